@@ -11,6 +11,7 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import STATUS
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
+from scvi_codegen.runtime.constraint_rank import Linearised, refusal
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -63,6 +64,8 @@ def projected(
         checked_number(t, "the time t"), *map(binding.pointer, (q0, p0, values, q1, p1)), binding.workspace()
     )
     if status:
+        if wrong := refusal(stepper.constraints, q0, _linearised(stepper, t, parameters), nearest=True):
+            raise StateError(f"the constraints cannot be met near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
     status = binding.function("apart")(t, *map(binding.pointer, (q0, p0, q1, p1, values, apart)), binding.workspace())
@@ -72,18 +75,21 @@ def projected(
 
 
 def consistent(
-    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters, *, check_rank: bool = True
 ) -> tuple[Array, Array]:
     """An initial state put on the constraints: silently by what rounding and typing explain, else with a warning.
 
     Raises:
-        StateError: if it is far off, and where an input that constraints name is not given.
+        StateError: if it is far off, if constraints depend on each other there (``check_rank``), and where an input
+            that constraints name is not given.
     """
     for name in inputs_not_given(stepper.interface, parameters):
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
             raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
+    if check_rank and (wrong := refusal(stepper.constraints, q1, _linearised(stepper, t, parameters))):
+        raise StateError(f"{wrong} (q = {_shown(q1)})")
     moved = float(apart.max())
     if moved <= ROUNDED * np.finfo(float).eps:
         return q0, p0
@@ -145,8 +151,27 @@ def _call(
         _refuse(stepper, status, q)
 
 
+def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Linearised:
+    """G by unit velocities, which constraints of velocities have, too; no numbers where velocities give no momenta."""
+    unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
+
+    def at(q: Array) -> tuple[Array, Array]:
+        positions = np.tile(q, (len(unit), 1))
+        try:
+            momenta = stepper.momentum(positions, unit, t, parameters)
+            g, rates = constraint_values(stepper, positions, momenta, t, parameters)
+        except StateError:
+            return np.full(len(stepper.constraints), np.nan), np.full((len(stepper.constraints), len(q)), np.nan)
+        return g[0], (rates[1:] - rates[0]).T
+
+    return at
+
+
+def _shown(q: Array) -> str:
+    return np.array2string(q, threshold=2 * MOST_SHOWN)
+
+
 def _refuse(stepper: Integrator, status: int, q: Array) -> None:
     hint = "; do constraints say the same there, or contradict each other?" if "singular" in STATUS[status] else ""
     shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
-    near = np.array2string(q, threshold=2 * MOST_SHOWN)
-    raise StateError(f"the constraints {shown} cannot be met near q = {near} ({STATUS[status]}{hint})")
+    raise StateError(f"the constraints {shown} cannot be met near q = {_shown(q)} ({STATUS[status]}{hint})")

@@ -56,7 +56,7 @@ def start_of_ensemble(
     values = parameters_of_each(stepper, parameters, len(positions))
     if stepper.interface.constraints:
         for k, own in enumerate(values):
-            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own)
+            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own, check_rank=k == 0)
     return positions, momenta, values
 
 

@@ -11,10 +11,15 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.indices import Loop
 from scvi_codegen.native.options import STATUS, SolverOptions
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
+from scvi_codegen.runtime.constraint_rank import refusal
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
+
+
+MOST_DENSE = 64
+"""Coordinates, and constraints, whose Jacobian is made row by row to find its rank."""
 
 
 class RunOfArrays(Protocol):
@@ -29,6 +34,11 @@ class RunOfArrays(Protocol):
     problem: IndexedProblem
     options: SolverOptions | None
     state: Numbers
+
+    @property
+    def inverse_masses(self) -> dict[str, Numbers]:
+        """1/m of every coordinate by the name of its array."""
+        ...
 
     @property
     def t(self) -> float:
@@ -63,6 +73,8 @@ def consistent(run: RunOfArrays) -> None:
     """
     g, rate = constraint_values(run)
     before, moved = project(run)
+    if wrong := _dependent(run):
+        raise StateError(wrong)
     if max(moved) <= ROUNDED * np.finfo(float).eps:
         run.state[:] = before
     if max(moved) <= TYPED:
@@ -86,6 +98,8 @@ def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
     before, report = run.state.copy(), run.problem.binding.new("report *")
     status = run.call("project", run.problem.struct, run.problem.binding.options(run.options), report)
     if status:
+        if wrong := _dependent(run, nearest=True):
+            raise StateError(wrong)
         same = "do constraints say the same there, or contradict each other?"
         hint = f"; {same if 'singular' in STATUS[status] else 'give positions that are nearer to them'}"
         raise StateError(
@@ -107,17 +121,49 @@ def check_reachable(run: RunOfArrays) -> None:
     run.state[: len(before) // 2] = before[: len(before) // 2]
 
 
+def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
+    """What :func:`refusal` returns, "" where there are too many numbers for dense linear algebra."""
+    n, count = len(run.state) // 2, _count(run)
+    if max(n, count) > MOST_DENSE:
+        return ""
+    state, pointer = run.state.copy(), run.problem.binding.pointer
+    masses = 1.0 / np.concatenate([each.ravel() for each in run.inverse_masses.values()])
+
+    def at(q: Numbers) -> tuple[Numbers, Numbers]:
+        g, rates = np.zeros(count), np.zeros((n + 1, count))
+        run.state[:n] = q
+        for k, rate in enumerate(rates):
+            run.state[n:] = 0.0
+            run.state[n:][k - 1 : k] = masses[k - 1 : k]  # nothing moves before the first
+            run.call("constraint_values", run.problem.struct, pointer(g), pointer(rate))
+        return g, (rates[1:] - rates[0]).T
+
+    names = [
+        f"constraint {number}" + (str(list(map(int, place))) if shape else "")
+        for number, shape in enumerate(_shapes(run), 1)
+        for place in np.ndindex(*shape)
+    ]
+    try:
+        return refusal(names, state[:n].copy(), at, nearest=nearest)
+    finally:
+        run.state[:] = state
+
+
 def _count(run: RunOfArrays) -> int:
     if not run.problem.interface.constraints:
         raise MethodError(f"{run.problem.interface.system} has no constraints")
-    return sum(int(np.prod(_shape(loops, run.problem.arrays.sizes))) for loops in run.problem.interface.constraints)
+    return sum(int(np.prod(shape)) for shape in _shapes(run))
+
+
+def _shapes(run: RunOfArrays) -> list[list[int]]:
+    """Of each constraint as it was written."""
+    return [_shape(loops, run.problem.arrays.sizes) for loops in run.problem.interface.constraints]
 
 
 def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
     """By constraints as they were written."""
     found, start = [], 0
-    for loops in run.problem.interface.constraints:
-        shape = _shape(loops, run.problem.arrays.sizes)
+    for shape in _shapes(run):
         size = int(np.prod(shape))
         found.append(values[start : start + size].reshape(shape))
         start += size

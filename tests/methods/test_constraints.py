@@ -206,6 +206,33 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.3)
 
 
+@pytest.mark.parametrize(
+    ("third", "said"),
+    [
+        (
+            "(u - 1)**2 + y**2 = 1",
+            r"'x\*\*2 \+ y\*\*2 - 1' and .* depend on each other there \(rank 2 of 3\).* leave out one",
+        ),
+        ("(u - 1)**2 + y**2 = 2", "contradict each other or are out of reach near there: .* change or leave out one"),
+    ],
+)
+@pytest.mark.parametrize("method", ["svi:1", "svi:2"])
+def test_constraints_that_depend_on_each_other_where_they_hold_are_named(method, third, said):
+    """Generic points do not show it: G loses rank on the constraint manifold alone."""
+    system = LagrangianSystem.from_text(
+        name="loop",
+        coordinates=["x", "y", "u", "w"],
+        lagrangian="(x_dot**2 + y_dot**2 + u_dot**2 + w_dot**2)/2 - y",
+        constraints=["x**2 + y**2 = 1", "u = x + 1", third],
+    )
+    stepper = compile_stepper(system, method)
+    for q in ([1.0, 0.0, 2.0, 0.0], [0.6, 0.8, 1.6, 0.3]):
+        with pytest.raises(StateError, match=said):
+            stepper.integrate(q, velocity=[0.0, 0.0, 0.0, 1.0], h=0.05, steps=3)
+        with pytest.raises(StateError, match=said):
+            stepper.integrate_ensemble([q, q], velocity=[[0.0, 0.0, 0.0, 1.0]] * 2, h=0.05, steps=3)
+
+
 def test_initial_states_are_projected_or_refused():
     stepper = compile_stepper(rod(), lobatto(2))
     run = stepper.integrate([1.0606602, -1.0606602], [0.0, 0.0], h=0.1, steps=1)  # as typed

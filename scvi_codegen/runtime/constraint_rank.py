@@ -1,0 +1,71 @@
+"""Rank of the Jacobian G of constraints at a state: which constraints depend on each other, and which contradict.
+
+G is read off the rates G v + g_t, which are linear in the velocities, by unit velocities. Constraints that follow from
+others only where these hold (``(u - 1)**2 + y**2 = 1`` from ``x**2 + y**2 = 1`` and ``u = x + 1``) lose rank on the
+constraint manifold alone, where no generic point shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.runtime.inputs import Array
+
+__all__ = ["Linearised", "dependence", "refusal"]
+
+DEPENDENT = 1e-9
+"""Least singular value of G with rows of length 1: rows that depend on each other but for rounding."""
+TAKES_PART = 1e-6
+"""Of the largest entry of a null vector."""
+CONTRADICTED = 1e-7
+"""Of the size of the positions: how far constraints are off at the nearest state if no state meets them."""
+ITERATIONS = 30
+
+Linearised: TypeAlias = Callable[[Array], tuple[Array, Array]]
+"""Values g and Jacobian G of the constraints at positions."""
+
+
+def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
+    """Return the rank of (c, m) rows, and the (k,) indices of those that depend on each other."""
+    sizes = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    left, values, _ = np.linalg.svd(jacobian / np.where(sizes > 0.0, sizes, 1.0))
+    null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
+    shares = np.abs(null).max(axis=1, initial=0.0)
+    return len(left) - null.shape[1], np.flatnonzero(shares > TAKES_PART)
+
+
+def refusal(names: Sequence[str], q: Array, at: Linearised, *, nearest: bool = False) -> str:
+    """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
+
+    Args:
+        names: of the constraints.
+        q: (m,) positions.
+        at: g and G there.
+        nearest: first go to the positions that are least off the constraints (Gauss and Newton).
+    """
+    for _ in range(ITERATIONS if nearest else 0):
+        g, jacobian = at(q)
+        if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+            return ""
+        q = q - np.linalg.lstsq(jacobian, g, rcond=DEPENDENT)[0]
+    g, jacobian = at(q)
+    if not (np.isfinite(g).all() and np.isfinite(jacobian).all()):
+        return ""
+    rank, rows = dependence(jacobian)
+    if not len(rows):
+        return ""
+    listed = " and ".join(f"'{names[k]}'" for k in rows) if len(rows) < 5 else f"{len(rows)} of them"
+    rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
+    if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
+        return (
+            f"the constraints {listed} contradict each other or are out of reach near there: at the nearest "
+            f"positions they are still {rests}, not 0; change or leave out one of them"
+        )
+    return (
+        f"the constraints {listed} depend on each other there (rank {rank} of {len(g)}), so that their multipliers are "
+        "undetermined; leave out one that follows from the others, or start from a state where they are independent"
+    )
