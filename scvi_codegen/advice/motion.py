@@ -23,6 +23,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.events import EventLike
+from scvi_codegen.runtime.global_error import checked_error
 from scvi_codegen.runtime.longest_step import longest_step, too_wrong
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -77,6 +78,7 @@ def solve_motion(
     h: float | None = None,
     tolerance: float | None = None,
     rtol: float | None = None,
+    error: float | None = None,
     monitor: str | Expr | None = None,
     controller: str | None = None,
     t_eval: ArrayLike | None = None,
@@ -103,6 +105,9 @@ def solve_motion(
         tolerance: in place of ``h``: the error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses it.
             Where the run breaks the promise, ``success`` is False.
         rtol: the relative error of the end of each step whose length is its own; by default round-off.
+        error: bound of the relative global error of the whole run by adaptive steps, as of :meth:`Stepper.integrate`;
+            ``trajectory.global_error`` and ``confirmed_until`` tell what is confirmed. ``success`` is False where the
+            bound is not.
         monitor: g of :func:`reparametrise`: by equal steps of tau, dt = g dtau, symplectic and of variable length in t.
             ``h`` is then of tau; without it :func:`longest_step` finds one for ``rtol``. A run with steps that do not
             keep it is no success.
@@ -125,7 +130,10 @@ def solve_motion(
     start, end = _span(t_span)
     q, given = _halves(y0) if velocity is None else (y0, None)
     asked = None if t_eval is None else times_of_run(t_eval, start, end)
-    wish = _Wish(h, rtol, tolerance)
+    if error is not None:
+        others = {"h": h, "tolerance": tolerance, "rtol": rtol, "monitor": monitor, "controller": controller}
+        checked_error(error, others)
+    wish = _Wish(h, rtol, tolerance, error)
     stepper, uncompiled = _stepper(system, method, (monitor, controller), wish)
     p = stepper.momenta_given(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
@@ -145,6 +153,7 @@ class _Wish(NamedTuple):
     h: float | None
     rtol: float | None
     tolerance: float | None
+    error: float | None
 
 
 class _Chosen(NamedTuple):
@@ -153,6 +162,7 @@ class _Chosen(NamedTuple):
     h: float | None
     rtol: float | None
     broken: Callable[[Trajectory], str] = lambda trajectory: ""
+    error: float | None = None
 
 
 def _stepper(
@@ -186,6 +196,8 @@ def _plan(
     along: dict[str, Any],
 ) -> _Chosen:
     """Steps for a wish, of a motion from (q, p) over a span."""
+    if wish.error is not None:
+        return _Chosen(None, None, _unconfirmed, wish.error)
     if wish.h is not None:
         return _Chosen(wish.h, wish.rtol)
     if _paced(stepper):
@@ -198,6 +210,14 @@ def _plan(
     (system, method), (q, p, span) = uncompiled, motion
     h = advise(system, method, q, p, span, advised, **along).h
     return _Chosen(h, None, lambda run: broken_promise(system, run, advised))
+
+
+def _unconfirmed(trajectory: Trajectory) -> str:
+    """Return how far the wanted global error is confirmed, where that is not the end of the run."""
+    found = trajectory.confirmation
+    if found is None or found.confirmed:
+        return ""
+    return f"The global error {found.requested:g} is confirmed until t = {found.confirmed_until:.6g} only."
 
 
 INSTEAD = {
@@ -230,6 +250,8 @@ def _chooses(stepper: Stepper) -> bool:
 
 def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[str, Any]:
     """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
+    if plan.error is not None:
+        return {"t_end": end, "error": plan.error}
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
     if _paced(stepper):
