@@ -96,9 +96,10 @@ void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double 
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,
     double *workspace);
-/* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
- * each step is resolved, beside its state; beside the largest yet where it is near rest at the origin. Negative where
- * the method has no curve that tells it. */
+/* Returns an estimate of the relative error of the worst step of a run so far, which began at run->error_t: from the
+ * last coefficients of the polynomials of each step, relative to its state (near rest at the origin, to the largest
+ * state of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
+ * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
 double kepler_svi_4_step_error(const kepler_svi_4_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */

@@ -92,9 +92,10 @@ void pendulum_stoermer_verlet_start(pendulum_stoermer_verlet_run *run, double t,
 int pendulum_stoermer_verlet_advance(pendulum_stoermer_verlet_run *run, long long steps, long long every,
     const double *parameters, const pendulum_stoermer_verlet_options *options, double *t, double *q, double *p,
     int *iterations, pendulum_stoermer_verlet_report *report, double *workspace);
-/* An estimate of the relative error of the worst step of a run, which began at run->error_t: from how far the curve of
- * each step is resolved, beside its state; beside the largest yet where it is near rest at the origin. Negative where
- * the method has no curve that tells it. */
+/* Returns an estimate of the relative error of the worst step of a run so far, which began at run->error_t: from the
+ * last coefficients of the polynomials of each step, relative to its state (near rest at the origin, to the largest
+ * state of the run). Returns -1 if there is no estimate: for explicit methods, for methods with too few points, and in
+ * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
 double pendulum_stoermer_verlet_step_error(const pendulum_stoermer_verlet_run *run);
 
 /* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */

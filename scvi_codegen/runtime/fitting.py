@@ -129,7 +129,7 @@ def fit(
         q, p, velocity: (m,) the initial state, one of p and velocity: a first guess, or, without ``state``, known.
         h: steps are no longer than this.
         parameters: first guesses of those unknown, values of the others; by default those of the system.
-        unknown: parameters to find, by default all but those of inputs.
+        unknown: names of the parameters to find, by default all but those of inputs; the others are known.
         state: whether the initial state is to be found, too.
         start: time of the initial state, by default that of the first measurement.
         observed: what the columns of ``measured`` are, coordinates and momenta (``"p_x"``, or of a Hamiltonian their
@@ -228,6 +228,11 @@ class _Model:
             )
         if not wanted and not state:
             raise StateError("there is nothing to find: no parameter is unknown, and the initial state is known")
+        if isinstance(parameters, Sequence) and any(isinstance(value, str) for value in parameters):
+            raise StateError(
+                f"parameters must be values, as {{'{next(iter(parameters))}': 1.0}}, not names: the names of those to "
+                f"find go to unknown={list(parameters)}"
+            )
         values = checked_parameters(stepper.interface, parameters)
         momenta = stepper.momenta_given(q, p, velocity, measurements.start, values)
         places = [2 * m + stepper.parameters.index(name) for name in wanted]
@@ -334,7 +339,8 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
     lengths = np.linalg.norm(slopes, axis=0)
     changes = lengths * sizes
     if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():
-        raise FitError(f"these measurements do not tell {free[nothing[0]]}: they do not depend on it. Take it as known")
+        name = free[nothing[0]]
+        raise FitError(f"these measurements do not tell {name}: they do not depend on it. {_as_known([name])}")
     singular, directions = np.linalg.svd(slopes / lengths)[1:]
     if singular[-1] > SAME * singular[0]:
         return
@@ -343,9 +349,18 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
     if len(told) < 2:
         raise FitError(
             f"these measurements do not tell {' '.join(told) or 'the states of segments'}: changed together with "
-            "states of later segments, it leaves all that is measured as it is. Take more as known"
+            "states of later segments, it leaves all that is measured as it is. {_as_known([*told, ''])}"
         )
     raise FitError(
         f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
-        "that is measured as it is. Take one of them as known"
+        f"that is measured as it is. {_as_known(told)}"
+    )
+
+
+def _as_known(names: Sequence[str]) -> str:
+    """Return the advice that says how to take an unknown as known."""
+    return (
+        f"Take {names[0] if len(names) == 1 else 'one of them'} as known: list only the parameters to find in unknown=["
+        "...] (by default all are) and give values of the others in parameters={...}; state=False keeps the initial "
+        "state (with p) as given"
     )

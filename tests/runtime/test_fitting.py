@@ -83,7 +83,9 @@ def test_values_and_errors_are_those_of_curve_fit():
     )
     assert_allclose(found.values, values, rtol=1e-6)
     assert_allclose(found.covariance, covariance, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
-    assert_allclose(found.deviations, NOISE, rtol=0.15)
+    left = np.sqrt((found.residuals**2).sum() / (len(TIMES) - 5))
+    assert_allclose(found.deviations, [left], rtol=1e-12)
+    assert_allclose(left, NOISE, rtol=0.15)
     assert list(found.standard_errors) == list(found.names)
     assert "alpha = " in str(found)
 
@@ -108,6 +110,7 @@ def test_several_quantities_with_gaps_and_noise_of_their_own():
     assert_allclose(found.values, alone.values, atol=4 * np.sqrt(np.diag(alone.covariance)).max())
     assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()
     assert np.isnan(found.residuals[::7, 0]).all()
+    assert found.deviations.tolist() == sizes
     held = fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
     assert held.values[2] == pytest.approx(0.25, abs=1e-6)
 
@@ -146,6 +149,10 @@ def test_a_known_start_and_inputs_that_are_data():
     ("options", "message"),
     [
         ({"unknown": [*SOME, "m", "gamma"]}, "do not tell alpha, beta, delta, m and gamma apart"),
+        (
+            {"unknown": [*SOME, "m", "gamma"]},
+            r"one of them as known: list only .* in unknown=\[...\] .*parameters=\{...\}",
+        ),
         ({"unknown": ["omega"], "parameters": TRUE | {"gamma": 0.0}}, "do not tell omega: they do not depend on it"),
     ],
 )
@@ -162,6 +169,10 @@ def test_two_measurements_do_not_tell_five_unknowns():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (
+            {"parameters": ["m", "beta"]},
+            r"must be values, as \{'m': 1.0\}, not names: .* go to unknown=\['m', 'beta'\]",
+        ),
         ({"unknown": ["alfa"]}, "no parameter 'alfa' to find; did you mean 'alpha'"),
         ({"observed": ["v"]}, "'v' cannot be observed"),
         ({"observed": ["x", "p_x"]}, r"measured has shape \(150, 2\) for x, p_x, not \(150,\)"),
