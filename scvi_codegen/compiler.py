@@ -33,6 +33,7 @@ from functools import cache, partial
 from sympy import Expr
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.parts import key_of
 from scvi_codegen.given.kinds import SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
@@ -146,7 +147,7 @@ class _Texts:
         monitor: str | Expr | None,
     ) -> None:
         self.system, self.method, self.solver, self.monitor = system, method, solver, monitor
-        self.key = (*system.key(), *method.key(), solver, str(prefix), *map(repr, symmetries), str(monitor))
+        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), monitor)))
         self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
         self._programs: dict[bool, Program] = {}
 

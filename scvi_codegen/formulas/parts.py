@@ -1,10 +1,14 @@
-"""Expressions as what they share: each part once, where a walk through trees would meet it again and again."""
+"""Expressions by their shared parts, and keys of caches made from every field of what describes a system."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import sympy
 
-__all__ = ["identity", "parts"]
+__all__ = ["identity", "key_of", "parts"]
 
 
 def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
@@ -44,3 +48,33 @@ def identity(expression: sympy.Basic) -> str:
 
     place(expression)
     return "\n".join(lines)
+
+
+def key_of(value: Any) -> str:
+    """Return text that differs for values that differ: a dataclass by its type and every one of its fields.
+
+    Keys of caches are made of it, so that a new field cannot be forgotten. Fields that do not take part in comparisons
+    are included.
+
+    Raises:
+        TypeError: for a value that is none of: a dataclass, expression, number, text, ``None``, sequence or mapping.
+
+    >>> key_of((1, 1.0, "1", None))
+    "(1, 1.0, '1', None)"
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        named = ", ".join(f"{field.name}={key_of(getattr(value, field.name))}" for field in fields(value))
+        return f"{type(value).__module__}.{type(value).__qualname__}({named})"
+    if isinstance(value, sympy.Basic):
+        return repr(identity(value))
+    if hasattr(value, "_mpf_"):
+        return f"mpf{value._mpf_}"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key_of(name)}: {key_of(each)}' for name, each in value.items())}}}"
+    if isinstance(value, tuple | list):
+        return f"({', '.join(map(key_of, value))})"
+    if isinstance(value, float):
+        return repr(float(value))
+    if value is None or isinstance(value, bool | int | str):
+        return repr(value)
+    raise TypeError(f"a key of a cache cannot be made of a {type(value).__name__}: {value!r}")

@@ -31,7 +31,7 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.inputs import inputs_by_name
-from scvi_codegen.formulas.parts import identity
+from scvi_codegen.formulas.parts import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.given.kinds import of
@@ -160,17 +160,8 @@ class MechanicalSystem(ABC):
         return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in bound)
 
     def key(self) -> tuple[str, ...]:
-        """All that tells this system from others: equal for systems of which equal texts are generated."""
-        symbols = (*self.coordinates, *self.auxiliaries, *self.parameters, self.time)
-        return (
-            self.name,
-            identity(self.formula),
-            " ".join(symbol.name for symbol in symbols),
-            repr((len(self.coordinates), len(self.auxiliaries), self.defaults)),
-            identity(self.clock.rate) if self.clock else "",
-            *map(identity, (*self.forces, *self.constraints, self.damping)),
-            repr((len(self.constraints), self.inputs)),
-        )
+        """Return the key of this system in caches, made from its type and all of its fields."""
+        return (key_of(self),)
 
     def to_text(self) -> str:
         """The function as text that ``from_text`` reads back."""

@@ -18,6 +18,7 @@ import sympy
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.parts import key_of
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.constraints import velocities_held
 from scvi_codegen.mechanics.forms import forms_of
@@ -127,8 +128,8 @@ class Method(ABC):
         return card(self.title, facts, *(numbers_html(number_table(part)) for part in self.parts))
 
     def key(self) -> tuple[str, ...]:
-        """All that tells this method from others."""
-        return (repr(self),)
+        """Return the key of this method in caches, made from its type and all of its fields."""
+        return (key_of(self),)
 
     @abstractmethod
     def specification(self) -> Specification:

@@ -21,7 +21,7 @@ FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
 
 
 def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
-    """24 digits made from all that determines the compiled code: text, compiler, flags, cffi, processor.
+    """Return 24 digits made from all that determines the compiled code: text, compiler, flags, cffi, processor.
 
     Raises:
         BuildError: without a compiler.
@@ -29,11 +29,12 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
     compiler = find_compiler()
     parts = [
         json.dumps([each.to_record() for each in source.sources]),
-        " ".join(compiler),
+        json.dumps(compiler),
         compiler_version(compiler),
-        " ".join(flags),
+        json.dumps(flags),
         os.environ.get(FLAGS_VARIABLE, ""),
         _cffi_backend.__version__,
+        _commands(),
         _processor() if _tuned(compiler, flags) else platform.machine(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
@@ -42,6 +43,12 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
 def _tuned(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
     """Whether any flag, wherever it stands, asks for the instructions of this processor (-march, -mcpu, -mtune)."""
     return "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
+
+
+@cache
+def _commands() -> str:
+    """Return the text of the module that chooses further flags and libraries by what the source includes."""
+    return Path(__file__).with_name("building.py").read_text(encoding="utf-8")
 
 
 @cache

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import pickle
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
+import numpy as np
 import pytest
+import sympy
 
 import scvi_codegen as sc
 from scvi_codegen import compiler
+from scvi_codegen.formulas.parts import key_of
+from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native import building
+from scvi_codegen.native import building, fingerprint
 from scvi_codegen.rendering import text_cache
 
 
@@ -166,3 +171,106 @@ def test_a_cache_that_cannot_be_written_is_no_error(made, tmp_path):
     sc.compile_stepper(spring(), sc.SVI(2))
     sc.compile_stepper(spring(), sc.SVI(2))
     assert len(made) == 2
+
+
+def mutations(value):
+    """Other values in place of one: of a dataclass, one for each field, however deep."""
+    if is_dataclass(value):
+        for field in fields(value):
+            for other in mutations(getattr(value, field.name)):
+                changed = copy.copy(value)
+                object.__setattr__(changed, field.name, other)
+                yield f"{type(value).__name__}.{field.name}", changed
+    elif isinstance(value, tuple):
+        yield "shorter", value[:-1]
+        yield "longer", (*value, sympy.Integer(7))
+        for k, each in enumerate(value):
+            for name, other in mutations(each):
+                yield name, (*value[:k], other, *value[k + 1 :])
+    else:
+        yield from others(value)
+
+
+def others(value):
+    """Other values in place of one without parts."""
+    if isinstance(value, sympy.Basic):
+        yield "expression", value + sympy.Symbol("other", real=True)
+        yield "number", sympy.Float(value) if value.is_Integer else sympy.Symbol(str(value))
+    elif hasattr(value, "_mpf_"):
+        yield "last digit", value * (1 + value.context.mpf(2) ** -190) + value.context.mpf(2) ** -190
+    elif isinstance(value, bool) or value is None:
+        yield "other", "None" if value is None else not value
+    elif isinstance(value, int | float):
+        yield "next", value + 1 if isinstance(value, int) else float(np.nextafter(value, np.inf))
+    else:
+        yield "text", f"{value}2"
+
+
+def driven() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="all",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + y_dot**2)/2 - x**2*y**2/2",
+        parameters={"m": 1.5, "c": 0.25},
+        forces={"x": "u"},
+        damping="c",
+        constraints=["x - 2*y"],
+        inputs=["u"],
+    )
+
+
+def described() -> list:
+    """One of each kind of what texts are made from, with all fields in use."""
+    lattice = sc.IndexedSystem.from_text(
+        name="ring",
+        coordinates=["q[N]"],
+        lagrangian="sum(a in N, m[a]*q_dot[a]**2/2 - k*q[a]**2/2) - sum(b in B, q[bonds[b, 0]]*q[bonds[b, 1]])",
+        parameters={"k": 2.0, "m[N]": 1.5},
+        tables=["bonds[B, 2]"],
+        forces={"q[a]": "u"},
+        inputs=["u"],
+    )
+    turned = sc.reparametrise(problem("kepler").system, "distance")
+    vortices, methods = problem("point-vortices").system, ("svi:2", "scvi:2", "gauss:2", "stoermer-verlet")
+    own = [as_method(name, driven()) for name in methods]
+    return [driven(), lattice, turned, vortices, sc.symmetries(turned)[0], *own]
+
+
+@pytest.mark.parametrize("number", range(9))
+def test_every_field_of_what_describes_a_text_changes_its_key(number):
+    given = described()[number]
+    key, found = key_of(given), list(mutations(given))
+    assert key == key_of(described()[number])
+    assert len(found) >= len(fields(given))
+    unseen = [name for name, other in found if key_of(other) == key]
+    assert unseen == []
+    keys = {key_of(other) for _, other in found}
+    assert len(keys) > 0.9 * len(found)
+    if hasattr(given, "key"):
+        assert given.key() == (key,)
+
+
+def test_keys_hold_what_equality_or_texts_would_confuse():
+    a, b = sympy.symbols("x x", real=True), sympy.Symbol("x")
+    same = [(1, 2), ("1, 2",), (1, (2,)), (1.0, 2), (True, 2), ("None",), (None,), (sympy.Integer(1), 2), (a[0],), (b,)]
+    assert len({key_of(each) for each in same}) == len(same)
+    with pytest.raises(TypeError, match="cannot be made of a object"):
+        key_of(object())
+    assert keys({}, prefix="None") != keys({})
+    assert keys({}, monitor="None") != keys({})
+
+
+def test_compiler_flags_and_commands_have_a_part_in_the_name_of_a_library(monkeypatch):
+    source = sc.compile_stepper(spring(), sc.SVI(1)).source
+    found = [building.fingerprint(source, flags=flags) for flags in (("-O1", "-g"), ("-O1 -g",), ("-g", "-O1"))]
+    for field in fields(source):
+        other = copy.copy(source)
+        value = getattr(source, field.name)
+        changed = source if value is None else f"{value}2" if isinstance(value, str) else (*value, ("support/a.h", ""))
+        object.__setattr__(other, field.name, changed)
+        found.append(building.fingerprint(other, flags=("-O1", "-g")))
+    monkeypatch.setattr(fingerprint, "compiler_version", lambda command: "another")
+    found.append(building.fingerprint(source, flags=("-O1", "-g")))
+    monkeypatch.setattr(fingerprint, "_commands", lambda: "another")
+    found.append(building.fingerprint(source, flags=("-O1", "-g")))
+    assert len(set(found)) == len(found) == 11

@@ -25,6 +25,7 @@ from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
+from scvi_codegen.formulas.parts import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.given.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.indices import Access, Array, Loop, Size
@@ -290,9 +291,8 @@ class IndexedSystem:
         return any(self.time in formula.free_symbols for formula in formulas)
 
     def key(self) -> tuple[str, ...]:
-        """All that tells this system from others."""
-        arrays = (self.momenta, self.tables, self.fields, self.inputs)
-        return (self.name, str(self), repr((arrays, self.parameters, self.defaults)))
+        """Return the key of this system in caches, made from all of its fields."""
+        return (key_of(self),)
 
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
