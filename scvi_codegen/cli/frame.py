@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -108,6 +109,13 @@ class Commands(click.Group):
         found = [CompletionItem(name, help=self.about[name]) for name in names]
         return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
 
+    def main(self, *given: Any, **named: Any) -> Any:
+        """Run with streams that can be written, also where a shell closed them (``2>&-``)."""
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:
+                setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115  (as long as the process)
+        return super().main(*given, **named)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; errors become messages."""
         try:
@@ -116,7 +124,9 @@ class Commands(click.Group):
         except (StepFailedError, BuildError, RecordingError) as error:
             raise CommandFailure(str(error), FAILURE) from error
         except ScviCodegenError as error:
-            raise CommandFailure(str(error), USAGE) from error
+            cause = error.__cause__
+            unwritten = isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
+            raise CommandFailure(str(error), FAILURE if unwritten else USAGE) from error
         except BrokenPipeError:
             raise
         except OSError as error:

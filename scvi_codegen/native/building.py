@@ -16,7 +16,6 @@ import json
 import os
 import platform
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
@@ -40,7 +39,7 @@ from scvi_codegen.files.cache import (
     touch,
     trusted_folder,
 )
-from scvi_codegen.native.compilers import another_compiler, find_compiler, from_wheel
+from scvi_codegen.native.compilers import another_compiler, find_compiler, from_wheel, words_of
 from scvi_codegen.native.fingerprint import FLAGS_VARIABLE, fingerprint
 from scvi_codegen.native.processes import running
 from scvi_codegen.native.waiting import waiting_for
@@ -220,7 +219,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     is_cut = any("support/parts.h" in each.files for each in source.sources)
     cut = CUT_FLAGS if is_cut and _takes_flags(compiler, CUT_FLAGS) else ()
     threads = THREADS if any(SHARED_BY_THREADS in each.files for each in source.sources) else ()
-    wanted = [*threads, *shlex.split(os.environ.get(FLAGS_VARIABLE, ""))]
+    wanted = [*threads, *words_of(FLAGS_VARIABLE)]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
     objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
     for define, libraries in _mathematics(flags):
@@ -235,8 +234,13 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
         except BuildError:
             if not define:
                 raise
+    if not _library(folder).is_file():
+        raise BuildError(
+            f"{' '.join(compiler)!r} made no library, and reported no error: it is no C compiler. Set the environment "
+            "variable CC to one, as in CC=gcc"
+        )
     for name in parts:
-        (folder / f"{name}.o").unlink()
+        (folder / f"{name}.o").unlink(missing_ok=True)
 
 
 def _declarations(source: Source, command: list[str], folder: Path) -> str:

@@ -11,10 +11,11 @@ import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from scvi_codegen.errors import BuildError
 
-__all__ = ["another_compiler", "compiler_title", "compiler_version", "find_compiler", "from_wheel"]
+__all__ = ["another_compiler", "compiler_title", "compiler_version", "find_compiler", "from_wheel", "words_of"]
 
 WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 
@@ -27,7 +28,7 @@ def find_compiler() -> tuple[str, ...]:
     """
     chosen = os.environ.get("CC")
     if chosen:
-        command = tuple(shlex.split(chosen))
+        command = words_of("CC")
         if not command or shutil.which(command[0]) is None:
             raise BuildError(f"the compiler named by the environment variable CC ({chosen!r}) was not found")
         return command
@@ -42,6 +43,22 @@ def find_compiler() -> tuple[str, ...]:
     )
 
 
+def words_of(variable: str) -> tuple[str, ...]:
+    """The words of an environment variable, as a shell splits them.
+
+    Raises:
+        BuildError: if a quote is not closed.
+    """
+    text = os.environ.get(variable, "")
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise BuildError(
+            f"the environment variable {variable} is {text!r}, which cannot be split into words ({error}): close "
+            "its quotes"
+        ) from error
+
+
 def from_wheel(compiler: tuple[str, ...]) -> bool:
     """Whether a command is the compiler of the extra ``compiler``."""
     return "ziglang" in compiler
@@ -54,8 +71,7 @@ def compiler_title() -> str:
 
 @cache
 def _title_of(command: tuple[str, ...]) -> str:
-    result = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
-    return (result.stdout.splitlines() or [" ".join(command)])[0]
+    return (_said_by(command).splitlines() or [" ".join(command)])[0]
 
 
 @cache
@@ -66,11 +82,16 @@ def compiler_version(compiler: tuple[str, ...]) -> str:
         with suppress(OSError):
             status = file.stat()
             return f"{file} {status.st_size} {status.st_mtime_ns}"
+    return _said_by(compiler)
+
+
+def _said_by(compiler: tuple[str, ...]) -> str:
+    """What it says of its version."""
+    settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
     try:
-        result = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(subprocess.run([*compiler, "--version"], check=False, **settings).stdout)
+    except (OSError, ValueError, subprocess.TimeoutExpired) as error:
         raise BuildError(f"the compiler {' '.join(compiler)!r} does not run: {error}") from error
-    return result.stdout
 
 
 def another_compiler(command: list[str]) -> str:
