@@ -23,7 +23,7 @@ from scvi_codegen.models.indexed_document import model_texts
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.package import prefix_of, source_in
 from scvi_codegen.rendering.indexed import render_indexed_example
-from scvi_codegen.runtime.indexed_interface import read_arrays, read_state
+from scvi_codegen.runtime.indexed_interface import read_arrays, read_state, table_limits
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 
 __all__ = ["generate_sums", "load_sums"]
@@ -54,7 +54,10 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         numbers=problem.numbers,
         sizes={name: problem.sizes[name] for name in interface.sizes},
         fields={f"field_{name}": values.size for name, values in problem.fields.items()},
-        tables={f"table_{name}": values.size for name, values in problem.places.items()},
+        tables={
+            f"table_{name}": (problem.places[name].size, limits)
+            for name, limits in table_limits(interface, problem.sizes)
+        },
         moving=moving if moving in arrays else "",
         constraints=bool(interface.constraints),
         run={"t": model.t, "h": model.step, "steps": model.step_count, "every": model.every},

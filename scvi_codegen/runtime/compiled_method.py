@@ -20,6 +20,10 @@ from scvi_codegen.runtime.inputs import (
 __all__ = ["CompiledMethod", "no_text"]
 
 
+MOST_WATCHING = 16
+"""Sets of events whose integrators are kept, so that the same formulas are not parsed again in every call."""
+
+
 def no_text(*_: int) -> None:
     """Of a method without a text for many trajectories, or for steps that choose their length."""
 
@@ -60,6 +64,7 @@ class CompiledMethod:
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
+        self._watching: dict[tuple[Event, ...], Self] = {}
         self._plain = source
         self.source = _watching(source, interface, events) if events else source
         library = building.load(self.source, flags=flags)
@@ -223,6 +228,13 @@ class CompiledMethod:
         wanted = as_events(events)
         if wanted == self.events:
             return self
+        if wanted not in self._watching:
+            while len(self._watching) >= MOST_WATCHING:
+                self._watching.pop(next(iter(self._watching)), None)
+            self._watching[wanted] = self._made_watching(wanted)
+        return self._watching[wanted]
+
+    def _made_watching(self, wanted: tuple[Event, ...]) -> Self:
         return type(self)(
             self._plain,
             self.interface,

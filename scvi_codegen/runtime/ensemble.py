@@ -33,7 +33,7 @@ from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.workers import PROGRESS_SECONDS
+from scvi_codegen.runtime.workers import MOST_PIECES, PROGRESS_SECONDS
 
 __all__ = [
     "Change",
@@ -178,9 +178,13 @@ class Ensemble:
                 faster = PORTION_SECONDS / max(time.perf_counter() - began, 1e-6)
                 portion = min(max(1, int(portion * min(8.0, faster))), self.steps - int(reached[number]))
 
+        def take(piece: int) -> None:
+            for number in range(piece, len(firsts), MOST_PIECES):
+                drive(number)
+
         with ThreadPoolExecutor(workers) as pool:
             try:
-                pending = {pool.submit(drive, number) for number in range(len(firsts))}
+                pending = {pool.submit(take, piece) for piece in range(min(len(firsts), MOST_PIECES))}
                 while pending:
                     finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
                     for future in finished:

@@ -19,6 +19,7 @@ __all__ = [
     "RunArrays",
     "read_arrays",
     "read_state",
+    "table_limits",
 ]
 
 Numbers = NDArray[np.float64]
@@ -211,6 +212,17 @@ def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables
                 _check_span(f"{place}", _span(spans[place.index], sizes), rows[place.table], 0, sizes)
             span = _places(place, spans, sizes, tables, access.array.axes[k].at(sizes))
             _check_span(f"{access}", span, access.array, k, sizes)
+
+
+def table_limits(interface: IndexedInterface, sizes: Mapping[str, int]) -> list[tuple[str, list[int]]]:
+    """Of each table and each of its columns the length of the shortest axis that its numbers are places on."""
+    found = {table.name: [2**31] * table.axes[1].number for table in interface.tables}
+    for access, _ in interface.accesses:
+        for axis, place in zip(access.array.axes, access.places, strict=True):
+            if place.table:
+                limits = found[place.table]
+                limits[place.column] = min(limits[place.column], axis.at(sizes))
+    return list(found.items())
 
 
 def _places(

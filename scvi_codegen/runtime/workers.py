@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
 from scvi_codegen.given.counts import checked_count
 
-__all__ = ["PROGRESS_SECONDS", "Heed", "run_each"]
+__all__ = ["MOST_PIECES", "PROGRESS_SECONDS", "Heed", "run_each"]
 
 PROGRESS_SECONDS = 0.1
 MOST_PIECES = 4096

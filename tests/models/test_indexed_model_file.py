@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import scvi_codegen as sc
+from scvi_codegen.cli import main
 from scvi_codegen.formulas.indexed import parse_array
 from scvi_codegen.models.array_values import read_array
 from scvi_codegen.models.model_file import read_model_file
+from scvi_codegen.native.compilers import find_compiler
 
 NET = """
 [system]
@@ -191,3 +195,22 @@ def test_steps_that_choose_their_length(net: Path) -> None:
     with pytest.raises(sc.ModelFileError, match="give a step"):
         model.step_count  # noqa: B018
     assert sc.load_indexed_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
+
+
+def test_the_example_frees_its_memory_and_refuses_places_outside(net: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables are files beside the program: whoever edits them gets a message, and no access outside an array."""
+    monkeypatch.chdir(net.parent)
+    invoked = CliRunner().invoke(main, ["generate", str(net), "-o", "net_svi"])
+    assert invoked.exit_code == 0, invoked.output
+    command = [*find_compiler(), "-O0", "-std=c99", "main.c", "net_svi.c", "-lm", "-o", "main"]
+    checked = subprocess.run(
+        [*command, "-fsanitize=address,undefined"], cwd="net_svi", capture_output=True, check=False
+    )
+    if checked.returncode:  # a compiler without sanitizers
+        subprocess.run(command, cwd="net_svi", check=True)
+    subprocess.run(["./main"], cwd="net_svi", check=True, capture_output=True)
+    for wrong in ("3", "-1", "1e9", "nan"):
+        Path("net_svi/table_bonds.txt").write_text(f"0 1 1 {wrong}")
+        ended = subprocess.run(["./main"], cwd="net_svi", capture_output=True, text=True, check=False)
+        assert ended.returncode == 1
+        assert "no place from 0 to 2" in ended.stderr

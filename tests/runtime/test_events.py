@@ -34,6 +34,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime import compiled_method
 from scvi_codegen.runtime.events import Event
 from scvi_codegen.runtime.stepper import Stepper
 
@@ -492,3 +493,16 @@ def test_crossings_of_a_step_come_by_their_fractions_where_their_times_tie():
     run = stepper.integrate([0.5], [1.0], t=1e12, h=1.0, steps=1, events=events)
     assert [len(found) for found in run.events] == [0, 1]
     assert abs(run.q[-1, 0] - 1.0) < 1e-15
+
+
+def test_the_same_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And those of many calls do not fill the memory."""
+    system = LagrangianSystem.from_text(name="falling", coordinates=["q"], lagrangian="q_dot**2/2 - q")
+    stepper = compile_stepper(system, "svi:2")
+    first = stepper.with_events("q - 1")
+    assert stepper.with_events(["q - 1"]) is first
+    assert stepper.with_events(Event("q - 1", terminal=True)) is not first
+    monkeypatch.setattr(compiled_method, "_watching", lambda source, *_: source)
+    for k in range(40):
+        stepper.with_events(f"q - {k}")
+    assert len(stepper._watching) == compiled_method.MOST_WATCHING
