@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple, NoReturn
 
 from sympy import Add, Expr, Mul, Pow, Rational, S, Symbol
 
-from scvi_codegen.errors import ExpressionError, closest
+from scvi_codegen.errors import ExpressionError, SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import (
     MAX_BITS,
     MAX_DIGITS,
@@ -136,6 +136,8 @@ class Parser:
     pattern: ClassVar[re.Pattern[str]] = _TOKEN
 
     def __init__(self, text: str, symbols: Mapping[str, Symbol]) -> None:
+        if not isinstance(text, str):
+            raise SystemDefinitionError(f"a formula must be text, not {text!r:.60}: write it between quotes")
         self.text, self.symbols = text, symbols
         self.tokens = _tokens(text, self.pattern)
         self.position = self.depth = 0

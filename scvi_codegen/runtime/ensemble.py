@@ -8,7 +8,6 @@ for any number of threads.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -33,7 +32,7 @@ from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.workers import MOST_PIECES, PROGRESS_SECONDS
+from scvi_codegen.runtime.workers import MOST_PIECES, PROGRESS_SECONDS, workers_of
 
 __all__ = [
     "Change",
@@ -163,7 +162,7 @@ class Ensemble:
 
         Afterwards, also after an exception, :meth:`result` holds what was computed.
         """
-        workers = checked_count(threads or os.cpu_count() or 1, "threads", least=1)
+        workers = workers_of(threads)
         make, width = self.blocks()
         firsts = range(0, self.count, width)
         reached, stop = np.zeros(len(firsts)), threading.Event()

@@ -105,7 +105,7 @@ def read_arrays(
     given = dict(parameters or {})
     numbers = number_values(interface, given)
     shapes += [
-        (field, np.shape(given[field.name])) for field in interface.fields if np.ndim(given.get(field.name, 0.0))
+        (field, real_array(given[field.name], field.name).shape) for field in interface.fields if field.name in given
     ]
     sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
     fields = field_values(interface, given, sizes)
@@ -270,7 +270,7 @@ def _check_named(given: Mapping[str, object], names: Sequence[str], what: str, *
     for name in given:
         if name not in names:
             raise StateError(
-                f"there is no '{name}' among {what}{closest(name, names)} Known: {', '.join(names) or 'none'}"
+                f"there is no '{name}' among {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
             )
     for name in names:
         if whole and name not in given:

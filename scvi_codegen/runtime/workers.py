@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
 from scvi_codegen.given.counts import checked_count
 
-__all__ = ["MOST_PIECES", "PROGRESS_SECONDS", "Heed", "run_each"]
+__all__ = ["MOST_PIECES", "PROGRESS_SECONDS", "Heed", "run_each", "workers_of"]
 
 PROGRESS_SECONDS = 0.1
 MOST_PIECES = 4096
@@ -21,6 +21,12 @@ Heed = Callable[[int], None]
 
 class _Stopped(Exception):  # noqa: N818  (a wish, not an error)
     """Another trajectory was interrupted, and so is this one."""
+
+
+def workers_of(threads: int | None) -> int:
+    """The number of workers, one a core where none is given."""
+    given = 0 if threads is None else checked_count(threads, "threads", least=0)
+    return given or os.cpu_count() or 1
 
 
 def run_each(
@@ -36,7 +42,7 @@ def run_each(
         progress: called now and then with how many are done.
         threads: workers, by default one a core.
     """
-    workers, stop = checked_count(threads or os.cpu_count() or 1, "threads", least=1), threading.Event()
+    workers, stop = workers_of(threads), threading.Event()
     pieces, done = min(count, MOST_PIECES), 0
 
     def heed(_: int) -> None:

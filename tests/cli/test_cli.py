@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -504,3 +506,25 @@ class TestListings:
         assert "order 10, symplectic, symmetric, A-stable" in text
         assert len(text.splitlines()) == 8
         assert "gauss" in error_of("methods", "--tableau", "gaus:3")
+
+
+@pytest.mark.parametrize("stream", ["1", "2"])
+def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
+    """As of a shell's ``2>&-``: what would be said there is lost, and nothing else."""
+    command = f"{shlex.quote(sys.executable)} -m scvi_codegen run kepler --step 0.1 --steps 5 -o a.npz {stream}>&-"
+    ended = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0
+    assert (tmp_path / "a.npz").exists()
+    assert ("q1 =" in ended.stdout) == (stream == "2")
+
+
+def test_a_package_that_cannot_be_written_is_a_failure(tmp_path, monkeypatch):
+    """Exit status 1, as for every file that cannot be written."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("scvi_codegen.models.folders.write_atomically", full)
+    result = CliRunner().invoke(main, ["generate", "kepler", "-o", str(tmp_path / "kepler_svi")])
+    assert result.exit_code == 1
+    assert "cannot be written: No space left" in result.output

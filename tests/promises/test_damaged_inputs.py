@@ -1,0 +1,355 @@
+"""Whatever is wrong with what a caller gives, the package's own errors say so: no traceback of another type leaves it.
+
+Each case damages one thing (a file, an argument, a variable of the environment) and may be refused or accepted; an
+exception must be a :class:`~scvi_codegen.errors.ScviCodegenError`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.native import building, compilers
+from scvi_codegen.rendering.source import Source
+
+MODEL = """[system]
+name = "swing"
+coordinates = ["q"]
+lagrangian = "q_dot**2/2 - w*q**2/2 + u*q"
+inputs = ["u"]
+
+[parameters]
+w = 1.0
+
+[inputs]
+u = { t = [0.0, 10.0], values = [0.0, 1.0] }
+
+[initial]
+q = [1.0]
+velocity = [0.0]
+
+[method]
+method = "svi:2"
+
+[run]
+step = 0.1
+steps = 10
+"""
+ODD: list[Any] = [
+    None, True, "x", "", b"x", 1j, [], {}, (), [[]], [[1.0]], [None], ["1"], [1.0, [2.0]], float("nan"), float("inf"),
+    -1, 0, 10**400, 2**63, 1e300, -1e300, object(), {"q": 1}, {1: 2}, {None: 1.0}, range(3), np.zeros((0, 1)),
+    np.array("x"), np.ma.masked, lambda: None, np.datetime64("2020"), type, ...,
+]  # fmt: skip
+"""Values that are wrong in most places."""
+
+
+def refused(act: Callable[[], Any]) -> sc.ScviCodegenError | None:
+    """The error of the package, if there is one; every other exception is one of the test."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            act()
+        except sc.ScviCodegenError as error:
+            return error
+    return None
+
+
+@cache
+def system() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="swing",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 - w*q**2/2 + u*q",
+        parameters={"w": 1.0},
+        inputs=["u"],
+    )
+
+
+@cache
+def stepper() -> sc.Stepper:
+    return sc.compile_stepper(system(), "svi:2", flags=QUICK_FLAGS)
+
+
+@cache
+def arrays() -> sc.IndexedStepper:
+    found = sc.IndexedSystem.from_text(
+        name="net",
+        coordinates=["q[N]"],
+        tables=["bonds[B, 2]"],
+        parameters={"k[B]": 1.0, "c": 1.0},
+        lagrangian="sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2/2)",
+    )
+    return sc.compile_indexed(found, "svi:2", flags=QUICK_FLAGS)
+
+
+INPUT = {"u_0": 0.0}
+STEP = {"h": 0.1, "steps": 2, "parameters": INPUT}
+TABLE = {"h": 0.1, "steps": 2, "tables": {"bonds": [[0, 1]]}}
+CALLS: dict[str, Callable[[Any], Any]] = {
+    "q": lambda x: stepper().integrate(x, [0.0], **STEP),
+    "p": lambda x: stepper().integrate([1.0], x, **STEP),
+    "velocity": lambda x: stepper().integrate([1.0], velocity=x, **STEP),
+    "h": lambda x: stepper().integrate([1.0], [0.0], h=x, steps=2, parameters=INPUT),
+    "steps": lambda x: stepper().integrate([1.0], [0.0], h=0.1, steps=2 if _is_huge(x) else x, parameters=INPUT),
+    "every": lambda x: stepper().integrate([1.0], [0.0], every=x, **STEP),
+    "t": lambda x: stepper().integrate([1.0], [0.0], t=x, **STEP),
+    "t_end": lambda x: stepper().integrate([1.0], [0.0], t_end=2 if _is_huge(x) else x, parameters=INPUT),
+    "t_eval": lambda x: stepper().integrate([1.0], [0.0], t_end=2.0, t_eval=x, parameters=INPUT),
+    "tolerance": lambda x: stepper().integrate([1.0], [0.0], t_end=2.0, tolerance=x, parameters=INPUT),
+    "parameters": lambda x: stepper().integrate([1.0], [0.0], h=0.1, steps=2, parameters=x),
+    "a parameter": lambda x: stepper().integrate([1.0], [0.0], h=0.1, steps=2, parameters={"w": x, **INPUT}),
+    "options": lambda x: stepper().integrate([1.0], [0.0], options=x, **STEP),
+    "events": lambda x: stepper().integrate([1.0], [0.0], events=x, **STEP),
+    "progress": lambda x: stepper().integrate([1.0], [0.0], progress=None if callable(x) else x, **STEP),
+    "inputs": lambda x: stepper().drive([1.0], [0.0], inputs=x, h=0.1, steps=2),
+    "an input": lambda x: stepper().drive([1.0], [0.0], inputs={"u": x}, h=0.1, steps=2),
+    "times of an input": lambda x: stepper().drive([1.0], [0.0], inputs={"u": (x, [0.0, 1.0])}, h=0.1, steps=2),
+    "ensemble": lambda x: stepper().integrate_ensemble(x, [[0.0]], **STEP),
+    "ensemble parameters": lambda x: stepper().integrate_ensemble([[1.0]], [[0.0]], h=0.1, steps=2, parameters=x),
+    "threads": lambda x: stepper().integrate_ensemble([[1.0]], [[0.0]], threads=1 if _is_huge(x) else x, **STEP),
+    "restore": lambda x: stepper().restore(x),
+    "jacobian": lambda x: stepper().jacobian(x, [0.0], 0.1, parameters=INPUT),
+    "energy": lambda x: stepper().energy([1.0], x, parameters=INPUT),
+    "array q": lambda x: arrays().integrate(x, **TABLE),
+    "array p": lambda x: arrays().integrate([1.0, 2.0], x, **TABLE),
+    "array h": lambda x: arrays().integrate([1.0, 2.0], **{**TABLE, "h": x}),
+    "tables": lambda x: arrays().integrate([1.0, 2.0], **{**TABLE, "tables": x}),
+    "a table": lambda x: arrays().integrate([1.0, 2.0], **{**TABLE, "tables": {"bonds": x}}),
+    "array parameters": lambda x: arrays().integrate([1.0, 2.0], parameters=x, **TABLE),
+    "a field": lambda x: arrays().integrate([1.0, 2.0], parameters={"k": x}, **TABLE),
+    "array events": lambda x: arrays().integrate([1.0, 2.0], events=x, **TABLE),
+    "array threads": lambda x: arrays().integrate([1.0, 2.0], threads=1 if _is_huge(x) else x, **TABLE),
+    "array restore": lambda x: arrays().restore(x),
+    "coordinates": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=x, lagrangian="q_dot**2"),
+    "lagrangian": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=["q"], lagrangian=x),
+    "defaults": lambda x: sc.LagrangianSystem.from_text(
+        name="a", coordinates=["q"], lagrangian="q_dot**2", parameters=x
+    ),
+    "forces": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=["q"], lagrangian="q_dot**2", forces=x),
+    "method": lambda x: sc.compile_stepper(system(), x, flags=QUICK_FLAGS),
+    "load_run": sc.load_run,
+    "load_model": sc.load_model,
+}  # fmt: skip
+
+
+def _is_huge(x: Any) -> bool:
+    """Whether it is a number that is right, and would take for ever."""
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) > 1e6
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_odd_values(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    failed = []
+    for value in ODD:
+        try:
+            refused(lambda value=value: CALLS[name](value))
+        except Exception as error:  # noqa: BLE001  (all of them are shown together)
+            failed.append(f"{value!r:.40}: {error!r:.200}")
+    assert failed == []
+
+
+LINES = MODEL.splitlines()
+WRONG_LINES = [
+    "x = ",
+    "= 3",
+    "q = [1.0,, 2]",
+    "q = nan",
+    "q = 1979-05-27",
+    "q = { a = 1 }",
+    "q = [[1.0]]",
+    '"" = 1',
+    "\0",
+]
+
+
+@pytest.mark.parametrize("number", [number for number, line in enumerate(LINES) if line])
+def test_model_files(number: int, tmp_path: Path) -> None:
+    """Each line left out, cut, doubled, or with another in its place."""
+    path = tmp_path / "model.toml"
+    line = LINES[number]
+    name = line.partition(" = ")[0]
+    values = (
+        "-1",
+        "[]",
+        '"x"',
+        "true",
+        "nan",
+        "1e400",
+        "[1, [2]]",
+        "{}",
+        "1979-05-27",
+        "99999999999999999999",
+        '["", 1]',
+    )
+    replaced = [f"{name} = {value}" for value in values] if " = " in line else ["[x]", "[[system]]", "[system.a]"]
+    for text in ("", line[: len(line) // 2], f"{line}\n{line}", f"{line} #\udcff", *WRONG_LINES, *replaced):
+        path.write_text("\n".join([*LINES[:number], text, *LINES[number + 1 :]]), errors="surrogateescape")
+        refused(lambda: sc.load_model(path))
+
+
+CSV = [
+    "",
+    "u",
+    "t,u",
+    "t,u\n",
+    "t,u\n0,1",
+    "t,u\n0,1\n0,2",
+    "t,u\n0,1\n1",
+    "t,u\n0,x\n1,2",
+    "t,t\n0,1\n1,2",
+    ",u\n0,1\n1,2",
+    "t,u\n0,1_0\n1,2",
+    "t,u\n0,\u0661\n1,2",
+    "t,u\n0,nan\n1,2",
+    "t,u\n0,1e999\n1,2",
+    't,u\n0,"1\n1,2',
+    "\ufefft,u\n0,1\n9,2",
+    "t,u\n0," + "1" * 200_000 + "\n1,2",
+    "t;u\n0;1\n1;2",
+    "t,u\n0,1\n1,2\0",
+    "t,v\n0,1\n9,2",
+    "t,u,v\n0,1,2\n9,1,2",
+    "\x00\x01",
+    "q1,q2\n1_0,2",
+    "q1,q2\n\u0661,2",
+    "q1\n" + "1" * 200_000,
+]
+
+
+@pytest.mark.parametrize("number", range(len(CSV)))
+def test_tables_in_csv(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As inputs, as tables of places, and as ensembles of the command line."""
+    monkeypatch.chdir(tmp_path)
+    Path("u.csv").write_text(CSV[number])
+    Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'))
+    refused(lambda: sc.load_model("model.toml").all_inputs())
+    result = CliRunner().invoke(main, ["run", "kepler", "--step", "0.1", "--steps", "2", "--ensemble", "u.csv"])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+
+
+@pytest.mark.parametrize("kind", ["npz", "npy"])
+def test_files_of_numpy(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path(f"u.{kind}")
+    if kind == "npz":
+        np.savez(path, t=[0.0, 10.0], u=[0.0, 1.0])
+    else:
+        np.save(path, [0.0, 1.0])
+    whole, random = path.read_bytes(), np.random.default_rng(5)
+    Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", f'{{ file = "u.{kind}" }}'))
+    damaged = [whole[:size] for size in range(0, len(whole), 41)]
+    for _ in range(60):
+        spoiled = bytearray(whole)
+        for place in random.integers(0, len(whole), 2):
+            spoiled[place] ^= int(random.integers(1, 256))
+        damaged.append(bytes(spoiled))
+    for data in damaged:
+        path.write_bytes(data)
+        refused(lambda: sc.load_model("model.toml").all_inputs())
+
+
+def paths_of(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The places of all that a JSON document has, but the lines of texts."""
+    found = [place] if place else []
+    items = (
+        document.items()
+        if isinstance(document, dict)
+        else enumerate(document[:1])
+        if isinstance(document, list)
+        else ()
+    )
+    return found + [each for key, value in items for each in paths_of(value, (*place, key))]
+
+
+PARTS = 6
+VALUES: list[Any] = [None, 0, -1, 1, 1.5, 1e30, 10**30, "x", "1", "", [], [1], ["x"], {}, {"a": 1}, True, float("nan")]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "a.run"
+    sc.record_run(stepper().start([1.0], [0.0], h=0.1, parameters=INPUT), folder, steps=20, rows=8)
+    return folder
+
+
+@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.full) for part in range(1, PARTS))])
+def test_manifests(recorded: Path, part: int) -> None:
+    """Every entry of a manifest with every value: refused as a recording, or read and used without harm."""
+    path = recorded / "manifest.json"
+    whole = path.read_text()
+    document = json.loads(whole)
+    count = 0
+    try:
+        for place in paths_of(document):
+            for value in VALUES[part::PARTS]:
+                changed = json.loads(whole)
+                inner = changed
+                for key in place[:-1]:
+                    inner = inner[key]
+                inner[place[-1]] = value
+                path.write_text(json.dumps(changed))
+                count += refused(lambda: _read_whole(recorded)) is not None
+    finally:
+        path.write_text(whole)
+    assert count > 60
+
+
+def _read_whole(folder: Path) -> None:
+    """All that reads and needs no other C text than was compiled."""
+    run = sc.load_run(folder)
+    if run.manifest.source == stepper().source and run.manifest.flags == QUICK_FLAGS:
+        assert np.isfinite(run[0:3].energy()).all()
+    np.asarray(run.q)
+    assert (len(run), run.steps, repr(run)) is not None
+
+
+def test_files_of_states(recorded: Path) -> None:
+    path = recorded / "states-000001.npz"
+    whole = path.read_bytes()
+    with np.load(path) as file:
+        arrays_in_file = dict(file)
+    try:
+        for name in arrays_in_file:
+            for value in (np.zeros(0), np.zeros(3), np.zeros((8, 3)), np.array(["x"] * 8), np.zeros(8, dtype=complex)):
+                np.savez(path, **{**arrays_in_file, name: value})
+                refused(lambda: np.asarray(sc.load_run(recorded).q))
+        for size in range(0, len(whole), 97):
+            path.write_bytes(whole[:size])
+            assert isinstance(refused(lambda: np.asarray(sc.load_run(recorded).q)), sc.RecordingError)
+    finally:
+        path.write_bytes(whole)
+
+
+ENVIRONMENT = [
+    ("CC", "gcc 'x"), ("CC", "true"), ("CC", "false"), ("CC", "/tmp"), ("CC", "/etc/passwd"), ("CC", "no-such-program"),
+    ("CC", "' '"), ("CC", "cc -nonsense"), ("SCVI_CODEGEN_CFLAGS", "-O0 'x"), ("SCVI_CODEGEN_CFLAGS", "-nonsense"),
+    ("SCVI_CODEGEN_CACHE", "/proc/none"), ("SCVI_CODEGEN_CACHE", "/dev/null"), ("SCVI_CODEGEN_CACHE", "x" * 5000),
+    ("SCVI_CODEGEN_CACHE_SIZE", "huge"), ("SCVI_CODEGEN_CACHE_SIZE", "-1"), ("TMPDIR", "/no/such/folder"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), ENVIRONMENT, ids=lambda text: text[:20])
+def test_the_environment(name: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "double answer(void);\n"
+    code = '#include "tiny.h"\ndouble answer(void) { return 1.0; }\n'
+    tiny = Source(prefix="tiny", header=text, code=code, declarations=text)
+    monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
+    monkeypatch.setattr(building, "_loaded", {})
+    monkeypatch.setenv(name, value)
+    compilers.compiler_version.cache_clear()
+    error = refused(lambda: building.load(tiny, flags=("-O0",)))
+    assert error is None or isinstance(error, sc.BuildError)
+    assert os.environ[name] == value
