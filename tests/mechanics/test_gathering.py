@@ -149,3 +149,16 @@ def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
     own = sc.compile_indexed(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
     other = sc.compile_stepper(written, "svi:2").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
     assert np.abs(own.q["q"] - other.q).max() < 1e-15
+
+
+@pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
+def test_names_of_parameters_are_no_names_of_arrays_and_tables(name):
+    written = lagrangian(["x", "y"], f"x_dot**2/2 + y_dot**2/2 - {name}*x**2/2 - 3*{name}*y**2/2", **{name: 1.3})
+    found = sc.gather_sums(written)
+    own = sc.compile_indexed(found.system, "stoermer-verlet").integrate(
+        [1.0, 2.0], h=0.1, steps=3, tables=found.tables, parameters={**found.parameters, name: 1.7}
+    )
+    other = sc.compile_stepper(written, "stoermer-verlet")
+    (q,) = own.q.values()
+    expected = other.integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3, parameters={name: 1.7}).q
+    assert np.abs(q - expected).max() < 1e-15

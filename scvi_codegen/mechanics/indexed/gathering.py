@@ -6,6 +6,7 @@ q[places[b, 1]], c[b])), with a table of places and arrays of numbers.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,8 @@ class GatheredSums:
     """A system as sums over indices, and the data with which it is the system that was written out.
 
     Attributes:
-        system: of one array q[N], the coordinates in their order.
+        system: of one array q[N], the coordinates in their order; named qg[Ng] or the like, with the other names,
+            where a parameter or an input of the system has one of these names.
         tables: places by name; parameters: numbers, one an element, by name; both as runs take them.
     """
 
@@ -59,9 +61,11 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
     chain: L(q[N]) = sum(b in B0, c0_1[b]*(-q[at0[b, 0]] + q[at0[b, 1]])**2) + sum(b in B1, q_dot[at1[b, 0]]**2/2)
     """
     _check_what_stands_beside(system)
-    places = {q: ("q", k) for k, q in enumerate(system.coordinates)}
-    places |= {v: (f"q{DOT}", k) for k, v in enumerate(system.velocities)}
-    places |= {p: ("p", k) for k, p in enumerate(system.auxiliaries)}
+    mark = _mark({*map(str, system.constants), *system.inputs})
+    q, p, b, n = (f"{name}{mark}" for name in "qpbN")
+    places = {each: (q, k) for k, each in enumerate(system.coordinates)}
+    places |= {each: (f"{q}{DOT}", k) for k, each in enumerate(system.velocities)}
+    places |= {each: (p, k) for k, each in enumerate(system.auxiliaries)}
     named = {formula: name for name, formula in input_formulas(system.inputs, system.time).items()}
     function, *forces = (each.xreplace(named) for each in (system.formula, *system.forces))
     acting = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
@@ -72,24 +76,32 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
         raise SystemDefinitionError(
             f"the terms of '{system.name}' are of more than {MOST_FAMILIES} kinds: they are no sums of few"
         )
-    found = [_family(str(k), kind, defaults) for k, kind in enumerate((*kinds, *pulls))]
+    found = [_family(f"{mark}{k}", b, kind, defaults) for k, kind in enumerate((*kinds, *pulls))]
     used = {name: value for each in found for name, value in each.numbers.items()}
-    fields = {f"{name}[B{k}]": 1.0 for k, each in enumerate(found) for name in each.fields}
-    written = " + ".join(f"sum(b in B{k}, {each.text})" for k, each in enumerate(found[: len(kinds)]))
-    given = {"hamiltonian": written, "momenta": ["p[N]"]} if system.auxiliaries else {"lagrangian": written}
+    fields = {f"{name}[B{mark}{k}]": 1.0 for k, each in enumerate(found) for name in each.fields}
+    written = " + ".join(f"sum({b} in B{mark}{k}, {each.text})" for k, each in enumerate(found[: len(kinds)]))
+    given = {"hamiltonian": written, "momenta": [f"{p}[{n}]"]} if system.auxiliaries else {"lagrangian": written}
     return GatheredSums(
         IndexedSystem.from_text(
             name=system.name,
-            coordinates=["q[N]"],
+            coordinates=[f"{q}[{n}]"],
             parameters={**used, **fields},
-            tables=[f"at{k}[B{k}, {each.table.shape[1]}]" for k, each in enumerate(found)],
-            forces={f"q[at{k}[b, 0]]": each.text for k, each in enumerate(found) if k >= len(kinds)},
+            tables=[f"at{mark}{k}[B{mark}{k}, {each.table.shape[1]}]" for k, each in enumerate(found)],
+            forces={f"{q}[at{mark}{k}[{b}, 0]]": each.text for k, each in enumerate(found) if k >= len(kinds)},
             inputs=system.inputs,
             **given,
         ),
-        {f"at{k}": each.table for k, each in enumerate(found)},
+        {f"at{mark}{k}": each.table for k, each in enumerate(found)},
         {name: values for each in found for name, values in each.fields.items()},
     )
+
+
+def _mark(names: set[str]) -> str:
+    """Return letters behind the names of arrays, indices, sizes and tables, so that none of them is a parameter's."""
+    mark = ""
+    while any(re.fullmatch(rf"(q|p|b|N|p_q){mark}|q{mark}{DOT}|(at|B|c){mark}\d+(_\d+)?", name) for name in names):
+        mark += "g"
+    return mark
 
 
 def _check_what_stands_beside(system: MechanicalSystem) -> None:
@@ -122,18 +134,18 @@ class _Family:
     numbers: dict[str, float]
 
 
-def _family(name: str, kind: LikeTerms, defaults: dict[Symbol, float]) -> _Family:
+def _family(name: str, index: str, kind: LikeTerms, defaults: dict[Symbol, float]) -> _Family:
     fields: dict[str, NDArray[np.float64]] = {}
     numbers: dict[str, float] = {}
     constants: list[str] = []
     for k, column in enumerate(zip(*kind.constants, strict=True)):
         if len(set(column)) > 1:
             fields[f"c{name}_{k}"] = np.array([float(defaults.get(each, each)) for each in column])
-            constants.append(f"c{name}_{k}[b]")
+            constants.append(f"c{name}_{k}[{index}]")
         else:
             numbers |= {column[0].name: defaults[column[0]]} if column[0] in defaults else {}
             constants.append(str(column[0]) if _is_plain(column[0]) else f"({column[0]})")
-    text = kind.written(lambda k: f"[at{name}[b, {k}]]", constants.__getitem__)
+    text = kind.written(lambda k: f"[at{name}[{index}, {k}]]", constants.__getitem__)
     width = max(1, *map(len, kind.places))  # of terms without coordinates one column, which nothing reads
     table = np.zeros((len(kind.places), width), dtype=np.int32)
     table[:, : len(kind.places[0])] = kind.places
