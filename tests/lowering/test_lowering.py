@@ -21,7 +21,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient, jacobian
 from scvi_codegen.ir.arithmetic import DEEPEST_EXPRESSION, lower_kernel
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
+from scvi_codegen.methods import SCVI, SVI, Gauss, RadauIIA, SpectralCollocation
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import double_pendulum, duffing, fput_chain, kepler
 from scvi_codegen.native.compilers import find_compiler
@@ -328,3 +328,9 @@ def test_printed_numbers_read_back_as_the_same_double(number):
 def test_the_whole_catalogue_lowers():
     for name in PROBLEMS:
         assert lowered(problem(name).system, SVI(2)).kernels
+
+
+@pytest.mark.parametrize(("method", "symmetric"), [(SVI(2), True), (RadauIIA(2), False)])
+def test_notes_say_whether_a_method_is_symmetric(method, symmetric):
+    notes = lowered(problem("kepler").system, method).notes
+    assert ("symmetric" in notes, "not symmetric" in notes) == (symmetric, not symmetric)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
+from scvi_codegen.models.systems import point_vortices
 from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
@@ -47,3 +48,51 @@ def test_steps_that_choose_their_length_do_not_drift(angle):
     run = stepper.start(turn @ q, turn @ p, t_end=30_000 * 2 * np.pi, tolerance=1e-20)
     energy = run.record(every=STEPS // 200).energy()
     assert abs(energy / energy[0] - 1).max() < 6e-13
+
+
+ROD = sc.LagrangianSystem.from_text(
+    name="rod", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"]
+)
+RODS = sc.LagrangianSystem.from_text(
+    name="two rods",
+    coordinates=["x1", "y1", "x2", "y2"],
+    lagrangian="m*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - g*(m*y1 + y2)",
+    parameters={"m": 2.0, "g": 3.0},
+    constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+)
+OWN = {"rod": ROD, "two rods": RODS, "vortices": point_vortices(2)}
+
+
+MILLION = 1_000_000
+LONG = {
+    "kepler": ("kepler", "svi:8", "fixed-point", 0.3, ([0.8, 0.0], [0.0, np.sqrt(1.5)])),
+    "kepler by Newton": ("kepler", "svi:6", "newton", 0.15, ([0.8, 0.0], [0.0, np.sqrt(1.5)])),
+    "henon-heiles": ("henon-heiles", "svi:8", "fixed-point", 0.4, ([0.1, 0.2], [0.2, 0.1])),
+    "henon-heiles by composition": (
+        "henon-heiles",
+        {"method": "composition", "order": 8},
+        "auto",
+        0.05,
+        ([0.1, 0.2], [0.2, 0.1]),
+    ),
+    "planar-pendulum": ("planar-pendulum", "gauss:8", "fixed-point", 0.1, ([1.0], [0.3])),
+    "double-pendulum": ("double-pendulum", "svi:8", "fixed-point", 0.02, ([0.4, -0.2], [0.1, 0.2])),
+    "double-pendulum by Newton": ("double-pendulum", "scvi:6", "newton", 0.02, ([0.4, -0.2], [0.1, 0.2])),
+    "charged-particle": ("charged-particle", "gauss:8", "fixed-point", 0.1, ([0.6, 0.3, -0.2], [-0.3, 0.4, 0.5])),
+    "two vortices": ("vortices", "gauss:6", "fixed-point", 0.05, ([0.5, -0.4], [0.1, 0.3])),
+    "rod": ("rod", "svi:6", "auto", 0.02, ([0.6, -0.8], [0.4, 0.3])),
+    "two rods": ("two rods", "svi:5", "auto", 0.02, ([0.6, -0.8, 1.4, -1.4], [0.8, 0.6, 0.7, 0.7])),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", LONG)
+def test_energies_of_a_million_steps_walk_at_random(name):
+    """Beside a part of the walk of a sum that rounds the state in every step: half of it for close vortices."""
+    part = 0.5 if "vortices" in name else 0.25
+    system, method, solver, h, state = LONG[name]
+    given = OWN[system] if system in OWN else sc.problem(system).system
+    method = sc.methods.method_from_specification(method) if isinstance(method, dict) else method
+    stepper = sc.compile_stepper(given, method, solver=solver)
+    energy = stepper.integrate(*state, h=h, steps=MILLION, every=MILLION // 200).energy()
+    assert abs(energy - energy[0]).max() < part * 2.0**-52 * np.sqrt(MILLION) * max(1.0, abs(energy[0]))

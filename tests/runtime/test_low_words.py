@@ -218,7 +218,7 @@ def test_work_is_the_sum_of_what_each_step_gives() -> None:
 
 
 BY_DESIGN = ("Newton", "rattle", "lobatto")
-"""Forces at the start of their steps are those of the high word: an error of the size of a rounding of the increment."""
+"""Forces at the start of their steps are those of the high word: an error like a rounding of the increment."""
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
