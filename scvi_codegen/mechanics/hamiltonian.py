@@ -78,10 +78,10 @@ class HamiltonianSystem(MechanicalSystem):
     )
     def from_text(
         cls,
-        *,
         name: str,
         coordinates: Sequence[str],
         hamiltonian: str,
+        *,
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,

@@ -88,10 +88,10 @@ class LagrangianSystem(MechanicalSystem):
     )
     def from_text(
         cls,
-        *,
         name: str,
         coordinates: Sequence[str],
         lagrangian: str,
+        *,
         parameters: Mapping[str, float] | None = None,
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,

@@ -18,12 +18,14 @@ NEEDED = 6
 """Newton's iteration is needed, and is not there (:mod:`scvi_codegen.native.binding`), or had no memory."""
 
 VANISHED = (
-    "the motion ends there (a collision, a singularity), its forces are not smooth, or from rest at the origin they "
+    "the step size is below machine precision: the motion ends there (a collision, a singularity, a mass of 0), its "
+    "forces are not smooth, or from rest at the origin they "
     "grow as a power of t beyond the method's degree: take a higher one"
 )
 ADVICE = {
     "not converged": "try a smaller step, solver='newton' where the system is stiff, or more iterations",
-    "singular": "the Newton matrix has no inverse there: try a smaller step, or more quadrature points",
+    "singular": "the Newton matrix has no inverse there: check that no mass is 0 with these parameters, else try "
+    "a smaller step, or more quadrature points",
     "vanished": VANISHED,
     "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",
     "no memory": "Newton's iteration found none: the machine's is used up",

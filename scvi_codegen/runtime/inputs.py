@@ -51,8 +51,10 @@ class TakesInputs(Protocol):
 
 
 def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
-    """A finite, contiguous (m,) copy."""
+    """Return a finite, contiguous (m,) copy; of one coordinate a number will do."""
     array, coordinates = real_array(value, name), interface.coordinates
+    if array.ndim == 0 and interface.dimension == 1:
+        array = array.reshape(1)
     if array.shape != (interface.dimension,):
         names = ", ".join(coordinates[:6]) + (", ..." if interface.dimension > 6 else "")
         raise StateError(f"{name} must have shape ({interface.dimension},) for ({names}), not {array.shape}")
@@ -67,7 +69,7 @@ def checked_states(
 ) -> tuple[Array, Array, Array]:
     """(n,) times and (n, m) positions and momenta (or what ``second`` names), contiguous, of one state or many."""
     positions, momenta = real_array(q, "q"), real_array(p, second)
-    if positions.ndim == 1:
+    if positions.ndim <= 1:
         positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
     elif positions.ndim != 2 or positions.shape != momenta.shape or positions.shape[1] != interface.dimension:
         raise StateError(

@@ -75,6 +75,30 @@ def test_of_a_system(given, said):
     assert said in str(caught.value)
 
 
+def test_a_system_may_be_given_by_place_and_one_coordinate_by_a_number(stepper):
+    for kind, formula in ((sc.LagrangianSystem, TEXT["lagrangian"]), (sc.HamiltonianSystem, "p_q**2/2 - cos(q)")):
+        by_name = {"lagrangian": formula} if kind is sc.LagrangianSystem else {"hamiltonian": formula}
+        assert kind.from_text("swing", ["q"], formula) == kind.from_text(name="swing", coordinates=["q"], **by_name)
+    text = "sum(a in N, q_dot[a]**2/2)"
+    assert sc.IndexedSystem.from_text("chain", ["q[N]"], text).name == "chain"
+    run = stepper.integrate(1.0, 0.5, h=0.1, steps=3)
+    assert run.q.tolist() == stepper.integrate([1.0], [0.5], h=0.1, steps=3).q.tolist()
+    assert stepper.energy(1.0, 0.5) == stepper.energy([1.0], [0.5])
+    with pytest.raises(ScviCodegenError, match=r"q must have shape \(2,\) for \(q1, q2\), not \(\)"):
+        sc.compile_stepper(sc.problem("kepler").system, "svi:2", flags=QUICK_FLAGS).energy(1.0, 0.5)
+
+
+def test_a_mass_of_0_and_steps_that_vanish_are_explained():
+    text = {"lagrangian": "m*q_dot**2/2 - q**2/2", "parameters": {"m": 1.0}}
+    stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT | text), "svi:2", flags=QUICK_FLAGS)
+    for given, said in (
+        ({"h": 0.1, "steps": 9}, "no mass is 0"),
+        ({"t_end": 1.0}, "below machine precision.*mass of 0"),
+    ):
+        with pytest.raises(sc.StepFailedError, match=said):
+            stepper.integrate([1.0], [0.0], parameters={"m": 0.0}, **given)
+
+
 @pytest.mark.parametrize(
     ("name", "meant"),
     [("verlet", "stoermer-verlet"), ("leapfrog", "stoermer-verlet"), ("midpoint", "gauss:1"), ("svl:4", "svi")],

@@ -109,10 +109,10 @@ class IndexedSystem:
     )
     def from_text(
         cls,
-        *,
         name: str,
         coordinates: Sequence[str],
         lagrangian: str | None = None,
+        *,
         hamiltonian: str | None = None,
         momenta: Sequence[str] | None = None,
         parameters: Mapping[str, float] | None = None,
