@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import click
 
 from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.frame import tell
 from scvi_codegen.cli.wording import duration
-from scvi_codegen.errors import StateError
+from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.given.counts import check_tolerance
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.global_error import GlobalError
 
-__all__ = ["advised_model", "controlled_model"]
+__all__ = ["advised_model", "confirmed_model", "controlled_model"]
 
 AnyModel = TypeVar("AnyModel", Model, IndexedModel)
 ROUND_OFF = 2.0**-52
@@ -36,6 +38,50 @@ def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
         click.echo(f"Warning: doubles do not allow {tolerance:g}: steps are as accurate as they do", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF else None
     return replace(model, h=None, tolerance=allowed, steps=None, span=model.covered)
+
+
+def confirmed_model(
+    model: Model, error: float, *, solver: str, options: SolverOptions | None
+) -> tuple[Model, GlobalError]:
+    """Return the model with the local tolerance whose run other runs confirm, and what they confirm; prints it.
+
+    Steps of the same tolerance are the same, to the last bit, so that the run to come is the one that was confirmed.
+
+    Raises:
+        StateError: unless the error is positive and below 1, and for steps of tau.
+    """
+    stepper = model.stepper(solver=solver)
+    p = model.momenta(stepper)
+    given: dict[str, Any] = {
+        "t": model.t,
+        "t_end": model.t + model.covered,
+        "parameters": model.parameters,
+        "options": options,
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AccuracyWarning)  # in words below
+        if model.system.inputs:
+            found = stepper.drive(model.q, p, inputs=model.all_inputs(), error=error, **given).confirmation
+        else:
+            found = stepper.integrate(model.q, p, error=error, **given).confirmation
+    assert found is not None  # by construction
+    local = f"{found.tolerance:.1e}" if found.tolerance else "round-off"
+    numbers = {
+        "requested": error,
+        "estimate": found.estimate,
+        "digits": found.digits,
+        "confirmed": found.confirmed,
+        "confirmed_until": found.confirmed_until,
+        "tolerance": found.tolerance,
+        "runs": found.runs,
+    }
+    tell(
+        f"global error: estimated at {found.estimate:.1e} (relative) from {found.runs} runs of different steps; "
+        f"{error:g} is confirmed until t = {found.confirmed_until:g}, with a local tolerance of {local}",
+        global_error=numbers,
+    )
+    chosen = replace(model, h=None, tolerance=found.tolerance or None, steps=None, span=model.covered)
+    return chosen, found
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 import warnings
 
 import mpmath
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from extrapolation import Real, integrated
 
 import scvi_codegen as sc
+from scvi_codegen.cli import main
 
 MASSES = np.array([3, 4, 5], dtype=Real)
 
@@ -484,3 +488,29 @@ class TestSolveMotion:
     def test_beside_another_choice_of_steps(self, kepler_stepper):
         with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
             sc.solve_motion(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
+
+
+class TestCommandLine:
+    def test_words_and_json_agree_with_the_states(self, tmp_path):
+        words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", str(tmp_path / "orbit.npz")]
+        told = CliRunner().invoke(main, words)
+        document = json.loads(CliRunner().invoke(main, [*words, "--json"]).stdout)
+        found, kept = document["global_error"], np.load(tmp_path / "orbit.npz")
+        exact = on_an_ellipse(kept["q"][0], kept["p"][0], kept["t"])
+        size = np.linalg.norm(kept["q"], axis=1).max()
+        assert told.exit_code == 0
+        assert f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in told.output
+        assert np.linalg.norm(exact[:, :2] - kept["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
+        assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
+        assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, kept["t"][-1])
+
+    def test_what_is_not_confirmed_ends_with_1(self):
+        result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
+        assert result.exit_code == 1
+        assert re.search(r"the global error 1e-09 is confirmed until t = [\d.]+ only", result.output)
+
+    @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
+    def test_one_choice_of_steps_alone(self, other):
+        result = CliRunner().invoke(main, ["run", "kepler", "--error", "1e-9", other, "1e-9"])
+        assert result.exit_code == 2
+        assert "exclude each other" in result.output

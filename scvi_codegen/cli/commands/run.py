@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from scvi_codegen.advice.promise import broken_promise
-from scvi_codegen.cli.advising import advised_model, controlled_model
+from scvi_codegen.cli.advising import advised_model, confirmed_model, controlled_model
 from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
 from scvi_codegen.cli.conservation import energy_balance
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
@@ -24,6 +24,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.overview import plot_trajectory
+from scvi_codegen.runtime.global_error import GlobalError
 
 __all__ = ["run"]
 
@@ -37,6 +38,9 @@ asked for.
 With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
 pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
 exit status 1.
+
+With --error the global error of the whole run is bounded: the tolerance of the steps is chosen until runs with
+other steps confirm it. A run that they confirm in part ends with exit status 1 and the time until which they do.
 
 With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
 symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
@@ -70,6 +74,7 @@ Examples:
   scvi-codegen run outer-solar-system --plot orbits.png
   scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
   scvi-codegen run kepler --tolerance 1e-12
+  scvi-codegen run kepler --error 1e-9
   scvi-codegen run kepler --advise 1e-9
   scvi-codegen run kepler --monitor frequency --span 1000
   scvi-codegen run kepler --monitor frequency --controller reversible --step 0.2
@@ -108,6 +113,12 @@ Examples:
     "one step of tau is chosen for it.",
 )
 @click.option(
+    "--error",
+    type=float,
+    metavar="X",
+    help="Bound of the relative global error of all states, by adaptive steps and confirmed by runs of other steps.",
+)
+@click.option(
     "--advise",
     type=float,
     metavar="X",
@@ -130,6 +141,7 @@ def run(
     plot: str | None,
     ensemble: str | None,
     tolerance: float | None,
+    error: float | None,
     advise: float | None,
     solver: str,
     solver_tolerance: float | None,
@@ -148,14 +160,14 @@ def run(
     recorded = output is not None and is_folder(output)
     recording.check(recorded)
     _check_outputs(output, plot, ensemble)
-    wanted = {"tolerance": tolerance, "advise": advise}
+    wanted = {"tolerance": tolerance, "error": error, "advise": advise}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
     model = read_model(model_name, Choices(**choices))
     given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
-        refuse({"ensemble": ensemble, "advise": advise})
+        refuse({"ensemble": ensemble, "advise": advise, "error": error})
         model = solved_by(solver, model)
         run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options, threads)
         return
@@ -166,14 +178,29 @@ def run(
     if ensemble is not None:
         _run_ensemble(model, ensemble, output, solver, options)
         return
-    if tolerance is not None:
-        model = controlled_model(model, tolerance)
-    if advise is not None:
-        model = advised_model(model, advise, solver=solver, options=options)
+    model, found = _with_steps(model, wanted, solver, options)
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, solver=solver, options=options))
         return
     _run_one(model, output, plot, solver, options, promised=advise)
+    if found is not None and not found.confirmed:
+        unconfirmed = f"the global error {error:g} is confirmed until t = {found.confirmed_until:g} only"
+        tell(broken=unconfirmed)
+        raise CommandFailure(unconfirmed, FAILURE)
+
+
+def _with_steps(
+    model: Model, wanted: dict[str, float | None], solver: str, options: SolverOptions | None
+) -> tuple[Model, GlobalError | None]:
+    """Return the model with the steps that one of the wanted errors determines, and what confirms them."""
+    tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
+    if tolerance is not None:
+        return controlled_model(model, tolerance), None
+    if error is not None:
+        return confirmed_model(model, error, solver=solver, options=options)
+    if advise is not None:
+        return advised_model(model, advise, solver=solver, options=options), None
+    return model, None
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
@@ -199,7 +226,7 @@ def _check_combination(
         raise click.UsageError("--plot is for a trajectory in memory, not for a run in a folder")
     given = [name for name, value in wanted.items() if value is not None]
     if len(given) > 1:
-        raise click.UsageError("--tolerance and --advise exclude each other: steps of their own, or one for all")
+        raise click.UsageError(f"--{given[0]} and --{given[1]} exclude each other: each chooses the steps; give one")
     for name in ("step", "steps") if given else ():
         if choices[name] is not None:
             raise click.UsageError(f"--{given[0]} chooses the step: leave out --{name} (--span is the length)")
