@@ -30,6 +30,7 @@ from scvi_codegen.errors import (
     closest,
 )
 from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.models.meant import EVENTS
 from scvi_codegen.native.waiting import told_to
 
 __all__ = [
@@ -121,6 +122,10 @@ class Commands(click.Group):
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)
+        except click.NoSuchOption as error:
+            if error.option_name not in ("--event", "--events"):
+                raise
+            raise click.UsageError(f"there is no option '{error.option_name}': {EVENTS}", error.ctx) from error
         except (StepFailedError, BuildError, RecordingError) as error:
             raise CommandFailure(str(error), FAILURE) from error
         except ScviCodegenError as error:

@@ -8,7 +8,7 @@ from typing import Final
 from scvi_codegen.errors import closest
 from scvi_codegen.given.words import meanings, same_here
 
-__all__ = ["meant_by"]
+__all__ = ["EVENTS", "meant_by"]
 
 KEYS: Final = {
     "run": "step span steps tolerance every controller",
@@ -16,6 +16,7 @@ KEYS: Final = {
     "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints monitor inputs",
 }
+EVENTS: Final = "events exist in Python only, as stepper.integrate(..., events=[...])"
 PLACES: Final = {
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
     **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},
@@ -31,6 +32,8 @@ def meant_by(key: str, names: Iterable[str]) -> str:
         names: those known in its place.
     """
     known = list(names)
+    if key in ("event", "events"):
+        return f"; {EVENTS}."
     if here := same_here(key, known):
         return here
     if (hint := closest(key, known)) != ".":

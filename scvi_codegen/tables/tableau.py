@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import lru_cache
 from itertools import count as count_from
 from itertools import pairwise
@@ -45,6 +46,8 @@ __all__ = [
 ]
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
+SMALL_DENOMINATOR, ROUNDINGS = 1000, 2
+"""Of a rational that a float is taken for, and how many roundings it may be off."""
 MOST_STAGES = 64
 
 
@@ -161,9 +164,10 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
     """Return the collocation method on ascending distinct abscissae c_1 .. c_s (usually in [0, 1]).
 
     a_ij is the integral of l_j from 0 to c_i, b_j that from 0 to 1: equation (23); GNI, theorem II.1.4. Raises
-    ``MethodError`` when the abscissae are not ascending.
+    ``MethodError`` when the abscissae are not ascending. Floats stand for the rational, or the symmetric pair, of which
+    they are roundings: order and symmetry of [0.1, 0.5, 0.9] are those of 1/10, 1/2, 9/10.
     """
-    c = tuple(map(to_number, abscissae))
+    c = _intended(tuple(abscissae))
     if len(c) > MOST_STAGES:
         raise MethodError(f"{len(c)} abscissae are too many: take at most {MOST_STAGES}, and more steps")
     for index, (left, right) in enumerate(pairwise(c), start=1):
@@ -172,6 +176,23 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
                 f"abscissa {index} is {mp.nstr(right, 8)}, not above the one before it; sort them, each once"
             )
     return tableau_on(c, name)
+
+
+def _intended(abscissae: Sequence[Any]) -> Vector:
+    """Numbers, floats within some roundings of a rational of small denominator or of 1 - c of another being these."""
+    c, slack = list(map(to_number, abscissae)), ROUNDINGS * mp.mpf(2) ** -53
+    floats = [isinstance(value, float) for value in abscissae]
+    for i, number in enumerate(c):
+        if floats[i]:
+            near = Fraction(abscissae[i]).limit_denominator(SMALL_DENOMINATOR)
+            rational = mp.mpf(near.numerator) / near.denominator
+            c[i] = rational if abs(rational - number) <= slack * abs(number) else number
+    for i in range((len(c) + 1) // 2):
+        j = len(c) - 1 - i
+        if floats[i] and floats[j] and not is_zero(c[i] + c[j] - 1) and abs(c[i] + c[j] - 1) <= slack:
+            c[i] = (c[i] - c[j] + 1) / 2
+            c[j] = 1 - c[i]
+    return tuple(c)
 
 
 @lru_cache(maxsize=256)

@@ -225,6 +225,7 @@ class TestChoices:
             ("kepler --method gauss:", "a number, its stages, follows the colon, as in gauss:8"),
             ("kepler --method collocation:2", "no number follows collocation; it takes abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),
+            ("kepler --event q1", "events exist in Python only, as stepper.integrate(..., events=[...])"),
             (
                 "kepler --stages 3",
                 "unknown key 'stages' in [method] for svi; did you mean 'degree'? Known: method, degree, quadrature",

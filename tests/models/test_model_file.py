@@ -125,7 +125,11 @@ def test_names_that_need_quotes_survive_a_round_trip():
 
 def test_methods_without_a_name_are_refused_rather_than_changed():
     own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
-    for method in (SVI(2, own), METHODS["collocation"](("1/3", 1)), replace(Gauss(3), tableau=lobatto_iiib(3))):
+    for method in (
+        SVI(2, own),
+        METHODS["collocation"](("0.3333333333333333333", 1)),
+        replace(Gauss(3), tableau=lobatto_iiib(3)),
+    ):
         with pytest.raises(ModelFileError, match=r"quadrature|method"):
             dump_model(kepler(method=method))
 
@@ -155,6 +159,11 @@ def test_a_catalogue_reference_may_be_changed():
     ("old", "new", "message"),
     [
         ("[run]", "[rum]", "unknown section 'rum' in the file; did you mean 'run'?"),
+        (
+            "[system]",
+            "[[events]]\nfunction = 'q'\n[system]",
+            "section 'events' in the file; events exist in Python only",
+        ),
         ("[method]", "[zzz]", "Known: system, forces, inputs, parameters, initial, method, run"),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),

@@ -104,6 +104,7 @@ METHODS = (
     Gauss(2, form="position"),
     RadauIA(2, form="position"),
     CollocationRK([0.2, 0.9]),
+    CollocationRK([0.1, 0.5, 0.9]),
     StoermerVerlet(),
     ExplicitEuler(),
     ExplicitEuler(form="position"),

@@ -349,3 +349,21 @@ def test_impossible_requests_are_refused(call: object, message: str) -> None:
 
 def test_the_euler_method_has_a_name_too() -> None:
     assert tableau_by_name("explicit-euler") is explicit_euler()
+
+
+@pytest.mark.parametrize(
+    ("floats", "meant", "order", "symmetric"),
+    [
+        ([0.1, 0.5, 0.9], [Fraction(1, 10), Fraction(1, 2), Fraction(9, 10)], 4, True),
+        ([0.1, 0.7, 1.0 - 0.1], [Fraction(1, 10), Fraction(7, 10), Fraction(9, 10)], 3, False),
+        ([1 / 3, 1.0], [Fraction(1, 3), 1], 3, False),
+        ([0.21132486540518713, 0.7886751345948129], None, 2, True),
+        ([0.1, 0.5, 0.9 + 1e-14], None, 3, False),
+    ],
+)
+def test_floats_are_taken_for_the_numbers_that_they_are_roundings_of(floats, meant, order, symmetric):
+    tableau = collocation_tableau(floats)
+    assert (tableau.order, tableau.is_symmetric) == (order, symmetric)
+    if meant is not None:
+        assert max(abs(c - other) for c, other in zip(tableau.c, collocation_tableau(meant).c, strict=True)) < 1e-50
+    assert max(abs(c - given) for c, given in zip(tableau.c, floats, strict=True)) < 3e-16
