@@ -644,3 +644,25 @@ def test_of_one_forms_whose_forces_depend_on_velocities_nothing_is_claimed():
     own = Gauge(**{each.name: getattr(plain, each.name) for each in fields(plain) if each.init})
     assert symmetries(plain) != ()
     assert symmetries(own) == ()
+
+
+def test_the_lagrangian_changes_by_the_rate_of_the_gauge():
+    """Noether's condition xi . L_q + xi' . L_v = df/dt, and J = p . xi - f, from the definition."""
+    system = LagrangianSystem.from_text(
+        "falling pair", ["x", "y"], "(3*x_dot**2 + 2*y_dot**2)/2 - (x - y)**2/2 - g*(3*x + 2*y)", parameters={"g": 2.0}
+    )
+    q, v, t = system.coordinates, system.velocities, system.time
+    found = symmetries(system)
+    assert any(each.gauge != 0 for each in found)
+
+    def rate(f):
+        return f.diff(t) + sum(f.diff(x) * u for x, u in zip(q, v, strict=True))
+
+    for each in found:
+        change = sum(
+            xi * system.lagrangian.diff(x) + rate(xi) * system.lagrangian.diff(u)
+            for xi, x, u in zip(each.direction, q, v, strict=True)
+        )
+        assert sympy.expand(change - rate(each.gauge)) == 0
+        carried = sum(p * xi for p, xi in zip(each.momenta, each.direction, strict=True))
+        assert sympy.expand(each.momentum_map - carried + each.gauge) == 0

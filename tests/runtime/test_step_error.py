@@ -63,3 +63,12 @@ def test_where_momenta_are_unknowns_newtons_iteration_estimates_as_sweeps_do():
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])
 def test_nor_of_a_step_by_newtons_iteration(method):
     check_all_phases(SYSTEMS["quartic"], method, "newton")
+
+
+def test_the_worst_step_begins_at_the_perihelion():
+    """Half a period (pi, for a semi-major axis of 1) after the aphelion, wherever the run starts in time."""
+    stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(3), flags=("-O0",))
+    for start in (0.0, 7.25, -3.5):
+        run = stepper.integrate([1.6, 0.0], [0.0, 0.5], h=0.05, steps=120, t=start)
+        assert abs(run.step_error_t - (start + np.pi)) < 2 * 0.05
+        assert np.abs(run.t - run.step_error_t).min() < 1e-12
