@@ -1,5 +1,5 @@
 /* Runs to a time, by steps that choose their own length. Before it: a controller: what a trial of a step is,
- * begin_trials, find_step, and take_step, which makes the step found the state. */
+ * begin_trials, find_step, confirm_step, and take_step, which makes the step found the state. */
 
 int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
@@ -19,7 +19,9 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   load_state(run, &now.at);
   while (report->steps < steps && !has_arrived(now.at.t, now.at.t_low, t_end)) {
     const long long before = report->iterations;
-    const int status = find_step(run, &now, options, report);
+    int status = find_step(run, &now, options, report);
+    if (status == OK)
+      status = confirm_step(run, &now, options, report);
     if (status != OK) {
       save_state(&now.at, run);
       return status;

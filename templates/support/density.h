@@ -61,10 +61,15 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
       now->step.scratch + SCRATCH);
 }
 
+static int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  (void)report;
+  return observe_error(run, &now->step, &now->data, now->dq, now->dp, options, now->step.scratch + SCRATCH);
+}
+
 /* Makes the step that was found the state. */
 static void take_step(run_memory *run, trial *now)
 {
-  observe_error(run, &now->step, &now->data, now->dq, now->dp, now->step.scratch + SCRATCH);
   add_compensated(now->at.q, now->at.carry_q, now->dq);
   add_compensated(now->at.p, now->at.carry_p, now->dp);
   if (now->last) {

@@ -59,7 +59,7 @@ def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
         KEPLER, (0.0, 6.0), far, monitor="1e-3*(1 + (q1**2 + q2**2)/1000)", rtol=1e-10, method=sc.SVI(8)
     )
     assert not found.success
-    assert found.status == -2
+    assert found.status in (-1, -2)  # a step at the sun has no solution by halves, or too large an error
 
 
 def test_what_is_said_of_a_too_wrong() -> None:

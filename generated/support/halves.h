@@ -1,0 +1,95 @@
+/* A step compared with two of half its length: what its curve cannot tell, where it has too few points, where forces
+ * pass through zero at them, or where it is another solution of the stage equations. Before it: prepare and solve of a
+ * solver, duration. */
+
+#define COMPARED 512 /* steps, of which one is compared */
+#define FALLBACK_COMPARED 8 /* steps that sweeps did not solve, of which one is */
+#define DOUBTFUL REAL(4.0) /* times the largest error yet, squared as that of a curve: such a step is */
+#define RESOLVED_STEP REAL(1e-6) /* of the state: where halves differ by more, those of the first half are compared */
+#define MOST_HALVINGS 24
+#define ROUNDING_OF_HALVES (64 * REAL_EPSILON)
+
+static real duration(const step_data *step, const solver_data *data, const real *memory, long long guess,
+    real *workspace);
+
+/* Solves a step without a guess; the increments without their low parts are added to those given. */
+static SELDOM int add_part(step_data *part, const solver_options *options, real *dq, real *dp)
+{
+  real memory[MEMORY], own_q[2 * M] = {0}, own_p[2 * M] = {0};
+  solver_report report = {0};
+  solver_data data;
+  long long guess = 0;
+  int status;
+  prepare(part, &data);
+  status = solve(part, &data, memory, &guess, own_q, own_p, options, &report, part->scratch + SCRATCH);
+  if (status != OK)
+    return status;
+  part->t += duration(part, &data, memory, guess, part->scratch + SCRATCH);
+  for (int i = 0; i < M; i++) {
+    dq[i] += own_q[i];
+    dp[i] += own_p[i];
+  }
+  return 0 * part->t == 0 ? OK : NOT_FINITE;
+}
+
+/* Solves two steps of h/2: the increments of both, and those of the first. */
+static SELDOM int solve_halves(const step_data *step, real h, const solver_options *options, real *dq, real *first)
+{
+  const real nothing[M] = {0};
+  real q[M], p[M], dp[M] = {0};
+  step_data part = *step;
+  int status;
+  part.h = h / 2;
+  part.first = 1;
+  part.tables = NULL;
+  memset(dq, 0, sizeof(real) * M);
+  status = add_part(&part, options, dq, dp);
+  if (status != OK)
+    return status;
+  memcpy(first, dq, sizeof(real) * M);
+  for (int i = 0; i < M; i++) {
+    q[i] = step->q0[i] + (step->carry_q[i] + dq[i]);
+    p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
+  }
+  part.q0 = q;
+  part.p0 = p;
+  part.carry_q = part.carry_p = nothing;
+  return add_part(&part, options, dq, dp);
+}
+
+/* The difference of the increments, relative to the state that `halves` lead to; 0 where it may be rounding. */
+static real difference(const step_data *step, const real *whole, const real *halves)
+{
+  real largest = 0, most = 0;
+  for (int i = 0; i < M; i++)
+    largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(halves[i]));
+  for (int i = 0; i < M; i++) {
+    const real size = MATH(fabs)(step->q0[i]) + MATH(fabs)(halves[i]) + largest + REAL_MIN;
+    most = larger(most, MATH(fabs)(whole[i] - halves[i]) / size);
+  }
+  return most > ROUNDING_OF_HALVES ? most : 0;
+}
+
+/* By how much the end of a step is wrong, relative to the state, as its halves tell. Both may leave forces at the start
+ * out, as those near a centre: so where they differ much the first half is compared with its own halves, as long as
+ * these differ by more. Not OK where halves have no solution. */
+static SELDOM int compare_with_halves(const step_data *step, const real *dq, const solver_options *options, real *error)
+{
+  real whole[M], halves[M], first[M], before = -1, h = step->h;
+  memcpy(whole, dq, sizeof whole);
+  *error = 0;
+  for (int k = 0; k < MOST_HALVINGS; k++) {
+    const int status = solve_halves(step, h, options, halves, first);
+    real apart;
+    if (status != OK)
+      return status > STATUS(STRAYED) ? status : STATUS(STRAYED);
+    apart = difference(step, whole, halves);
+    *error = larger(*error, apart);
+    if (!(apart > RESOLVED_STEP && apart > before))
+      break;
+    before = apart;
+    memcpy(whole, first, sizeof whole);
+    h /= 2;
+  }
+  return OK;
+}

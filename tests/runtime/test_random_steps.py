@@ -1,0 +1,113 @@
+"""Random single steps: none that is accepted is wrong by more than 100 times its estimate; spurious solutions."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from random_steps import FAMILIES, WANTED, compiled, outcome, trials
+
+import scvi_codegen as sc
+
+QUICK = {
+    "duffing": "scvi:3",
+    "planar-pendulum": "scvi:6",
+    "kepler": "svi:2",
+    "relativistic": "svi:2",
+    "driven": "sc:3",
+    "damped": "gauss:3",
+    "chain": "svi:2",
+}
+METHODS = (
+    *(sc.SVI(degree) for degree in (2, 3, 4, 5, 6, 8, 12)),
+    *(sc.SVI(*sizes) for sizes in ((3, "gauss-legendre:5"), (3, "gauss-lobatto:3"), (4, "gauss-lobatto:4"))),
+    *(sc.SCVI(degree) for degree in (2, 3, 4, 6, 8)),
+    sc.SCVI(3, variational=False),
+    *(sc.SpectralCollocation(degree) for degree in (2, 3, 4, 6)),
+    sc.SpectralCollocation(3, form="phase-space"),
+    *(sc.Gauss(stages) for stages in (2, 3, 4, 6)),
+    *(family(stages) for family in (sc.RadauIIA, sc.RadauIA, sc.LobattoIIIA) for stages in (3, 4)),
+    *(family(stages) for family in (sc.ChebyshevGauss, sc.ChebyshevLobatto) for stages in (3, 4)),
+)
+"""Those that estimate the error of a step."""
+
+
+def check(name, method, solver, steps):
+    found = outcome(compiled(name, method, solver), steps)
+    accepted = ~found.refused
+    assert accepted.mean() > 0.5
+    assert not np.isnan(found.estimates[accepted]).any()
+    assert found.ratios.max() <= WANTED, steps[int(found.ratios.argmax())]
+    return found
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_no_step_is_wrong_by_far_more_than_its_estimate(name):
+    found = check(name, QUICK[name], "auto", trials(name, 150))
+    assert (found.errors > 1e-12).sum() > 20
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("solver", ["auto", "newton"])
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
+def test_no_step_of_any_method_is(method, solver):
+    """10,000 steps of each method that estimates the error of a step."""
+    for name in FAMILIES:
+        try:
+            compiled(name, method, solver)
+        except sc.MethodError:
+            assert name == "chain"
+            continue
+        check(name, method, solver, trials(name, 1100))
+
+
+SPURIOUS = {
+    "planar-pendulum": [
+        ("scvi:3", 0.3071399754577905, -1.0088668625585298, 3.2754332164851276),
+        ("scvi:6", 0.6144060580820349, 0.8655135641512931, 3.847090915225689),
+    ],
+    "duffing": [("scvi:3", 0.48772377726415744, -0.43246828955033717, 2.716772389715709)],
+}
+
+
+@pytest.mark.parametrize(("name", "flags"), [(name, flags) for name in SPURIOUS for flags in (("-O1",), ("-O2",))])
+def test_a_spurious_solution_is_refused_or_its_error_is_told(name, flags):
+    """Their curves are smooth: the energy of the first grows from -0.44 to 591."""
+    system = sc.problem(name).system
+    for method, q, p, h in SPURIOUS[name]:
+        stepper = sc.compile_stepper(system, method, flags=flags)
+        exact = sc.compile_stepper(system, sc.SVI(12)).integrate([q], [p], t_end=h).q[-1, 0]
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            try:
+                run = stepper.integrate([q], [p], h=h, steps=1)
+            except sc.StepFailedError:
+                continue
+        error = abs(run.q[-1, 0] - exact) / (2 * (abs(q) + abs(exact - q)))
+        assert run.step_error > error / WANTED
+        assert error < 1e-2 or any(issubclass(each.category, sc.AccuracyWarning) for each in heard)
+
+
+def test_a_controlled_run_begins_with_no_spurious_step():
+    """With 1e-2 allowed to a step, its curve tells less than that of steps of many periods."""
+    stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "scvi:3")
+    exact = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(12))
+    for q, p in [(0.3, -1.0), (0.6, 0.9), (1.4, 0.2)]:
+        run = stepper.integrate([q], [p], t_end=6.0, tolerance=1e-2)
+        first = exact.integrate([q], [p], t_end=run.t[1]).q[-1, 0]
+        assert abs(run.q[1, 0] - first) < 0.3
+
+
+def test_comparing_with_halves_leaves_a_run_as_it_is():
+    """Every 512th step is compared: what goes from step to step stays, by Newton's iteration, too."""
+    system = sc.problem("henon-heiles").system
+    start = {"q": [0.1, 0.2], "p": [0.3, 0.1]}
+    for solver in ("auto", "newton"):
+        stepper = sc.compile_stepper(system, "svi:4", solver=solver)
+        whole = stepper.integrate(**start, h=0.1, steps=1030)
+        run = stepper.start(**start, h=0.1)
+        run.record(512)
+        last = run.record(518)
+        assert np.array_equal(last.q[-1], whole.q[-1])
+        assert whole.step_error < 1e-6
