@@ -7,6 +7,7 @@
 #define DOUBTFUL REAL(4.0) /* times the largest error yet, squared as that of a curve: such a step is */
 #define RESOLVED_STEP REAL(1e-6) /* of the state: where halves differ by more, those of the first half are compared */
 #define MOST_HALVINGS 24
+#define GROSS_DIFFERENCE REAL(10.0) /* times the state: beyond it a step is no motion */
 #define ROUNDING_OF_HALVES (64 * REAL_EPSILON)
 
 static real duration(const step_data *step, const solver_data *data, const real *memory, long long guess,
@@ -72,7 +73,7 @@ static real difference(const step_data *step, const real *whole, const real *hal
 
 /* By how much the end of a step is wrong, relative to the state, as its halves tell. Both may leave forces at the start
  * out, as those near a centre: so where they differ much the first half is compared with its own halves, as long as
- * these differ by more. Not OK where halves have no solution. */
+ * these differ by more. Not OK where halves have no solution, or differ by far more than the state. */
 static SELDOM int compare_with_halves(const step_data *step, const real *dq, const solver_options *options, real *error)
 {
   real whole[M], halves[M], first[M], before = -1, h = step->h;
@@ -85,6 +86,8 @@ static SELDOM int compare_with_halves(const step_data *step, const real *dq, con
       return status > STATUS(STRAYED) ? status : STATUS(STRAYED);
     apart = difference(step, whole, halves);
     *error = larger(*error, apart);
+    if (!(apart <= GROSS_DIFFERENCE))
+      return STATUS(STRAYED);
     if (!(apart > RESOLVED_STEP && apart > before))
       break;
     before = apart;
