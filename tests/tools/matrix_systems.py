@@ -31,7 +31,7 @@ class Problem:
     Attributes:
         own: parameters of a run that are no defaults.
         x: initial velocities, or momenta where a Hamiltonian is given.
-        methods: name and solver, with the error of states that is allowed.
+        methods: name and solver, with the error of states that is allowed; nine points are several vectors.
         event: a function that crosses zero.
         maps: momentum maps by formula, in the order of the stepper.
         impulses: momentum maps of L alone, p . xi by the formulas of xi.
@@ -318,7 +318,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.6, -0.2),
         x=(-0.3, 0.4),
         own={"l": 1.1, "a": 0.35, "w": 1.2, "c": 0.3, "g": 2.3},
-        methods=(("gauss:4", "fixed-point", HIGH), ("sc:7", "newton", HIGH)),
+        methods=(("gauss:9", "fixed-point", HIGH), ("sc:7", "newton", HIGH)),
         event="q - s*l/5",
         text={
             "coordinates": ["q", "s"],
@@ -406,7 +406,7 @@ PROBLEMS: tuple[Problem, ...] = (
         q=(0.3, -0.2, 0.5, 0.1),
         x=(0.1, 0.4, -0.3, 0.2),
         own={"k": 1.6, "b": 0.3, "a": 0.5, "c": 0.2, "e": 0.05, **{f"m{i}": x for i, x in enumerate(OTHER_MASSES)}},
-        methods=(("svi:4", "fixed-point", HIGH), ("gauss:4", "fixed-point", HIGH)),
+        methods=(("svi:4", "fixed-point", HIGH), ("gauss:9", "fixed-point", HIGH)),
         event="q0 - q2*k/4",
         text={
             "coordinates": [f"q{i}" for i in range(CHAIN)],
