@@ -114,7 +114,8 @@ class Commands(click.Group):
         """Run with streams that can be written, also where a shell closed them (``2>&-``)."""
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:
-                setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115  (as long as the process)
+                nowhere = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  (as long as the process)
+                setattr(sys, name, nowhere)
         return super().main(*given, **named)
 
     def invoke(self, ctx: click.Context) -> Any:

@@ -16,7 +16,8 @@ ALLOWED = re.compile(
     r"|-m(arch|tune|cpu)=[\w.+-]+|-m(no-)?(avx[\w.-]*|sse[\w.]*|fma4?|f16c|bmi2?|prefer-vector-width=\d+)"
     r"|-ffp-contract=(on|off|fast)|-fsanitize=[a-z,-]+|-D[A-Za-z_]\w*(=\d+)?"
     r"|-f(no-)?(math-errno|trapping-math|fast-math|signed-zeros|associative-math|reciprocal-math|finite-math-only"
-    r"|rounding-math|unsafe-math-optimizations|unroll-loops|tree-vectorize|tree-slp-vectorize|inline|wrapv|gcse|tree-pre"
+    r"|rounding-math|unsafe-math-optimizations|unroll-loops|tree-vectorize|tree-slp-vectorize|inline|wrapv|gcse"
+    r"|tree-pre"
     r"|strict-aliasing|omit-frame-pointer|schedule-insns2?|rerun-cse-after-loop|dse|lto)",
     re.ASCII,
 )
