@@ -139,8 +139,9 @@ class GrowthCheck:
         found = []
         for mine, each in zip(self._halves(), (states.q, states.p), strict=True):
             rows = self._rows(each)[: k + 1]
-            size = float(np.sqrt(np.einsum("ij,ij->i", rows, rows).max()))
-            apart = float(np.linalg.norm(mine - rows[k]))
+            unit = float(np.abs(rows).max()) or 1.0  # squares of very large or small numbers are not finite or are 0
+            size = float(np.linalg.norm(rows / unit, axis=1).max())
+            apart = float(np.linalg.norm((mine - rows[k]) / unit))
             found.append(apart / size if apart and size else apart)
         return max(found)
 
