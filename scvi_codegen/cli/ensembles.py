@@ -13,7 +13,7 @@ import numpy as np
 from scvi_codegen.cli.conservation import momentum_report
 from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
-from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -111,6 +111,11 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"{_way(model, result)} kept of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} a step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
+        *(
+            []
+            if model.h is None or model.system.inputs
+            else whole_steps(model.span, model.step, model.step_count, model.t)
+        ),
         ", ".join(f"{number} {status}" for status, number in _statuses(result)),
     ]
     return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])

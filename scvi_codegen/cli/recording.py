@@ -14,9 +14,10 @@ from typing import Any
 import click
 import numpy as np
 
+from scvi_codegen.cli.frame import tell
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.running import conserved, final_state
-from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
@@ -138,6 +139,8 @@ class Recording:
         if model.system.clock is not None and model.ends_at_time:
             raise click.UsageError("in transformed time a folder holds a number of steps: give --step and --steps")
         run = model.start(model.stepper(solver=solver), options=options)
+        if not run.goal:
+            tell("\n".join(whole_steps(model.span, model.step, model.step_count, model.t)))
         return self._watched(
             record_run,
             run,
@@ -161,6 +164,7 @@ class Recording:
             raise click.UsageError("in transformed time a folder holds a number of steps: give --steps, not --span")
         elif span is not None:
             steps = max(1, round(span / abs(manifest.h)))
+            tell("\n".join(whole_steps(span, manifest.h, steps, manifest.t)))
         goal = manifest.steps if steps is None else steps
         return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal, **further)
 

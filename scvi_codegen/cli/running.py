@@ -13,7 +13,7 @@ from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
 from scvi_codegen.cli.memory import check_memory, check_room
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
-from scvi_codegen.cli.wording import counted, duration, in_known_digits
+from scvi_codegen.cli.wording import counted, duration, in_known_digits, whole_steps
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model, allowed_error
@@ -205,6 +205,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
         f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
         f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} kept",
+        *([] if _by_time(model) else whole_steps(model.span, model.step, model.step_count, model.t)),
     ]
     if run.steps:
         lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")

@@ -15,7 +15,7 @@ from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, tell
 from scvi_codegen.cli.memory import check_states
 from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
-from scvi_codegen.cli.wording import counted, duration
+from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import allowed_error
@@ -130,6 +130,8 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
     kept = counted(len(trajectory.t), "state")
     lengths = "of their own lengths" if run.goal else f"of {run.h:g}"
     yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} kept"
+    if model.h is not None:
+        yield from whole_steps(model.span, model.step, model.step_count, model.t)
     if run.steps:
         each = outcome.seconds / run.steps
         yield (

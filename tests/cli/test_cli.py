@@ -281,6 +281,17 @@ class TestRun:
         text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
         assert "order 16, symplectic where steps have one length, symmetric" in text
 
+    def test_a_span_that_the_step_does_not_divide_is_reported(self):
+        """Single runs, recorded ones, continued ones, ensembles and sums over indices; not where the step divides."""
+        Path("s.csv").write_text("q1,q2,q1_dot,q2_dot\n1.0,0.0,0.0,1.0\n")
+        ring = str(Path(__file__).parents[2] / "examples/fput_ring.toml")
+        end = "of steps of 0.3: the run is the nearest number of them, 3, and ends at t = 0.9"
+        for words in (("kepler",), ("kepler", "-o", "a.run"), ("kepler", "--ensemble", "s.csv"), (ring,)):
+            assert end in output_of("run", *words, "--step", "0.3", "--span", "1"), words
+        assert "ends at t = 2.1, not 2;" in output_of("run", "--resume", "a.run", "--span", "2")
+        for words in ("--step 0.25 --span 1", "--step 0.3 --steps 3", "--tolerance 1e-9 --span 1"):
+            assert "whole number" not in output_of("run", "kepler", *words.split())
+
     def test_sums_up_what_was_conserved(self):
         text = output_of("run", "kepler")
         assert "order 16, symplectic, symmetric" in text
