@@ -462,6 +462,13 @@ def test_bands_and_kept_factors_pass_the_sanitizers(command, masses, method, tmp
     check_sanitized([(source, interface)], command, tmp_path)
 
 
+@SANITIZERS
+def test_sweeps_over_positions_and_momenta_pass_the_sanitizers(command, tmp_path):
+    sanitizer(command, tmp_path)
+    source, interface = generate_source(driven_hamiltonian(), Gauss(3), solver="fixed-point")
+    check_sanitized([(source, interface)], command, tmp_path)
+
+
 @pytest.mark.full
 @SANITIZERS
 @pytest.mark.parametrize("method", METHODS)

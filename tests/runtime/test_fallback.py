@@ -123,6 +123,16 @@ def test_a_recorded_run_goes_on_with_what_it_borrowed(start, tmp_path):
     assert np.array_equal(whole.iterations, expected.iterations)
 
 
+def test_low_words_do_not_depend_on_how_a_run_is_cut(start):
+    """Those of a step by sweeps are not those of the next one by Newton's iteration, in one call as in many."""
+    for stepper in both(SVI(4)):
+        whole, cut = (stepper.start(*start, h=LONG) for _ in range(2))
+        whole.advance(60)
+        for _ in range(60):
+            cut.advance(1)
+        assert whole.save() == cut.save()
+
+
 def test_a_run_that_fails_stands_before_the_step(start):
     borrowing, _ = both(SVI(4))
     run = borrowing.start(*start, h=40.0)

@@ -154,6 +154,52 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
 
 
+@pytest.mark.parametrize("name", ["svi", "gauss of a Hamiltonian", "svi, coupled"])
+def test_states_of_ensembles_stay_within_a_rounding_of_exact_sums(name: str) -> None:
+    """Low words keep what sums leave: high words alone are off by no more than half a rounding each, however long."""
+    steps, members = 1024, 5
+    shift = np.arange(members)[:, None] / 16
+    begun = Q + shift, P - shift / 4
+    ends = compiled(name).integrate_ensemble(*begun, t=1 / 3, h=H, steps=steps, every=64)
+    most_p = float(np.spacing(np.abs(ends.p)).max(axis=0).sum(axis=1).max()) / 2
+    most_q = float((np.spacing(np.abs(ends.q)).max(axis=0) * MASSES).sum(axis=1).max()) / 2
+    for j in range(members):
+        first, begun_at = exact(*begun[1][j]), exact(*(begun[0][j] * MASSES))
+        for k, (q, p) in enumerate(zip(ends.q[:, j], ends.p[:, j], strict=True)):
+            assert abs(exact(*p) - first) <= most_p * 1.01
+            assert abs(exact(*(q * MASSES)) - begun_at - first * 64 * k * Fraction(H)) <= most_q * 1.01
+
+
+@pytest.mark.parametrize("name", ["rattle", "lobatto"])
+def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
+    """A thousandth of the state as its low word: that sum, and not the high word, meets the constraint after a step."""
+    own = Begun(name)
+    long = tuple(np.cos(np.arange(4)) / 1024 for _ in range(2))
+    own.run.resume_at(0, (own.run.t, 0.0), long)
+    own.run.advance(1)
+    q, _, low, _ = own.words()
+    x, y, _, w = q + low
+    assert abs((x - y) ** 2 + w**2 - 1) < 1e-14
+
+
+@pytest.mark.parametrize("lengths", ["h", "tolerance", "monitor"])
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "back"])
+def test_the_last_step_ends_where_the_sum_of_both_words_of_time_does(lengths: str, sign: float) -> None:
+    """Far from t = 0 times are rounded to 6e-8: positions at t_end do not show it."""
+    system = sc.LagrangianSystem.from_text(name="spring", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    monitor = "1 + x**2" if lengths == "monitor" else None
+    stepper = sc.compile_stepper(system, "svi:8", monitor=monitor, flags=QUICK_FLAGS)
+    t = sign * 2.0**30 / 3
+    for span in (0.9, 1.3, 2.1):
+        end = t + sign * span
+        steps = {"tolerance": 1e-14} if lengths == "tolerance" else {"h": 0.13 if monitor else sign * 0.13}
+        run = stepper.integrate([1.0], [0.0], t=t, t_end=end, **steps)
+        passed = float(Fraction(end) - Fraction(t))
+        assert run.t[-1] == end
+        assert abs(run.q[-1, 0] - np.cos(passed)) < 1e-12
+        assert abs(run.p[-1, 0] + np.sin(passed)) < 1e-12
+
+
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:
     """Of steps that choose their length, the last of which ends at t_end; and of pieces between breakpoints."""

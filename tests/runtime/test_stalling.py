@@ -22,8 +22,9 @@ def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
     assert 100 < len(failure.value.trajectory) < 10**6
 
 
-def test_nor_under_the_reversible_controller():
-    controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2")
+@pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
+def test_nor_under_the_reversible_controller(events):
+    controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2", events=events)
     with pytest.raises(StepFailedError, match="comes to 0") as failure:
         controlled.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
