@@ -21,7 +21,20 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/indexed": ("runtime/test_indexed.py", "rendering/test_indexed.py"),
     "templates/main": ("models/test_package.py",),
     "templates/parts/main": ("models/test_package_inputs.py",),
-    "templates/support/density": ("runtime/test_density.py",),
+    "templates/support/density": ("runtime/test_density.py", "runtime/test_low_words.py"),
+    "templates/support/hamiltonian_sweep": (
+        "mechanics/test_hamiltonian.py",
+        "lowering/test_iterations.py",
+        "lowering/test_sweeps.py",
+        "rendering/test_c_text.py",
+        "promises/test_matrix.py",
+    ),
+    "templates/support/run.h": (
+        "runtime/test_stepper.py",
+        "lowering/test_newton.py",
+        "runtime/test_low_words.py",
+        "promises/test_matrix.py",
+    ),
     "templates/support/exchanges": ("runtime/test_exchanges.py", "promises/test_forced_motion.py"),
     "templates/support/inputs": ("runtime/test_driven.py", "models/test_package_inputs.py"),
     "templates/support/push": (
@@ -35,10 +48,25 @@ NEAR: dict[str, tuple[str, ...]] = {
     },
     "scvi_codegen/lowering/swept": ("runtime/test_swept_derivatives.py",),
     "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
-    "templates/support/flow": ("promises/test_matrix.py", "frameworks/test_casadi.py", "rendering/test_flow_text.py"),
-    "templates/support/casadi": ("frameworks/test_casadi.py", "rendering/test_flow_text.py"),
-    "templates/support/xla": ("frameworks/test_jax.py", "rendering/test_flow_text.py"),
+    "templates/support/flow": (
+        "frameworks/test_flow_entries.py",
+        "promises/test_matrix.py",
+        "frameworks/test_casadi.py",
+        "rendering/test_flow_text.py",
+    ),
+    "templates/support/casadi": (
+        "frameworks/test_flow_entries.py",
+        "frameworks/test_casadi.py",
+        "rendering/test_flow_text.py",
+    ),
+    "templates/support/xla": (
+        "frameworks/test_flow_entries.py",
+        "frameworks/test_jax.py",
+        "rendering/test_flow_text.py",
+    ),
     "templates/support/float": ("rendering/test_c_text.py",),
+    "templates/support/newton_fallback": ("runtime/test_fallback.py", "lowering/test_iterations.py"),
+    "scvi_codegen/runtime/observation": ("runtime/test_stalling.py", "runtime/test_events.py"),
     "templates/support/lent": ("runtime/test_fallback.py",),
     "templates/support/borrowed": ("runtime/test_fallback.py",),
     "templates/support/strays": ("runtime/test_fallback.py", "runtime/test_longest_step.py"),
@@ -63,7 +91,7 @@ NEAR: dict[str, tuple[str, ...]] = {
         "rendering/test_support.py",
     ),
     "templates/support/band": ("lowering/test_band.py", "lowering/test_newton.py"),
-    "templates/support/crowd": ("runtime/test_ensemble.py",),
+    "templates/support/crowd": ("runtime/test_ensemble.py", "runtime/test_low_words.py"),
     "templates/support/many": ("runtime/test_ensemble.py",),
     "templates/support/trajectories": ("runtime/test_ensemble.py", "runtime/test_drift.py"),
     **{
@@ -96,6 +124,7 @@ NEAR: dict[str, tuple[str, ...]] = {
             "methods/test_constraints.py",
             "methods/test_joints.py",
             "methods/test_rolling.py",
+            "runtime/test_low_words.py",
         )
         for stem in ("constraints", "rattle")
     },
