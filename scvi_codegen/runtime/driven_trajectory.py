@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
+from scvi_codegen.runtime.kept_states import checked_row, checked_rows
 from scvi_codegen.runtime.nearby_driven import NearbyDrivenMotions
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.standing import holds
@@ -49,6 +50,36 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
     def __repr__(self) -> str:
         return holds(self, f", breakpoints between: {len(self.pieces) - 1}")
+
+    @overload
+    def __getitem__(self, rows: slice) -> Self: ...
+    @overload
+    def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
+    def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
+        """Return successive states as a trajectory, for a slice; (t, q, p) of one state, for a number.
+
+        As of :meth:`Trajectory.__getitem__`, for slices of stride 1: the states at breakpoints belong to a trajectory.
+
+        Raises:
+            IndexError: for a state that is not there, and for a slice that is empty, goes backward or has a stride.
+        """
+        if not isinstance(rows, slice):
+            k = checked_row(rows, len(self))
+            return float(self.t[k]), self.q[k], self.p[k]
+        first, last, stride = checked_rows(rows, len(self))
+        if stride > 1:
+            raise IndexError(
+                f"a slice of a run with inputs holds every state between its ends, unlike {rows}: leave out the "
+                "stride, or slice the arrays t, q and p"
+            )
+        chosen: list[Trajectory] = []
+        start = 0
+        for piece in self.pieces:
+            low, high = max(first - start, 0), min(last - start, len(piece))
+            start += len(piece) - 1
+            if high - low > 1 or (high - low == 1 == last - first and not chosen):
+                chosen.append(piece[low:high])
+        return replace(self, pieces=tuple(chosen))
 
     @property
     def t(self) -> Array:

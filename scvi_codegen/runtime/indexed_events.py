@@ -62,6 +62,11 @@ class IndexedCrossings:
     def __len__(self) -> int:
         return len(self.t)
 
+    def chosen(self, which: NDArray[np.bool_]) -> IndexedCrossings:
+        """Return some of the crossings, by (k,) truth values."""
+        q, p = ({name: each[which] for name, each in part.items()} for part in (self.q, self.p))
+        return replace(self, t=self.t[which], q=q, p=p)
+
 
 class IndexedSearch:
     """Looks for the zeros of functions along a run, step by step.

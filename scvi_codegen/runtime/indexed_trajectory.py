@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +22,7 @@ from scvi_codegen.runtime.indexed_between import Departure, states_between
 from scvi_codegen.runtime.indexed_events import IndexedCrossings, IndexedSearch
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.kept_states import checked_row, checked_rows
 
 __all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
 
@@ -68,6 +70,38 @@ class IndexedTrajectory(Confirmed):
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
         lengths = "" if self.goal else f" of {self.h:g}"
         return f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>"
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @overload
+    def __getitem__(self, rows: slice) -> Self: ...
+    @overload
+    def __getitem__(self, rows: int) -> tuple[float, dict[str, Numbers], dict[str, Numbers]]: ...
+    def __getitem__(self, rows: slice | int) -> Self | tuple[float, dict[str, Numbers], dict[str, Numbers]]:
+        """Return some of the states as a trajectory, for a slice; t, and q and p by array, of one state, for a number.
+
+        Events outside the times of a slice are left out; ``steps`` and ``step_error`` stay those of the whole run.
+
+        Raises:
+            IndexError: for a state that is not there, and for a slice that is empty or goes backward.
+            StateError: where states were not kept.
+        """
+        if len(self.departures) < len(self.t):
+            raise StateError("states of an observed run are not kept: leave out observe, or index t and observed")
+        if not isinstance(rows, slice):
+            k = checked_row(rows, len(self))
+            q, p = ({name: each[k].copy() for name, each in part.items()} for part in (self.q, self.p))
+            return float(self.t[k]), q, p
+        first, last, stride = checked_rows(rows, len(self))
+        low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in ("t", "energies", "maps", "departures")},
+            q={name: each[rows] for name, each in self.q.items()},
+            p={name: each[rows] for name, each in self.p.items()},
+            events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
+        )
 
     def at(self, t: ArrayLike) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
         """Positions and momenta at (n,) times between those kept, (n, ..) by the name of their array.

@@ -14,7 +14,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["KeptStates", "checked_row"]
+__all__ = ["KeptStates", "checked_row", "checked_rows"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,14 @@ def checked_row(row: Any, count: int) -> int:
     if not -count <= number < count:
         raise IndexError(f"there is no state {number} among {count}")
     return number % count
+
+
+def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
+    """Return first, end and stride of a slice of that many states; IndexError if it is empty or goes backward."""
+    first, last, stride = rows.indices(count)
+    if stride < 0 or first >= last:
+        raise IndexError(f"a slice of a trajectory goes forward and holds at least one state, unlike {rows}")
+    return first, last, stride
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -24,7 +24,7 @@ from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
 from scvi_codegen.runtime.exchanges import exchanged_until
 from scvi_codegen.runtime.global_error import Confirmed, GlobalError
-from scvi_codegen.runtime.kept_states import Array, checked_row
+from scvi_codegen.runtime.kept_states import Array, checked_row, checked_rows
 from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
 from scvi_codegen.runtime.standing import holds, lengths_of
@@ -94,9 +94,7 @@ class Trajectory(NearbyMotions, Confirmed):
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
-        first, last, stride = rows.indices(len(self))
-        if stride < 0 or first >= last:
-            raise IndexError(f"a slice of a trajectory goes forward and holds at least one state, unlike {rows}")
+        first, last, stride = checked_rows(rows, len(self))
         lengths = self.lengths[rows]
         if stride > 1 and self.goal is not None:  # the next state kept is not the end of the step
             lengths = np.full_like(lengths, np.nan)

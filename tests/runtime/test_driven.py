@@ -394,3 +394,25 @@ def test_the_step_of_a_driven_run_is_that_of_its_first_piece(pendulum):
         run = stepper.drive([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
         assert run.h == run.t[1] - run.t[0] == min(h, KNOTS[1])
     assert stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
+
+
+def test_some_of_the_states(pendulum):
+    """Every slice of a run with inputs is the same states, energies and work, across breakpoints and at them."""
+    run = compile_stepper(pendulum, "svi:2").drive(
+        [0.3], velocity=[0.1], inputs=dict.fromkeys(pendulum.inputs, (KNOTS, VALUES)), h=0.2, t_end=2.6
+    )
+    count, work = len(run), run.work()
+    for first in range(count):
+        for end in range(first + 1, count + 1):
+            part = run[first:end]
+            assert np.array_equal(part.t, run.t[first:end])
+            assert np.array_equal(part.q, run.q[first:end])
+            assert np.array_equal(part.p, run.p[first:end])
+    part = run[3:-2]
+    assert np.array_equal(part.energy(), run.energy()[3:-2])
+    assert_allclose(part.work(), work[3:-2] - work[3], rtol=0, atol=1e-14)
+    t, q, p = run[-1]
+    assert (t, *q, *p) == (run.t[-1], *run.q[-1], *run.p[-1])
+    for rows in (count, slice(4, 4), slice(None, None, -1), slice(0, 5, 2)):
+        with pytest.raises(IndexError, match=r"there is no state|goes forward|stride, or slice"):
+            run[rows]

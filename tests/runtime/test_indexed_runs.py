@@ -47,6 +47,29 @@ def driven():
     )
 
 
+def test_some_of_the_states(steppers):
+    run = steppers[0].integrate(Q, velocity=V, h=0.1, steps=30, events="q[1] - q[2]")
+    for rows in (slice(2, None), slice(1, -1, 3), slice(3, 4)):
+        part = run[rows]
+        assert len(part) == len(run.t[rows])
+        for name in ("t", "energies", "maps"):
+            assert np.array_equal(getattr(part, name), getattr(run, name)[rows])
+        assert np.array_equal(part.q["q"], run.q["q"][rows])
+        assert np.array_equal(part.p["q"], run.p["q"][rows])
+        between = (part.t[0] + part.t[-1]) / 2
+        assert np.abs(part.at([between])[0]["q"] - run.at([between])[0]["q"]).max() < 1e-14
+        inside = (run.events[0].t >= part.t[0]) & (run.events[0].t <= part.t[-1])
+        assert np.array_equal(part.events[0].q["q"], run.events[0].q["q"][inside])
+    t, q, p = run[-1]
+    assert (t, *q["q"], *p["q"]) == (run.t[-1], *run.q["q"][-1], *run.p["q"][-1])
+    for rows in (len(run), slice(4, 4), slice(None, None, -1)):
+        with pytest.raises(IndexError, match=r"there is no state|goes forward"):
+            run[rows]
+    observed = steppers[0].integrate(Q, velocity=V, h=0.1, steps=3, observe=lambda state: state.q["q"][0])
+    with pytest.raises(StateError, match="not kept: leave out observe"):
+        observed[0]
+
+
 class TestControlledSteps:
     def test_round_off_is_the_default(self, steppers):
         own, other = (each.integrate(Q, velocity=V, t_end=10.0) for each in steppers)
