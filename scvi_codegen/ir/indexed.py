@@ -67,6 +67,7 @@ class IndexedProgram:
         velocities: on which forces depend, behind the coordinates at the points.
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
+        constants: terms of L, or of -H, without coordinates and momenta, which the energy needs.
         sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts that replace it where the method is explicit.
         held: what replaces both where there are constraints.
@@ -90,6 +91,7 @@ class IndexedProgram:
     parameter_defaults: tuple[float, ...]
     forces: tuple[LoopedKernel, ...]
     masses: tuple[LoopedKernel, ...]
+    constants: tuple[LoopedKernel, ...]
     sweep: SeparableSweep | HamiltonianSweep | None
     splitting: Splitting | None
     control: Control | None = None

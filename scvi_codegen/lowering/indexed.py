@@ -93,6 +93,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         parameter_defaults=system.defaults,
         forces=forces,
         masses=tuple(_mass(system, term, number) for number, term in enumerate(system.masses)),
+        constants=tuple(_constant(system, term, number) for number, term in enumerate(system.energy_offsets)),
         sweep=sweep,
         splitting=splitting,
         held=held,
@@ -204,6 +205,17 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         kernel=kernel_of(system, f"diagonal_{number}", own, force.slots, u, "By the coordinate itself."),
     )
     return product, diagonal
+
+
+def _constant(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
+    return LoopedKernel(
+        text=comment_text(str(term)),
+        loops=term.loops,
+        slots=(),
+        targets=(),
+        given=given_of(term.slots, ()),
+        kernel=kernel_of(system, f"constant_{number}", [term.formula], term.slots, (), "The term."),
+    )
 
 
 def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:

@@ -37,6 +37,7 @@ def render_indexed(program: IndexedProgram) -> Source:
     """Header and source of a program. Equal programs give equal bytes."""
     environment = template_environment()
     terms = [(each, each.scalar) for each in program.forces if each.scalar]
+    terms += [(each, each.kernel) for each in program.constants]
     scalars = [each.kernel for each in program.masses] + [scalar for _, scalar in terms]
     if program.sweep is None:
         scalars += [each.kernel for each in program.forces]

@@ -149,6 +149,7 @@ def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
     own = sc.compile_indexed(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
     other = sc.compile_stepper(written, "svi:2").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
     assert np.abs(own.q["q"] - other.q).max() < 1e-15
+    assert np.abs(own.energy() - other.energy()).max() < 1e-14
 
 
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])

@@ -182,6 +182,26 @@ def test_energy_does_not_drift() -> None:
     assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
 
 
+@pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet"])
+def test_energy_has_the_terms_without_coordinates(method: str) -> None:
+    """Terms of parameters, fields and time, of one sum or two, as of the system written out; they are no forces."""
+    beside = "3*sin(t) + a**2 + sum(i in N, a*f[i]*cos(t)) - sum(i in N, j in N, f[i]*f[j]) + sum(i in 0..N-2, 7*a)"
+    system = sc.IndexedSystem.from_text(
+        name="level",
+        coordinates=["q[N]"],
+        parameters={"a": 2, "f[N]": 1},
+        lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2) + {beside}",
+    )
+    written = sc.compile_stepper(sc.expand_sums(system, {"N": 3}), method)
+    f = {"f_0": 0.3, "f_1": -0.7, "f_2": 1.9}
+    start = {"velocity": random(3), "h": 0.1, "steps": 4, "t": 0.7}
+    own = sc.compile_indexed(system, method).integrate(random(3), parameters={"a": 1.5, "f": list(f.values())}, **start)
+    other = written.integrate(random(3), parameters={"a": 1.5, **f}, **start)
+    assert np.abs(own.q["q"] - other.q).max() < 1e-15
+    assert np.abs(own.energy() - other.energy()).max() < 1e-14 * np.abs(other.energy()).max()
+    assert np.ptp(other.energy()) > 0.05
+
+
 def test_runs_go_on() -> None:
     """So many steps at once or one after the other give the same bits; a stepper survives a pickle."""
     each = CASES["bodies"]

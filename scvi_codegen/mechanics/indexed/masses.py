@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import sympy
@@ -13,7 +13,7 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access, Array, Loop
 
-__all__ = ["MassTerm", "check_form", "masses_of", "velocity_slots"]
+__all__ = ["MassTerm", "check_form", "masses_of", "terms_at_rest", "velocity_slots"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,3 +56,29 @@ def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol)
                 f"in '{term}' the derivative by {v} is {slope}: a Lagrangian of sums over indices has velocities as "
                 "m*v**2/2 alone, with a constant mass m"
             )
+
+
+def terms_at_rest(
+    terms: Sequence[IndexedTerm],
+    velocities: Mapping[str, Array],
+    state: Sequence[Array],
+    *,
+    negative: bool,
+    moving: bool,
+) -> tuple[IndexedTerm, ...]:
+    """Terms at velocities of 0, without those that are 0: those that depend on the state, or those that do not.
+
+    Args:
+        terms: of a Lagrangian or a Hamiltonian.
+        velocities: the array of coordinates by the name of its velocities.
+        state: coordinates and momenta.
+        negative: whether to change the signs, as for -H.
+        moving: which terms.
+    """
+    found = []
+    for term in terms:
+        at_rest = term.formula.xreplace(dict.fromkeys(velocity_slots(term, velocities), S.Zero))
+        slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
+        if at_rest and moving == any(access.array in state for _, access in slots):
+            found.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))
+    return tuple(found)

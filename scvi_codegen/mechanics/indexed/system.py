@@ -30,7 +30,7 @@ from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.given.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
-from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, velocity_slots
+from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
 
 __all__ = ["INDEXED", "IndexedSystem"]
 
@@ -254,15 +254,13 @@ class IndexedSystem:
 
     @property
     def potentials(self) -> tuple[IndexedTerm, ...]:
-        """Terms of L without velocities, -V; those of -H."""
-        found = []
-        for term in self.terms:
-            at_rest = term.formula.xreplace(dict.fromkeys(velocity_slots(term, self._velocities), S.Zero))
-            at_rest = -at_rest if self.momenta else at_rest
-            if at_rest.free_symbols & {slot for slot, access in term.slots if access.array in self.state}:
-                slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
-                found.append(replace(term, formula=at_rest, slots=slots))
-        return tuple(found)
+        """Terms of L without velocities, -V; those of -H. They depend on coordinates or momenta."""
+        return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
+
+    @property
+    def energy_offsets(self) -> tuple[IndexedTerm, ...]:
+        """Terms of -V or -H without coordinates and momenta: they change the energy, not the motion."""
+        return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
     def kernels(self) -> tuple[tuple[IndexedTerm, dict[str, Expr]], ...]:

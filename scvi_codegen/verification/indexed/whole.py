@@ -145,7 +145,8 @@ def _energies(start: WholeStart) -> Finding:
     system, run = start.system, start.run()
     masses = {} if system.momenta else _masses(start)
     kinetic = sum(float(np.sum(start.p[name] ** 2 / mass)) / 2 for name, mass in masses.items())
-    values = [_values(start, start.elements(term.loops), term.formula, term.slots) for term in system.potentials]
+    terms = (*system.potentials, *system.energy_offsets)
+    values = [_values(start, start.elements(term.loops), term.formula, term.slots) for term in terms]
     potential = -sum(float(np.sum(each)) for each in values)
     size = kinetic + sum(float(np.sum(np.abs(each))) for each in values)
     wrong = abs(run.energies[0] - kinetic) + abs(run.energies[1] - potential)
