@@ -16,7 +16,7 @@ from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
-from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.native.options import FAILURES, SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
@@ -139,7 +139,9 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
         t = result.ends[0][j] if result.goals or result.spans else result.t[0] + result.steps[j] * result.h
-        yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {result.status[j]}"
+        status = str(result.status[j])
+        why = FAILURES[status][0] if status in FAILURES else status
+        yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {why}"
     if len(lost) > SHOWN_FAILURES:
         yield f"  and {len(lost) - SHOWN_FAILURES} more"
 

@@ -11,26 +11,42 @@ from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
-__all__ = ["STATUS", "VANISHED", "SolverOptions", "checked_options", "step_failure"]
+__all__ = ["FAILURES", "NOT_CONVERGED", "STATUS", "SolverOptions", "checked_options", "step_failure"]
 
 STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
 NEEDED = 6
 """Newton's iteration is needed, and is not there (:mod:`scvi_codegen.native.binding`), or had no memory."""
 
-VANISHED = (
-    "the step size is below machine precision: the motion ends there (a collision, a singularity, a mass of 0), its "
-    "forces are not smooth, or from rest at the origin they "
-    "grow as a power of t beyond the method's degree: take a higher one"
-)
-ADVICE = {
-    "not converged": "try a smaller step, solver='newton' where the system is stiff, or more iterations",
-    "singular": "the Newton matrix has no inverse there: check that no mass is 0 with these parameters, else try "
-    "a smaller step, or more quadrature points",
-    "vanished": VANISHED,
-    "strayed": "the equations of the step were solved by what is no motion: take a shorter step, or give t_end",
-    "no memory": "Newton's iteration found none: the machine's is used up",
-    "not finite": "the Lagrangian is undefined there, or the step is far too large",
+NOT_CONVERGED = "not converged"
+FAILURES = {
+    NOT_CONVERGED: (
+        "the iteration on the stage equations did not converge",
+        "Use a smaller step, solver='newton' if the system is stiff, or a larger max_iterations",
+    ),
+    "singular": (
+        "the Newton matrix is singular",
+        "Check that no mass is 0 with these parameters; otherwise use a smaller step, or more quadrature points",
+    ),
+    "not finite": (
+        "a value is infinite or NaN: the Lagrangian is undefined there, or the step is far too large",
+        "Use a smaller step, and check that the Lagrangian is defined all along the motion",
+    ),
+    "vanished": (
+        "the step size is below machine precision",
+        "The motion ends there (a collision, a singularity, a mass of 0), its forces are not smooth, or from rest at "
+        "the origin they grow as a power of t beyond the method's degree. Set t_end before that time, or use a method "
+        "of higher degree",
+    ),
+    "strayed": (
+        "the iteration converged to a spurious solution of the stage equations",
+        "Use a smaller step, or give t_end alone for adaptive steps",
+    ),
+    "no memory": (
+        "there is not enough memory for Newton's method",
+        "Free memory, or use solver='fixed-point' with a smaller step",
+    ),
 }
+"""By status: what failed, and what to do."""
 
 
 MOST_ITERATIONS = 10**6
@@ -66,13 +82,19 @@ def checked_options(options: SolverOptions | None) -> SolverOptions | None:
 
 
 def step_failure(
-    status: int, report: Any, *, step: int, h: float, kept: object = None, advice: Mapping[str, str] = ADVICE
+    status: int,
+    report: Any,
+    *,
+    step: int,
+    h: float,
+    kept: object = None,
+    failures: Mapping[str, tuple[str, str]] = FAILURES,
 ) -> StepFailedError:
-    """The exception for a failed step: which, when, by what h (0: its own), how far, what to try; what it ``kept``."""
+    """The exception for a failed step: which, when, by what h (0: its own), why, what to do; what was ``kept``."""
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
-    message = (
-        f"step {step} at t = {report.t:.17g}{length} failed: {word} "
-        f"(last update {report.change:.3g}, {report.iterations} iterations in all); {advice[word]}"
-    )
+    what, remedy = failures[word]
+    if word == NOT_CONVERGED:
+        what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
+    message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}"
     return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=kept)

@@ -13,7 +13,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.native.options import VANISHED, SolverOptions, step_failure
+from scvi_codegen.native.options import FAILURES, NOT_CONVERGED, SolverOptions, step_failure
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_state
@@ -28,17 +28,24 @@ from scvi_codegen.runtime.standing import stands
 
 __all__ = ["IndexedRun"]
 
-ADVICE = {
-    "not converged": "sweeps contract while h times the highest frequency is less than about 1 to 3: try a smaller h, "
-    "or solver='newton' where the fast motions are at rest: stiff bonds, short waves on a lattice",
-    "not finite": "the Lagrangian is undefined there, or the step is far too large",
-    "singular": "constraints contradict each other there, or say the same",
-    "vanished": VANISHED,
-}
-ADVICE_BY_SOLVER = {
-    "fixed-point": ADVICE,
-    "newton": ADVICE | {"not converged": "Newton's iteration, or GMRES in it, comes to no rest: try a smaller h"},
-    "rattle": ADVICE | {"not converged": "constraints turn too far in a step to be met at its end: try a smaller h"},
+FAILURES_BY_SOLVER = {
+    "fixed-point": FAILURES
+    | {
+        NOT_CONVERGED: (
+            "the fixed-point iteration did not converge",
+            "It converges while h times the highest frequency is less than about 1 to 3. Use a smaller h, or "
+            "solver='newton' where the fast motions are at rest (stiff bonds, short waves on a lattice)",
+        )
+    },
+    "newton": FAILURES | {NOT_CONVERGED: ("Newton-GMRES did not converge", "Use a smaller h")},
+    "rattle": FAILURES
+    | {
+        NOT_CONVERGED: ("the iteration on the constraints did not converge", "Use a smaller h"),
+        "singular": (
+            "the constraints are contradictory or redundant there",
+            "Remove the constraints that follow from others",
+        ),
+    },
 }
 
 
@@ -376,8 +383,8 @@ class IndexedRun(OneThread):
             done += report.steps
             self.iterations += report.iterations
             if status:
-                h, advice = 0.0 if self.goal else self.h, ADVICE_BY_SOLVER[self.interface.solver]
-                raise step_failure(status, report, step=self.steps, h=h, advice=advice)
+                h, failures = 0.0 if self.goal else self.h, FAILURES_BY_SOLVER[self.interface.solver]
+                raise step_failure(status, report, step=self.steps, h=h, failures=failures)
             if progress is not None:
                 progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)

@@ -72,9 +72,8 @@ def lost_level(states: Trajectory, longest: float) -> StepFailedError | None:
 
 def _halt(stepper: Integrator, t: float, number: int, evidence: str) -> StepFailedError:
     return StepFailedError(
-        f"step {number} at t = {t:.17g} failed: the monitor comes to 0, and time to a halt "
-        f"({evidence}). A monitor is positive wherever the motion leads: take another, or steps that choose their "
-        "length",
+        f"step {number} at t = {t:.17g} failed: the time transformation dt = g dtau is singular there: its monitor g "
+        f"reaches 0 ({evidence}). A monitor must be positive all along the motion: use another, or adaptive steps",
         status="stalled",
         step=number,
         t=t,

@@ -69,13 +69,13 @@ static const char *reason(int status)
 {
   switch (status) {
   case STATUS(NOT_CONVERGED):
-    return "the iteration did not converge: take shorter steps";
+    return "the iteration on the stage equations did not converge: use a smaller step";
   case STATUS(SINGULAR):
-    return "a matrix has no inverse";
+    return "the Newton matrix or the mass matrix is singular";
   case STATUS(NOT_FINITE):
-    return "an infinity or a NaN turned up";
+    return "a value is infinite or NaN";
   default:
-    return "its equations were solved by what is no motion: take shorter steps";
+    return "the iteration converged to a spurious solution of the stage equations: use a smaller step";
   }
 }
 

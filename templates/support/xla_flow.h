@@ -19,11 +19,13 @@ static int tells_version(const XLA_FFI_CallFrame *frame)
 
 static XLA_FFI_Error *failure(const XLA_FFI_CallFrame *frame, int status, const solver_report *report)
 {
-  static const char *const words[] = {"not converged", "singular", "not finite", "vanished", "strayed", "no memory"};
+  static const char *const reasons[] = {"the iteration on the stage equations did not converge",
+      "the Newton matrix is singular", "a value is infinite or NaN", "the step size is below machine precision",
+      "the iteration converged to a spurious solution of the stage equations",
+      "there is not enough memory for Newton's method"};
   char text[200];
   XLA_FFI_Error_Create_Args error = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, text, XLA_FFI_Error_Code_ABORTED};
-  snprintf(text, sizeof text, "step %lld at t = %.17g failed: %s (last update %.3g)", report->steps, report->t,
-      words[status - 1], report->change);
+  snprintf(text, sizeof text, "step %lld at t = %.17g failed: %s", report->steps, report->t, reasons[status - 1]);
   return frame->api->XLA_FFI_Error_Create(&error);
 }
 

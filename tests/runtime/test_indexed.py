@@ -344,7 +344,7 @@ def test_what_does_not_fit_is_refused(q: Any, given: dict[str, Any], message: st
 def test_failures() -> None:
     """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
     each = CASES["ring"]
-    with pytest.raises(sc.StepFailedError, match="try a smaller h") as caught:
+    with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
         sc.compile_indexed(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
     assert len(caught.value.trajectory.t) == 1
     bare = sc.IndexedSystem.from_text(

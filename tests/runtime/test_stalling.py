@@ -15,7 +15,7 @@ NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
 @pytest.mark.parametrize("monitor", ["x", "x**2"])
 def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
     stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, monitor), sc.SVI(4))
-    with pytest.raises(StepFailedError, match="comes to 0") as failure:
+    with pytest.raises(StepFailedError, match="reaches 0") as failure:
         stretched.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
     assert failure.value.t == pytest.approx(1.5708, abs=1e-3)
@@ -25,7 +25,7 @@ def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
 @pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
 def test_nor_under_the_reversible_controller(events):
     controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2", events=events)
-    with pytest.raises(StepFailedError, match="comes to 0") as failure:
+    with pytest.raises(StepFailedError, match="reaches 0") as failure:
         controlled.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
 
@@ -33,7 +33,7 @@ def test_nor_under_the_reversible_controller(events):
 def test_solve_motion_says_so():
     motion = sc.solve_motion(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
     assert not motion.success
-    assert "comes to 0" in motion.message
+    assert "reaches 0" in motion.message
 
 
 @pytest.mark.parametrize("monitor", ["frequency", "q1**2 + q2**2"])
