@@ -155,7 +155,7 @@ def test_the_swinging_atwood_machine(atwood):
 @pytest.mark.parametrize(("h", "wrong"), [(1.0, True), (0.25, True), (0.01, False)])
 def test_a_step_that_converged_and_is_nonsense_is_said(atwood, h, wrong):
     q, v = [1.1, 0.8], [0.0, 0.2]
-    said = pytest.raises((AccuracyWarning, StepFailedError), match=r"too long|no motion") if wrong else nullcontext()
+    said = pytest.raises((AccuracyWarning, StepFailedError), match=r"too long|spurious") if wrong else nullcontext()
     with said:
         run = atwood.integrate(q, atwood.momentum(q, v), h=h, steps=round(100.0 / h))
         assert run.step_error < 1e-3
@@ -408,7 +408,7 @@ def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
     with pytest.warns(AccuracyWarning):
         assert 0.01 < stepper.integrate(*start, h=0.816, steps=1).step_error < 1.0
-    with pytest.raises(StepFailedError, match="no motion") as failure:
+    with pytest.raises(StepFailedError, match="spurious") as failure:
         stepper.integrate(*start, h=0.816, steps=2)
     assert failure.value.status == "strayed"
     assert 0.0 < stepper.integrate(*start, h=0.01, steps=2).step_error < 1e-3
