@@ -123,14 +123,14 @@ def test_a_recorded_run_goes_on_with_what_it_borrowed(start, tmp_path):
     assert np.array_equal(whole.iterations, expected.iterations)
 
 
-def test_low_words_do_not_depend_on_how_a_run_is_cut(start):
+def test_low_words_do_not_depend_on_how_a_run_is_cut():
     """Those of a step by sweeps are not those of the next one by Newton's iteration, in one call as in many."""
-    for stepper in both(SVI(4)):
-        whole, cut = (stepper.start(*start, h=LONG) for _ in range(2))
-        whole.advance(60)
-        for _ in range(60):
-            cut.advance(1)
-        assert whole.save() == cut.save()
+    stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)
+    whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
+    whole.advance(40)
+    for _ in range(40):
+        cut.advance(1)
+    assert whole.save() == cut.save()
 
 
 def test_a_run_that_fails_stands_before_the_step(start):
