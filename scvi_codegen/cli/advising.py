@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import click
 
@@ -37,12 +37,12 @@ def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
     if tolerance < ROUND_OFF:
         click.echo(f"Warning: doubles do not allow {tolerance:g}: steps are as accurate as they do", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF else None
-    return replace(model, h=None, tolerance=allowed, steps=None, span=model.covered)
+    return replace(model, h=None, tolerance=allowed, error=None, steps=None, span=model.covered)
 
 
 def confirmed_model(
-    model: Model, error: float, *, solver: str, options: SolverOptions | None
-) -> tuple[Model, GlobalError]:
+    model: AnyModel, error: float, *, solver: str = "", options: SolverOptions | None, threads: int | None = None
+) -> tuple[AnyModel, GlobalError]:
     """Return the model with the local tolerance whose run other runs confirm, and what they confirm; prints it.
 
     Steps of the same tolerance are the same, to the last bit, so that the run to come is the one that was confirmed.
@@ -50,21 +50,13 @@ def confirmed_model(
     Raises:
         StateError: unless the error is positive and below 1, and for steps of tau.
     """
-    stepper = model.stepper(solver=solver)
-    p = model.momenta(stepper)
-    given: dict[str, Any] = {
-        "t": model.t,
-        "t_end": model.t + model.covered,
-        "parameters": model.parameters,
-        "options": options,
-    }
+    wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # in words below
-        if model.system.inputs:
-            found = stepper.drive(model.q, p, inputs=model.all_inputs(), error=error, **given).confirmation
+        if isinstance(wanted, IndexedModel):
+            found = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
         else:
-            found = stepper.integrate(model.q, p, error=error, **given).confirmation
-    assert found is not None  # by construction
+            found = wanted.confirmed(wanted.stepper(solver=solver), options=options)
     local = f"{found.tolerance:.1e}" if found.tolerance else "round-off"
     numbers = {
         "requested": error,
@@ -80,8 +72,7 @@ def confirmed_model(
         f"{error:g} is confirmed until t = {found.confirmed_until:g}, with a local tolerance of {local}",
         global_error=numbers,
     )
-    chosen = replace(model, h=None, tolerance=found.tolerance or None, steps=None, span=model.covered)
-    return chosen, found
+    return replace(wanted, tolerance=found.local_tolerance, error=None), found
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:
@@ -113,7 +104,7 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
             f"{advice.steps} steps are too many to begin without being told: take a method of higher order, "
             f"a larger --tolerance or a shorter --span, or say --step {advice.h:.6g}"
         )
-    return replace(model, h=advice.h, tolerance=None, steps=advice.steps, span=None)
+    return replace(model, h=advice.h, tolerance=None, error=None, steps=advice.steps, span=None)
 
 
 def _text(advice: Advice) -> str:

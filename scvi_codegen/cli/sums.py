@@ -30,7 +30,7 @@ __all__ = ["refuse", "run_sums", "solved_by"]
 
 MOST_SHOWN = 4
 """Entries of an array at the end."""
-INSTEAD = {"advise": "give --tolerance", "error": "give --tolerance, or error= in Python"}
+INSTEAD = {"advise": "give --tolerance"}
 """Of options that sums over indices do not have."""
 
 

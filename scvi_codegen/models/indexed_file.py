@@ -77,7 +77,7 @@ __all__ = ["read_indexed"]
 KEYS = {
     "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "constraints"),
     "initial": ("q", "p", "q_dot", "t"),
-    "run": ("step", "tolerance", "span", "steps", "every"),
+    "run": ("step", "tolerance", "error", "span", "steps", "every"),
 }
 SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {

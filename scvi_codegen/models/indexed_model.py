@@ -13,10 +13,19 @@ from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.lowering.indexed import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import check_controlled, check_not_both, check_one_of, check_step, real, steps_in
+from scvi_codegen.models.model import (
+    check_at_most_one,
+    check_controlled,
+    check_error,
+    check_one_of,
+    check_step,
+    real,
+    steps_in,
+)
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
+    from scvi_codegen.runtime.global_error import GlobalError
     from scvi_codegen.runtime.indexed_run import IndexedRun
     from scvi_codegen.runtime.indexed_stepper import IndexedStepper
     from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
@@ -36,6 +45,7 @@ class IndexedModel:
         p, velocity: initial momenta or velocities by the same names, one of both; or neither: 0.
         h: step, not 0, negative for a run backward; or ``None`` for adaptive steps.
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off.
+        error: in place of both, bound of the relative global error of all states, as of :class:`Model`.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps, or ``None`` if ``span`` is given.
         every: distance between kept states in steps.
@@ -54,6 +64,7 @@ class IndexedModel:
     solver: str = SOLVERS[0]
     h: float | None = None
     tolerance: float | None = None
+    error: float | None = None
     p: Mapping[str, Any] | None = None
     velocity: Mapping[str, Any] | None = None
     span: float | None = None
@@ -69,13 +80,14 @@ class IndexedModel:
         check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
-        check_not_both(self.h, self.tolerance)
+        check_at_most_one(self.h, self.tolerance, self.error)
         check_one_of("span", self.span, "steps", self.steps)
-        for name in ("h", "tolerance", "t", "span"):
+        for name in ("h", "tolerance", "error", "t", "span"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, real(value, name))
         if self.h is None:
             check_controlled(self.tolerance, self.span)
+            check_error(self.error, paced=False)
         else:
             check_step(self.h, self.span)
         if self.steps is not None:
@@ -124,7 +136,17 @@ class IndexedModel:
     ) -> IndexedRun:
         """The run of this model from its initial state; raises as :meth:`IndexedStepper.start`."""
         beside: dict[str, Any] = {"options": options, "threads": threads}
-        return (stepper or self.stepper()).start(**self._beginning, **self._lengths, **beside)
+        stepper, lengths = stepper or self.stepper(), self._lengths
+        if self.error is not None:
+            found = self.confirmed(stepper, **beside)
+            lengths = {"t_end": lengths["t_end"], "tolerance": found.local_tolerance}
+        return stepper.start(**self._beginning, **lengths, **beside)
+
+    def confirmed(self, stepper: IndexedStepper, **beside: Any) -> GlobalError:
+        """Return the local tolerance for :attr:`error` and what runs of other steps confirm, as of :class:`Model`."""
+        found = stepper.integrate(**self._beginning, **self._lengths, **beside).confirmation
+        assert found is not None  # by construction
+        return found
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """All of it; raises as :meth:`IndexedStepper.integrate`."""
@@ -136,7 +158,8 @@ class IndexedModel:
         """Of steps: the one of all, or where those lead that choose theirs."""
         if self.h is not None:
             return {"h": self.h}
-        return {"t_end": self.t + self.covered, "tolerance": self.tolerance}
+        chosen = {"tolerance": self.tolerance} if self.error is None else {"error": self.error}
+        return {"t_end": self.t + self.covered, **chosen}
 
     @property
     def _beginning(self) -> dict[str, Any]:

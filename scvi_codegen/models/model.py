@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from scvi_codegen.models.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
     from scvi_codegen.runtime.driven import Input
+    from scvi_codegen.runtime.global_error import GlobalError
     from scvi_codegen.runtime.inputs import Array
     from scvi_codegen.runtime.integrator import Integrator
     from scvi_codegen.runtime.run import Run
@@ -55,6 +56,8 @@ class Model:
             steps are of tau, as with a monitor.
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. In
             transformed time, and with a monitor, :func:`longest_step` chooses one length of tau for it.
+        error: in place of both, bound of the relative global error of all states: runs choose their local tolerance as
+            ``integrate(error=)`` does, and warn where the bound is not confirmed. Needs adaptive steps.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps of h, or ``None`` if ``span`` is given.
         monitor: of the reversible controller, as text, see :func:`~scvi_codegen.compile_stepper`; its runs have a span.
@@ -76,6 +79,7 @@ class Model:
     velocity: tuple[float, ...] | None = None
     h: float | None = None
     tolerance: float | None = None
+    error: float | None = None
     span: float | None = None
     steps: int | None = None
     monitor: str | None = None
@@ -87,12 +91,12 @@ class Model:
         check_kind(SYSTEM, self.system, "system", ModelFileError)
         object.__setattr__(self, "method", as_method(self.method, self.system))
         check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-        check_not_both(self.h, self.tolerance)
+        check_at_most_one(self.h, self.tolerance, self.error)
         check_one_of("span", self.span, "steps", self.steps)
         for name in ("q", "p", "velocity"):
             if (vector := getattr(self, name)) is not None:
                 object.__setattr__(self, name, self._vector(name, vector))
-        for name in ("h", "tolerance", "t", "span"):
+        for name in ("h", "tolerance", "error", "t", "span"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, real(value, name))
         self._check_length()
@@ -250,16 +254,32 @@ class Model:
             own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
             h = longest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
         to_end = h is None or self.monitor is not None
+        tolerance = self.tolerance if self.error is None else self.confirmed(stepper, options=options).local_tolerance
         return stepper.start(
             self.q,
             p,
             h=abs(h) if h is not None and to_end else h,
             t=self.t,
             t_end=self.t + self.covered if to_end else None,
-            tolerance=self.tolerance if h is None else None,
+            tolerance=tolerance if h is None else None,
             parameters=self.parameters_at_start(stepper),
             options=options,
         )
+
+    def confirmed(self, stepper: Stepper, *, options: SolverOptions | None = None) -> GlobalError:
+        """Return the local tolerance for :attr:`error` and what runs of other steps confirm.
+
+        Steps of that tolerance are the same, to the last bit, as those that were confirmed.
+        """
+        p = self.momenta(stepper)
+        common: dict[str, Any] = {"t": self.t, "t_end": self.t + self.covered, "error": self.error}
+        common |= {"parameters": self.parameters, "options": options}
+        if self.system.inputs:
+            found = stepper.drive(self.q, p, inputs=self.all_inputs(), **common).confirmation
+        else:
+            found = stepper.integrate(self.q, p, **common).confirmation
+        assert found is not None  # by construction
+        return found
 
     def _check_length(self) -> None:
         if self.monitor is not None and (self.system.clock is not None or self.span is None):
@@ -269,6 +289,7 @@ class Model:
             )
         if self.h is None:
             check_controlled(self.tolerance, self.span)
+            check_error(self.error, paced=self.paced)
             return
         check_step(self.h, self.span)
 
@@ -314,10 +335,23 @@ def check_length(values: Sequence[object], names: Sequence[str], where: str) -> 
         raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
 
 
-def check_not_both(h: float | None, tolerance: float | None) -> None:
-    """Refuse a step size with a tolerance; neither means adaptive steps with errors at round-off level."""
-    if h is not None and tolerance is not None:
-        raise ModelFileError("give h (step) for a fixed step size or tolerance for adaptive steps, not both")
+def check_at_most_one(h: float | None, tolerance: float | None, error: float | None) -> None:
+    """Refuse several choices of the step size; none means adaptive steps with errors at round-off level."""
+    if sum(each is not None for each in (h, tolerance, error)) > 1:
+        raise ModelFileError(
+            "give h (step) for a fixed step size, tolerance for the error of each adaptive step or error for that of "
+            "the whole run: one of them, not both"
+        )
+
+
+def check_error(error: float | None, *, paced: bool) -> None:
+    """Refuse what is no bound of a global error, and one for steps of tau."""
+    if error is not None and not 0.0 < error < 1.0:
+        raise ModelFileError(f"error is {error:g}: the bound of the relative global error is between 0 and 1")
+    if error is not None and paced:
+        raise ModelFileError(
+            f"error = {error:g} needs adaptive steps, and a monitor has fixed steps of tau: give tolerance or step"
+        )
 
 
 def allowed_error(model: Any) -> float | None:

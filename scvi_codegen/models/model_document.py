@@ -55,7 +55,7 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
     initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
-    fields = {"step": model.h, "tolerance": model.tolerance}
+    fields = {"step": model.h, "tolerance": model.tolerance, "error": model.error}
     step = {key: value for key, value in fields.items() if value is not None}
     controller = {"controller": "reversible"} if model.monitor else {}
     run = {**step, **controller, **length, "every": model.every}

@@ -112,7 +112,7 @@ Kind = TypeVar("Kind")
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
-RUN_KEYS = ("step", "tolerance", "controller", "span", "steps", "every")
+RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ARRAY_SECTIONS = ("sizes", "tables")
@@ -233,6 +233,8 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     entry = _read_catalogue(document.get("system", {}))
     if given.get("sizes"):
         raise ModelFileError('[sizes] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
+    if "monitor" in given.get("system", {}) and "error" in document.get("run", {}):
+        _check_kept(document["run"]["error"], given.get("run", {}))
     document, given = _with_own_step(document), _with_own_step(given)
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
@@ -252,9 +254,18 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
 def _with_own_step(layer: Document) -> Document:
     """Where time is transformed a step given for another time is of no use: one is chosen unless it is said with it."""
     run = layer.get("run", {})
-    if "monitor" not in layer.get("system", {}) or "step" in run or "tolerance" in run:
+    if "monitor" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
         return layer
     return {**layer, "run": {**run, "tolerance": None}}
+
+
+def _check_kept(error: Any, run: Section) -> None:
+    """Refuse a monitor laid over a bound of the global error that it would replace."""
+    if not {"step", "tolerance"} & run.keys():
+        raise ModelFileError(
+            f"[run] error = {error} needs adaptive steps, and a monitor has fixed steps of tau: give --tolerance or "
+            "--step with --monitor"
+        )
 
 
 def _check_complete(document: Document) -> None:

@@ -32,7 +32,7 @@ Built = TypeVar("Built")
 Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
-ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance"}, {"span", "steps"})
+ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance", "error"}, {"span", "steps"})
 """One of each is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments that a method laid over another takes from it, if it has them."""
@@ -153,13 +153,14 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
 def read_run(section: Section) -> dict[str, Any]:
     """The fields of a model that ``[run]`` gives; without a step its steps choose their length."""
     section = {key: value for key, value in section.items() if value is not None}
-    check_one(section, "run", "step", "tolerance")
+    for one, other in (("step", "tolerance"), ("step", "error"), ("tolerance", "error")):
+        check_one(section, "run", one, other)
     check_one(section, "run", "span", "steps")
-    fields = {"step": "h", "tolerance": "tolerance", "span": "span"}
+    fields = {"step": "h", "tolerance": "tolerance", "error": "error", "span": "span"}
     found: dict[str, Any] = {
         field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
     }
-    if not {"step", "tolerance"} & section.keys() and "steps" in section:
+    if not {"step", "tolerance", "error"} & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps and no step, which says how long they are")
     if "steps" in section:
         found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)

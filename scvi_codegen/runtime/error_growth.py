@@ -1,13 +1,15 @@
-"""Indicator of error growth: a second run from a state changed in its last place, made after an adaptive run.
+"""Indicator of error growth: other runs from a changed state, made after an adaptive run.
 
-The difference of the two runs is what the motion makes of an error as small as rounding. The second run keeps no
-states, is made of at most a fixed number of steps, and is given up half-way where errors grow too slowly to matter.
+The difference of two runs is what the motion makes of an initial error. A coarse run, of a larger tolerance, shows in
+the first quarter or half of the steps whether errors grow exponentially; only then the run itself is repeated from a
+state changed in its last place, which keeps no states and is made of at most a fixed number of steps.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +19,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.runtime import indexed_constraints
 from scvi_codegen.runtime.accuracy import warnings_wanted
 from scvi_codegen.runtime.constraints import projected
+from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.memory import Memory
 
@@ -26,14 +29,22 @@ Array = NDArray[np.float64]
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18
 """Steps of the second run by default: their number, and that times the number of coordinates."""
-FASTEST = 10.0
+FASTEST = 1.15
 """Growth of an error within one step: what grows slower than this in so few steps is not looked at."""
 NUDGE = 2.0**-50
 """Relative change of the initial state, or the local tolerance if that is larger."""
 TOLERABLE, LOOSE, LARGEST = 1e-7, 1e5, 0.1
 """A run is reported where the difference exceeds the first and the second times its tolerance, or the third."""
-SLOW = 0.4
-"""Part of the decades in question that an error must have grown half-way for the second half to be made."""
+COARSE = 1e-8
+"""Local tolerance of the coarse run and relative change of its initial state, unless the tolerance is larger."""
+FIRST, DECISIVE = 1.0 / 8.0, (1.0 / 4.0, 1.0 / 2.0)
+"""Parts of the steps where the coarse run is compared: for the rate of growth, and for the decision."""
+MANY = 256
+"""Steps from which on the coarse run is compared at the first part, too."""
+SMALLEST = 1e-140
+"""Squares of smaller numbers, and of those above its inverse, are not exact: states are scaled then."""
+SLOW = 0.9
+"""Part of the decades in question that an error must grow, extrapolated exponentially, for the run to be repeated."""
 
 
 class StatesRepeated(Protocol):
@@ -52,8 +63,8 @@ class GrowthCheck:
 
     Args:
         run: at its start.
-        asked: ``True``: check all of the run; ``None``: up to ``MOST_STEPS`` of its steps, half of them where errors
-            grow slowly; ``False``: nothing.
+        asked: ``True``: repeat all of the run; ``None``: up to ``MOST_STEPS`` of its steps, and only if a coarse run
+            shows exponential growth; ``False``: nothing.
         lead: advances the run to a time; by default to the goal of that time.
 
     Raises:
@@ -78,32 +89,52 @@ class GrowthCheck:
         """Repeat the run, which stays where that ends, and warn if it ends elsewhere by more than is tolerable."""
         if not self.wanted or len(states.t) < 2:
             return
-        goal, steps = self.run.goal, self.run.steps
-        assert goal is not None  # by construction
-        nudge = max(NUDGE, goal.tolerance)
-        tolerable = min(max(TOLERABLE, LOOSE * goal.tolerance), LARGEST)
-        last = self._last(states, steps)
-        if last == 0 or nudge * FASTEST ** float(min(steps, 300)) < tolerable:
+        assert self.run.goal is not None  # by construction
+        steps, tolerance = self.run.steps, self.run.goal.tolerance
+        nudge = max(NUDGE, tolerance)
+        tolerable = min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
+        last, decades = self._last(states, steps), math.log10(tolerable / nudge)
+        few = steps * math.log10(FASTEST) < decades
+        if last == 0 or (not self.asked and (few or self._slow(states, last, max(nudge, COARSE), decades))):
             return
-        worst = (0.0, 0.0)
         try:
-            self._begin(nudge)
+            self._begin(nudge, tolerance)
             for k in sorted({last // 2, last} - {0}):
                 self.lead(float(states.t[k]))
                 apart = self._apart(states, k)
-                worst = max(worst, (apart, float(states.t[k])))
-                if k < last and not self.asked and apart < nudge * (tolerable / nudge) ** SLOW:
+                if not apart <= tolerable:
+                    self._report(nudge, f"is {apart:.1e} of its size away at t = {states.t[k]:g}")
                     return
         except StepFailedError as failure:
             self._report(nudge, f"fails at t = {failure.t:g}")
-            return
-        if not worst[0] <= tolerable:
-            self._report(nudge, f"is {worst[0]:.1e} of its size away at t = {worst[1]:g}")
+
+    def _slow(self, states: StatesRepeated, last: int, tolerance: float, decades: float) -> bool:
+        """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
+
+        The growth A(k) until step k of n is extrapolated as an exponential function, from the start, A(k)^(n/k), or
+        from the comparison before, at j: A(k) (A(k) / A(j))^((n - k) / (k - j)), whichever is less; growth by a power
+        of the time has a smaller second one.
+        """
+        first = {int(last * FIRST)} if last >= MANY else set()
+        before, grown_before = 0, 0.0
+        try:
+            self._begin(tolerance, tolerance)
+            for k in sorted((first | {int(last * part) for part in DECISIVE}) - {0}):
+                self.lead(float(states.t[k]))
+                little = 0.0 if k in first else SLOW * decades * k / last
+                grown = math.log10(max(self._apart(states, k, tolerance * 10.0**little) / tolerance, 1.0))
+                rate = max(grown - grown_before, 0.0) / (k - before)
+                if k not in first and (grown < little or grown + rate * (last - k) < SLOW * decades):
+                    return True
+                before, grown_before = k, grown
+        except StepFailedError:
+            pass
+        return False
 
     def _last(self, states: StatesRepeated, steps: int) -> int:
         """Return the number of the last state to compare: all of them are kept, or as many for each part of the run."""
         count = len(states.t) - 1
-        if len(self._rows(states.q)) != len(states.t):
+        if len(self._rows(states.q, 0, len(states.t))) != len(states.t):
             return 0
         most = float(min(MOST_STEPS, MOST_NUMBERS // len(self._halves()[0])))
         return count if self.asked or steps <= most else int(count * most / steps)
@@ -115,13 +146,16 @@ class GrowthCheck:
         q, p = np.split(self.run.state, 2)
         return q, p
 
-    def _begin(self, nudge: float) -> None:
-        """Put the run back to its start, changed, and on its constraints."""
+    def _begin(self, nudge: float, tolerance: float) -> None:
+        """Put the run back to its start, changed, and on its constraints, with another local tolerance."""
         run = self.run
         run.rewind(self.start)
+        assert run.goal is not None  # by construction
+        run.goal = Goal(t_end=run.goal.t_end, tolerance=tolerance)
         q, p = self._halves()
-        for k, part in enumerate((q, p)):
-            part *= 1.0 + nudge * np.cos(np.arange(len(part)) + k)
+        factors = _factors(len(q), nudge)
+        q *= factors[0]
+        p *= factors[1]
         if isinstance(run, IndexedRun):
             if run.interface.constraints:
                 indexed_constraints.project(run)
@@ -129,27 +163,37 @@ class GrowthCheck:
             q[:], p[:], _ = projected(run.stepper, q.copy(), p.copy(), run.t, run.parameters)
 
     def _to(self, t: float) -> None:
-        assert self.run.goal is not None  # by construction
-        self.run.change(goal=replace(self.run.goal, t_end=t))
-        while not self.run.arrived:
-            self.run.advance(MOST_STEPS)
+        run = self.run
+        assert run.goal is not None  # by construction
+        run.goal = Goal(t_end=t, tolerance=run.goal.tolerance)
+        while not run.arrived:
+            run.advance(MOST_STEPS)
 
-    def _apart(self, states: StatesRepeated, k: int) -> float:
-        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest until there."""
-        found = []
+    def _apart(self, states: StatesRepeated, k: int, small: float = 0.0) -> float:
+        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest until there.
+
+        Relative to the state itself, a bound that is quicker, if that is at most ``small``.
+        """
+        ratios = []
         for mine, each in zip(self._halves(), (states.q, states.p), strict=True):
-            rows = self._rows(each)[: k + 1]
-            unit = float(np.abs(rows).max()) or 1.0  # squares of very large or small numbers are not finite or are 0
-            size = float(np.linalg.norm(rows / unit, axis=1).max())
-            apart = float(np.linalg.norm((mine - rows[k]) / unit))
-            found.append(apart / size if apart and size else apart)
-        return max(found)
+            row = self._rows(each, k, k + 1)[0]
+            difference = mine - row
+            apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
+            if not (SMALLEST < size < 1.0 / SMALLEST and apart <= small * size):
+                rows = self._rows(each, 0, k + 1)
+                unit = float(np.abs(rows).max()) or 1.0
+                size = float(np.linalg.norm(rows / unit, axis=1).max())
+                apart = float(np.linalg.norm(difference / unit))
+            ratios.append(apart / size if apart and size else apart)
+        return max(ratios)
 
     @staticmethod
-    def _rows(values: Any) -> Array:
+    def _rows(values: Any, first: int, end: int) -> Array:
+        """Return states, those of several arrays side by side."""
         if isinstance(values, Mapping):
-            return np.concatenate([each.reshape(len(each), -1) for each in values.values()], axis=1)
-        return np.asarray(values)
+            parts = [each[first:end] for each in values.values()]
+            return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        return np.asarray(values)[first:end]
 
     @staticmethod
     def _report(nudge: float, said: str) -> None:
@@ -159,3 +203,9 @@ class GrowthCheck:
             "or check_growth=False to leave this check out",
             AccuracyWarning,
         )
+
+
+@lru_cache(maxsize=8)
+def _factors(size: int, nudge: float) -> tuple[Array, Array]:
+    """Return by what positions and momenta are multiplied to change them by about ``nudge``."""
+    return 1.0 + nudge * np.cos(np.arange(size)), 1.0 + nudge * np.cos(np.arange(size) + 1)

@@ -79,6 +79,11 @@ class GlobalError:
         return self.estimate <= max(self.requested, float(np.finfo(float).eps))
 
     @property
+    def local_tolerance(self) -> float | None:
+        """``tolerance`` as :meth:`Stepper.integrate` takes it: ``None`` for round-off."""
+        return self.tolerance or None
+
+    @property
     def digits(self) -> int:
         """Number of confirmed decimal digits of the whole run."""
         return max(0, math.floor(-math.log10(self.estimate))) if self.estimate < 1.0 else 0

@@ -91,9 +91,9 @@ class Stepper(Ensembles):
                 confirms it: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. Where
                 binary64 does not allow it, as for chaotic motions, an :class:`~scvi_codegen.AccuracyWarning` gives the
                 time until which the bound is confirmed.
-            check_growth: after a run of adaptive steps, repeat up to 2048 of them (half, where errors grow slowly) from
-                a state changed in its last place, and warn if that ends elsewhere by more than 1e-7 of its size.
-                ``True``: all steps; ``False``: none.
+            check_growth: after a run of adaptive steps, repeat up to 2048 of them from a state changed in its last
+                place, unless a coarse run shows that errors grow slowly, and warn if that ends elsewhere by more than
+                1e-7 of its size. ``True``: all steps, without a coarse run; ``False``: none.
 
         Returns:
             A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it. An

@@ -509,6 +509,80 @@ class TestCommandLine:
         assert result.exit_code == 1
         assert re.search(r"the global error 1e-09 is confirmed until t = [\d.]+ only", result.output)
 
+    @pytest.mark.parametrize("where", ["file", "option", "folder"])
+    def test_the_run_is_the_confirmed_one_bit_by_bit(self, tmp_path, where):
+        """Whether a file or an option asks for it, in memory and in a folder."""
+        path = self._kepler(tmp_path)
+        output = tmp_path / ("orbit.run" if where == "folder" else "orbit.npz")
+        chosen = ["kepler", "--span", "20", "--error", "1e-9"] if where == "option" else [str(path)]
+        document = json.loads(CliRunner().invoke(main, ["run", *chosen, "-o", str(output), "--json"]).stdout)
+        model = sc.load_model(path)
+        stepper = model.stepper()
+        run = stepper.integrate(model.q, model.momenta(stepper), t_end=20.0, error=1e-9)
+        folder = sc.load_run(output) if where == "folder" else None
+        kept = {name: getattr(folder, name) for name in "tqp"} if folder else np.load(output)
+        assert document["global_error"]["estimate"] == run.global_error
+        assert np.array_equal(kept["t"], run.t)
+        assert np.array_equal(kept["q"], run.q)
+        assert np.array_equal(kept["p"], run.p)
+
+    def test_a_recorded_run_that_is_not_confirmed_ends_with_1(self, tmp_path):
+        words = ["run", "double-pendulum", "--span", "40", "--error", "1e-9", "-o", str(tmp_path / "d.run")]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 1
+        assert "the global error 1e-09 is confirmed until t = " in result.output
+        assert sc.load_run(tmp_path / "d.run").t[-1] == 40.0
+
+    ARRAYS = (
+        '[system]\nname = "pendulums"\ncoordinates = ["q[N]"]\n'
+        'lagrangian = "sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))"\n'
+        '[method]\nmethod = "svi:8"\n[run]\nspan = {span}\nerror = 1e-8\n[initial]\nq = {q}\n'
+    )
+
+    def test_arrays(self, tmp_path):
+        path, output = tmp_path / "arrays.toml", tmp_path / "a.npz"
+        path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
+        words = (["run", str(path), "-o", str(output), "--json"], ["run", str(path), "--error", "1e-8", "--json"])
+        found = [json.loads(CliRunner().invoke(main, each).stdout)["global_error"] for each in words]
+        model = sc.load_indexed_model(path)
+        run = model.integrate()
+        assert found[0] == found[1]
+        assert found[0]["confirmed"]
+        assert found[0]["estimate"] == run.global_error <= 1e-8
+        kept = np.load(output)
+        assert any(np.array_equal(kept[name], run.q["q"]) for name in kept)
+        path.write_text(self.ARRAYS.format(span=200.0, q=[2.5, -1.0, 1.0]))
+        result = CliRunner().invoke(main, ["run", str(path)])
+        assert result.exit_code == 1
+        assert "the global error 1e-08 is confirmed until t = " in result.output
+
+    @pytest.mark.parametrize(
+        ("run", "words", "message"),
+        [
+            ("error = 1e-9\ntolerance = 1e-9", [], "has both of tolerance and error"),
+            ("error = 1e-9\nstep = 0.1", [], "has both of step and error"),
+            ("error = 2.0", [], "between 0 and 1"),
+            ("error = 1e-9", ["--monitor", "frequency"], "needs adaptive steps"),
+        ],
+    )
+    def test_files_that_are_refused(self, tmp_path, run, words, message):
+        path = tmp_path / "kepler.toml"
+        path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
+        result = CliRunner().invoke(main, ["run", str(path), *words])
+        assert result.exit_code == 2
+        assert message in result.output
+
+    def test_generated_folders_keep_it(self, tmp_path):
+        model = sc.load_model(self._kepler(tmp_path))
+        folder = sc.generate_package(model, tmp_path / "orbit")
+        assert sc.load_model(folder / "model.toml").error == 1e-9
+
+    @staticmethod
+    def _kepler(folder):
+        path = folder / "kepler.toml"
+        path.write_text('[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\nerror = 1e-9\n')
+        return path
+
     @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
     def test_one_choice_of_steps_alone(self, other):
         result = CliRunner().invoke(main, ["run", "kepler", "--error", "1e-9", other, "1e-9"])

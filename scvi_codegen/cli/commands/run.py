@@ -167,9 +167,10 @@ def run(
     chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
-        refuse({"ensemble": ensemble, "advise": advise, "error": error})
-        model = solved_by(solver, model)
-        run_sums(model if tolerance is None else controlled_model(model, tolerance), output, plot, options, threads)
+        refuse({"ensemble": ensemble, "advise": advise})
+        arrays, confirmed = _sums_with_steps(solved_by(solver, model), wanted, options, threads)
+        run_sums(arrays, output, plot, options, threads)
+        _check_confirmed(confirmed)
         return
     if threads is not None:
         raise click.UsageError("--threads are for models of sums over indices")
@@ -181,10 +182,15 @@ def run(
     model, found = _with_steps(model, wanted, solver, options)
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, solver=solver, options=options))
-        return
-    _run_one(model, output, plot, solver, options, promised=advise)
+    else:
+        _run_one(model, output, plot, solver, options, promised=advise)
+    _check_confirmed(found)
+
+
+def _check_confirmed(found: GlobalError | None) -> None:
+    """End with exit status 1 where a global error was asked for and is not confirmed."""
     if found is not None and not found.confirmed:
-        unconfirmed = f"the global error {error:g} is confirmed until t = {found.confirmed_until:g} only"
+        unconfirmed = f"the global error {found.requested:g} is confirmed until t = {found.confirmed_until:g} only"
         tell(broken=unconfirmed)
         raise CommandFailure(unconfirmed, FAILURE)
 
@@ -196,11 +202,23 @@ def _with_steps(
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
         return controlled_model(model, tolerance), None
-    if error is not None:
-        return confirmed_model(model, error, solver=solver, options=options)
     if advise is not None:
         return advised_model(model, advise, solver=solver, options=options), None
+    if (bound := model.error if error is None else error) is not None:
+        return confirmed_model(model, bound, solver=solver, options=options)
     return model, None
+
+
+def _sums_with_steps(
+    model: IndexedModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
+) -> tuple[IndexedModel, GlobalError | None]:
+    """Return as :func:`_with_steps`, for sums over indices."""
+    if wanted["tolerance"] is not None:
+        return controlled_model(model, wanted["tolerance"]), None
+    bound = model.error if wanted["error"] is None else wanted["error"]
+    if bound is None:
+        return model, None
+    return confirmed_model(model, bound, options=options, threads=threads)
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
@@ -283,6 +301,10 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
+    if model.error is not None:
+        raise click.UsageError(
+            f"[run] error = {model.error:g} is for one trajectory, not for --ensemble: set tolerance in its place"
+        )
     if model.paced:
         raise click.UsageError("with a monitor every trajectory has its own times: --ensemble does not go with it")
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
