@@ -413,6 +413,7 @@ static const lanes NEXT[GROUPS] = {1.0, 0.0};
 #include "support/curve_error.h"
 #include "support/sweep_or_stage_error.h"
 #include "support/sizes.h"
+#include "support/comparison.h"
 #include "support/halves.h"
 #include "support/observed_error.h"
 #else
@@ -428,6 +429,7 @@ static const double EXTRAPOLATION[5][5] = {
 
 #define ERROR_POWER STAGE_POWER
 #include "support/sizes.h"
+#include "support/comparison.h"
 #include "support/halves.h"
 #include "support/observed_error.h"
 #endif

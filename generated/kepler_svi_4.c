@@ -280,6 +280,7 @@ static const lanes NEXT[GROUPS] = {0.5325080420189116, -0.5325080420189116, -0.5
 #include "support/curve_error.h"
 #include "support/sweep_or_stage_error.h"
 #include "support/sizes.h"
+#include "support/comparison.h"
 #include "support/halves.h"
 #include "support/observed_error.h"
 #else
@@ -294,6 +295,7 @@ static const double EXTRAPOLATION[4][4] = {
 
 #define ERROR_POWER STAGE_POWER
 #include "support/sizes.h"
+#include "support/comparison.h"
 #include "support/halves.h"
 #include "support/observed_error.h"
 #endif

@@ -203,6 +203,7 @@ static const lanes NEXT[GROUPS] = {0.0, 0.0};
 #include "support/curve_error.h"
 #include "support/sweep_error.h"
 #include "support/sizes.h"
+#include "support/comparison.h"
 #include "support/halves.h"
 #include "support/observed_error.h"
 #else

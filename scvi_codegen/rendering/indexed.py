@@ -31,6 +31,8 @@ NEWTON_VECTORS = 4 + 17
 """Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
 WAVE_VECTORS = 2
 """Beside these scratch of transforms (templates/support/indexed_waves.h)."""
+HALVES_VECTORS = 6
+"""Beside these the state at the start of a step and two increments (templates/support/indexed_halves.h)."""
 
 
 def render_indexed(program: IndexedProgram) -> Source:
@@ -65,6 +67,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "sweep": _sweep_text(program),
         "work": _work(program),
         "sweep_vectors": SWEEP_VECTORS,
+        "halves_vectors": HALVES_VECTORS,
         "hot": "static",
         "waves": waves_context(program) if program.reach else None,
         **held_context(program),
@@ -101,7 +104,7 @@ def _work(program: IndexedProgram) -> int:
     own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
     linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
     waves = WAVE_VECTORS * program.sweep.lanes + roots_of(program) if program.reach else 0
-    return (own + linear) * program.sweep.lanes + waves
+    return (own + linear) * program.sweep.lanes + waves + HALVES_VECTORS
 
 
 def _sweep_text(program: IndexedProgram) -> SweepText | None:

@@ -1,14 +1,6 @@
 /* A step compared with two of half its length: what its curve cannot tell, where it has too few points, where forces
- * pass through zero at them, or where it is another solution of the stage equations. Before it: prepare and solve of a
- * solver, duration. */
-
-#define COMPARED 512 /* steps, of which one is compared */
-#define FALLBACK_COMPARED 8 /* steps that sweeps did not solve, of which one is */
-#define DOUBTFUL REAL(4.0) /* times the largest error yet, squared as that of a curve: such a step is */
-#define RESOLVED_STEP REAL(1e-6) /* of the state: where halves differ by more, those of the first half are compared */
-#define MOST_HALVINGS 24
-#define GROSS_DIFFERENCE REAL(10.0) /* times the state: beyond it a step is no motion */
-#define ROUNDING_OF_HALVES (64 * REAL_EPSILON)
+ * pass through zero at them, or where it is another solution of the stage equations. Before it: comparison.h, prepare
+ * and solve of a solver, duration. */
 
 static real duration(const step_data *step, const solver_data *data, const real *memory, long long guess,
     real *workspace);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -11,13 +12,15 @@ from random_steps import FAMILIES, WANTED, compiled, outcome, trials
 import scvi_codegen as sc
 
 QUICK = {
-    "duffing": "scvi:3",
-    "planar-pendulum": "scvi:6",
-    "kepler": "svi:2",
-    "relativistic": "svi:2",
-    "driven": "sc:3",
-    "damped": "gauss:3",
-    "chain": "svi:2",
+    "duffing": ("scvi:3", "auto"),
+    "planar-pendulum": ("scvi:6", "auto"),
+    "kepler": ("svi:2", "auto"),
+    "relativistic": ("svi:2", "auto"),
+    "driven": ("sc:3", "auto"),
+    "damped": ("gauss:3", "auto"),
+    "chain": ("svi:2", "auto"),
+    "pendulums": ("svi:2", "newton"),
+    "ellipses": ("svi:2", "newton"),
 }
 METHODS = (
     *(sc.SVI(degree) for degree in (2, 3, 4, 5, 6, 8, 12)),
@@ -44,7 +47,7 @@ def check(name, method, solver, steps):
 
 @pytest.mark.parametrize("name", QUICK)
 def test_no_step_is_wrong_by_far_more_than_its_estimate(name):
-    found = check(name, QUICK[name], "auto", trials(name, 150))
+    found = check(name, *QUICK[name], trials(name, 150))
     assert (found.errors > 1e-12).sum() > 20
 
 
@@ -57,7 +60,7 @@ def test_no_step_of_any_method_is(method, solver):
         try:
             compiled(name, method, solver)
         except sc.MethodError:
-            assert name == "chain"
+            assert isinstance(FAMILIES[name].system, sc.IndexedSystem)
             continue
         check(name, method, solver, trials(name, 1100))
 
@@ -111,3 +114,20 @@ def test_comparing_with_halves_leaves_a_run_as_it_is():
         last = run.record(518)
         assert np.array_equal(last.q[-1], whole.q[-1])
         assert whole.step_error < 1e-6
+
+
+@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
+def test_comparing_with_halves_leaves_an_array_as_it_is(solver):
+    """Every step is compared, for any number of threads, and the run is that of which few are."""
+    few = compiled("chain", "svi:4", solver)
+    headers = tuple((name, text.replace("COMPARED 512", "COMPARED 1")) for name, text in few.source.support)
+    source = dataclasses.replace(few.source, support=headers)
+    assert source != few.source
+    every = sc.IndexedStepper(source, few.interface)
+    start = np.random.default_rng(1).normal(size=1100)
+    wanted = few.integrate(start, h=0.1, steps=12)
+    for threads in (1, 2):
+        found = every.integrate(start, h=0.1, steps=12, threads=threads)
+        assert np.array_equal(found.q["x"], wanted.q["x"])
+        assert np.array_equal(found.p["x"], wanted.p["x"])
+        assert found.step_error >= wanted.step_error

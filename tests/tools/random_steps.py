@@ -101,6 +101,14 @@ def _families() -> Mapping[str, Family]:
     five = [f"x{k}" for k in range(5)]
     out = " + ".join(f"{x}_dot**2/2 - {x}**2/2" for x in five)
     out += "".join(f" - ({b} - {a})**4/4" for a, b in pairwise(five))
+
+    def rows(name: str, terms: str) -> Any:
+        lagrangian = f"sum(a in N, {terms})"
+        return sc.IndexedSystem.from_text(name=name, coordinates=["x[N, 2]"], lagrangian=lagrangian)
+
+    ellipses = rows("ellipses", "(x_dot[a,0]**2 + x_dot[a,1]**2)/2 + 1/sqrt(x[a,0]**2 + x[a,1]**2)")
+    pendulums = rows("pendulums", "(x_dot[a,0]**2 + x_dot[a,1]**2)/2 + cos(x[a,0]) + cos(x[a,1])")
+    two = "p_dot**2/2 + q_dot**2/2 + cos(p) + cos(q)"
     driven = text(
         name="driven",
         coordinates=["x", "y"],
@@ -131,6 +139,10 @@ def _families() -> Mapping[str, Family]:
         "chain": Family(
             chain, 5.0, _normal((0,) * 5, (0,) * 5, 0.7), text(name="five", coordinates=five, lagrangian=out)
         ),
+        "pendulums": Family(
+            pendulums, 7.0, _normal((0, 0), (0, 0), 1.0), text(name="two", coordinates=["p", "q"], lagrangian=two)
+        ),
+        "ellipses": Family(ellipses, 6.3, _ellipse, known("kepler")),
     }
 
 
@@ -177,8 +189,10 @@ def trials(name: str, count: int, seed: int = 1) -> list[Trial]:
 def taken(stepper: Any, trial: Trial) -> tuple[Array, float]:
     """The end of a step and its estimate."""
     if isinstance(stepper, sc.IndexedStepper):
-        run = stepper.integrate(trial.q, trial.p, t=trial.t, h=trial.h, steps=1)
-        return run.q["x"][-1], run.step_error
+        shape = [axis.number or 1 for axis in stepper.interface.coordinates[0].axes]
+        at = [np.reshape(x, [-1, *shape[1:]]) for x in (trial.q, trial.p)]
+        run = stepper.integrate(*at, t=trial.t, h=trial.h, steps=1)
+        return run.q["x"][-1].ravel(), run.step_error
     run = stepper.integrate(trial.q, trial.p, t=trial.t, h=trial.h, steps=1)
     return run.q[-1], run.step_error
 
