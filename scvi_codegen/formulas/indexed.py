@@ -131,7 +131,7 @@ class _Indices(Parser):
     def whole_number(self) -> int:
         token = self.peek()
         if not token.text.isdigit() or len(token.text) > 9:
-            self.refuse(f"a whole number is expected here, not '{token.text}'", token.column)
+            self.refuse(f"a whole number of at most 9 digits is expected here, not '{token.text}'", token.column)
         self.position += 1
         return int(token.text)
 

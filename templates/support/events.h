@@ -339,7 +339,8 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
 /* Where the search of a first step begins. A run that was ended at a zero and starts from there again, thrown back, may
  * stand on the side from which it came to that zero by a rounding, or exactly on it; if it leaves to the other side and
  * returns within the step, no sign tells. States behind the start, each four times as far as the one before, are looked
- * at until one is beyond rounding, then for the return. If it returns before the first of these, crossings accumulate. */
+ * at until one is beyond rounding, then for the return. If it returns before the first of these,
+ * crossings accumulate. */
 static int leave_zero(const event_step *step, int e, const event_sample *left, real range, event_sample *from)
 {
   event_sample next;

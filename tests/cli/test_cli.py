@@ -353,7 +353,8 @@ class TestRun:
         written, table = arrays("orbit.npz"), np.loadtxt("orbit.csv", delimiter=",", skiprows=1)
         for key in ("t", "q", "p", "iterations"):
             assert np.array_equal(written[key], getattr(expected, key))
-        assert np.array_equal(table, np.column_stack([expected.t, expected.q, expected.p, expected.iterations]))
+        columns = [expected.t, expected.q, expected.p, expected.iterations, expected.velocity, expected.energy()]
+        assert np.array_equal(table, np.column_stack(columns))
 
     def test_steps_fewer_than_every_and_none_at_all(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state kept" in output_of(
