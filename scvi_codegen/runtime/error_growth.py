@@ -84,6 +84,9 @@ class GrowthCheck:
         self.wanted = adaptive and asked is not False and warnings_wanted()
         if self.wanted:
             self.start: Any = run.save() if isinstance(run, Memory) else run.mark
+            self.parameters = (
+                run.parameters.copy() if isinstance(run, Memory) else None
+            )  # inputs change them on the way
 
     def warn(self, states: StatesRepeated) -> None:
         """Repeat the run, which stays where that ends, and warn if it ends elsewhere by more than is tolerable."""
@@ -150,6 +153,8 @@ class GrowthCheck:
         """Put the run back to its start, changed, and on its constraints, with another local tolerance."""
         run = self.run
         run.rewind(self.start)
+        if isinstance(run, Memory):
+            run._parameters[:] = self.parameters
         assert run.goal is not None  # by construction
         run.goal = Goal(t_end=run.goal.t_end, tolerance=tolerance)
         q, p = self._halves()
