@@ -48,7 +48,7 @@ def check(name, method, solver, steps):
 @pytest.mark.parametrize("name", QUICK)
 def test_no_step_is_wrong_by_far_more_than_its_estimate(name):
     found = check(name, *QUICK[name], trials(name, 150))
-    assert (found.errors > 1e-12).sum() > 20
+    assert (found.errors > 1e-12).sum() > 10  # enough of them have an error to compare
 
 
 @pytest.mark.full
