@@ -247,12 +247,19 @@ def _rows(values: Any) -> Array:
 
 def _sizes(states: Array, early: NDArray[np.bool_]) -> Array:
     """Return the largest norm up to each state, at least that of the early ones."""
-    norms = np.linalg.norm(states, axis=1)
+    norms = _norms(states)
     return np.maximum.accumulate(np.maximum(norms, norms[early].max(initial=0.0)))
 
 
+def _norms(rows: Array) -> Array:
+    """Return the norm of each row; squares of its numbers relative to its largest are not infinite, nor all 0."""
+    units = abs(rows).max(axis=1, initial=0.0)
+    with np.errstate(invalid="ignore"):
+        return units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1)
+
+
 def _relative(one: Array, other: Array, sizes: Array) -> Array:
-    apart = np.linalg.norm(one - other, axis=1)
+    apart = _norms(one - other)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(apart == 0.0, 0.0, apart / sizes)
 

@@ -593,3 +593,12 @@ class TestCommandLine:
         result = CliRunner().invoke(main, ["run", "kepler", "--error", "1e-9", other, "1e-9"])
         assert result.exit_code == 2
         assert "exclude each other" in result.output
+
+
+@pytest.mark.parametrize("power", [-660, 660])
+def test_global_errors_of_linear_systems_know_no_size(power):
+    """Squares of such states overflow, or are 0."""
+    stepper = sc.compile_stepper(made("oscillator", ["q"], "q_dot**2/2 - q**2/2"), "svi:4")
+    one, other = (stepper.integrate([size], [0.0], t_end=3.0, error=1e-8) for size in (1.0, 2.0**power))
+    assert other.confirmation.confirmed
+    assert other.global_error == pytest.approx(one.global_error, rel=0.5)
