@@ -255,7 +255,7 @@ def _norms(rows: Array) -> Array:
     """Return the norm of each row; squares of its numbers relative to its largest are not infinite, nor all 0."""
     units = abs(rows).max(axis=1, initial=0.0)
     with np.errstate(invalid="ignore"):
-        return units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1)
+        return np.asarray(units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1))
 
 
 def _relative(one: Array, other: Array, sizes: Array) -> Array:
