@@ -183,8 +183,11 @@ class GrowthCheck:
         for mine, each in zip(self._halves(), (states.q, states.p), strict=True):
             row = self._rows(each, k, k + 1)[0]
             difference = mine - row
-            apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
-            if not (SMALLEST < size < 1.0 / SMALLEST and apart <= small * size):
+            largest = float(np.abs(row).max())
+            apart = size = 0.0
+            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # else squares overflow
+                apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
+            if not (size > 0.0 and apart <= small * size):
                 rows = self._rows(each, 0, k + 1)
                 unit = float(np.abs(rows).max()) or 1.0
                 size = float(np.linalg.norm(rows / unit, axis=1).max())

@@ -25,7 +25,7 @@ class _Stopped(Exception):  # noqa: N818  (a wish, not an error)
 
 def workers_of(threads: int | None) -> int:
     """The number of workers, one a core where none is given."""
-    given = 0 if threads is None else checked_count(threads, "threads", least=0)
+    given = 0 if threads is None else checked_count(threads, "threads", least=1)
     return given or os.cpu_count() or 1
 
 

@@ -35,7 +35,7 @@ def test_sweeps_that_diverge_beyond_all_squares_do_not_converge(system, method):
     stepper = sc.compile_stepper(system, method, solver="fixed-point", flags=QUICK_FLAGS)
     start = np.linspace(1.0, 0.5, stepper.dimension), np.zeros(stepper.dimension)
     for h in (1e4, 1e5, 1e6, 1e7, 1e10, 1e14, 1e20, 1e26, 1e40, 1e80, 1e160, 1e300):
-        with pytest.raises(StepFailedError, match=r"not (converged|finite)"):
+        with pytest.raises(StepFailedError, match=r"did not converge|infinite or NaN"):
             stepper.step(*start, h)
         if system is OSCILLATOR and method == "svi:2":
             many = stepper.integrate_ensemble([start[0]] * 3, [start[1]] * 3, h=h, steps=1)

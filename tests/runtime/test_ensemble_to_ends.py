@@ -102,7 +102,7 @@ def test_an_interruption_keeps_what_was_done(kepler):
         ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance is for"),
         ({"t_end": [1.0, 2.0]}, "one time or 4"),
         ({"t_end": [1.0, 2.0, -1.0, 3.0]}, "two ensembles"),
-        ({"t_end": 1.0, "tolerance": 2.0}, "between 0 and 1"),
+        ({"t_end": 1.0, "tolerance": 2.0}, "must be positive and below 1"),
         ({"t_end": 1.0, "t_eval": [0.5, 1.5]}, "outside"),
         ({"t_end": 1.0, "t_eval": [0.5], "every": 2}, "not both"),
     ],
