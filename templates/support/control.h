@@ -4,14 +4,25 @@
 #define ALLOWED_TO_HALVES 100 /* times the error allowed to a step, what its halves may differ from it by */
 #define SPURIOUS REAL(1e-8) /* of the state: by less than that other solutions of the equations differ not */
 
-/* Compares the first step, and later few, with their halves, and shortens it while it is wrong by far more than its
- * curve tells. */
+#define DOUBTED 16 /* steps that are compared after one that was shortened because of it */
+
+/* Whether a step is compared in momenta, too: where its size fell by an octave or more, and after a step that was wrong.
+ * Where forces are not smooth, as at a singular time, the coefficients of a curve do not decay, so that they do not show
+ * its error; and steps are so short that momenta have most of it. */
+static inline int is_doubted(const run_memory *run, const trial *now)
+{
+  return now->change <= -OCTAVE || run->doubted > 0;
+}
+
+/* Compares a step with its halves, and shortens it while it is wrong by far more than its curve estimates. */
 static SELDOM int compare_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const real allowed = larger(ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), SPURIOUS);
+  const int doubted = is_doubted(run, now);
+  const real allowed = larger(
+      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), doubted ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    int status = compare_with_halves(&now->step, now->dq, options, &apart);
+    int status = compare_with_halves(&now->step, now->dq, doubted ? now->dp : NULL, options, &apart);
     if (status > STATUS(STRAYED))
       return status;
     if (status == OK && apart <= allowed) {
@@ -20,8 +31,10 @@ static SELDOM int compare_step(run_memory *run, trial *now, const solver_options
         run->error = apart;
         run->error_t = now->at.t;
       }
+      run->doubted -= run->doubted > 0;
       return OK;
     }
+    run->doubted = DOUBTED;
     now->error = INFINITY;
     if (!shorten(run, now))
       return STATUS(VANISHED);
@@ -32,9 +45,10 @@ static SELDOM int compare_step(run_memory *run, trial *now, const solver_options
   }
 }
 
+/* Compares the first step, later few, and those in doubt. */
 static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  return run->step % COMPARED == 0 ? compare_step(run, now, options, report) : OK;
+  return run->step % COMPARED == 0 || is_doubted(run, now) ? compare_step(run, now, options, report) : OK;
 }
 
 /* Makes the step that was found the state. */

@@ -25,17 +25,19 @@ static SELDOM int add_part(step_data *part, const solver_options *options, real 
   return 0 * part->t == 0 ? OK : NOT_FINITE;
 }
 
-/* Solves two steps of h/2: the increments of both, and those of the first. */
-static SELDOM int solve_halves(const step_data *step, real h, const solver_options *options, real *dq, real *first)
+/* Solves two steps of h/2: the increments of both, and those of q by the first. */
+static SELDOM int solve_halves(const step_data *step, real h, const solver_options *options, real *dq, real *dp,
+    real *first)
 {
   const real nothing[M] = {0};
-  real q[M], p[M], dp[M] = {0};
+  real q[M], p[M];
   step_data part = *step;
   int status;
   part.h = h / 2;
   part.first = 1;
   part.tables = NULL;
   memset(dq, 0, sizeof(real) * M);
+  memset(dp, 0, sizeof(real) * M);
   status = add_part(&part, options, dq, dp);
   if (status != OK)
     return status;
@@ -50,14 +52,14 @@ static SELDOM int solve_halves(const step_data *step, real h, const solver_optio
   return add_part(&part, options, dq, dp);
 }
 
-/* The difference of the increments, relative to the state that `halves` lead to; 0 where it may be rounding. */
-static real difference(const step_data *step, const real *whole, const real *halves)
+/* The difference of the increments of x, relative to the state that `halves` lead to; 0 where it may be rounding. */
+static real difference(const real *x, const real *whole, const real *halves)
 {
   real largest = 0, most = 0;
   for (int i = 0; i < M; i++)
-    largest = larger(largest, MATH(fabs)(step->q0[i]) + MATH(fabs)(halves[i]));
+    largest = larger(largest, MATH(fabs)(x[i]) + MATH(fabs)(halves[i]));
   for (int i = 0; i < M; i++) {
-    const real size = MATH(fabs)(step->q0[i]) + MATH(fabs)(halves[i]) + largest + REAL_MIN;
+    const real size = MATH(fabs)(x[i]) + MATH(fabs)(halves[i]) + largest + REAL_MIN;
     most = larger(most, MATH(fabs)(whole[i] - halves[i]) / size);
   }
   return most > ROUNDING_OF_HALVES ? most : 0;
@@ -65,19 +67,23 @@ static real difference(const step_data *step, const real *whole, const real *hal
 
 /* By how much the end of a step is wrong, relative to the state, as its halves tell. Both may leave forces at the start
  * out, as those near a centre: so where they differ much the first half is compared with its own halves, as long as
- * these differ by more. Not OK where halves have no solution, or differ by far more than the state. */
-static SELDOM int compare_with_halves(const step_data *step, const real *dq, const solver_options *options, real *error)
+ * these differ by more. Momenta are compared too, of the whole step, unless dp is NULL. Not OK where halves have no
+ * solution, or differ by far more than the state. */
+static SELDOM int compare_with_halves(const step_data *step, const real *dq, const real *dp,
+    const solver_options *options, real *error)
 {
-  real whole[M], halves[M], first[M], before = -1, h = step->h;
+  real whole[M], halves[M], changes[M], first[M], before = -1, h = step->h;
   memcpy(whole, dq, sizeof whole);
   *error = 0;
   for (int k = 0; k < MOST_HALVINGS; k++) {
-    const int status = solve_halves(step, h, options, halves, first);
+    const int status = solve_halves(step, h, options, halves, changes, first);
     real apart;
     if (status != OK)
       return status > STATUS(STRAYED) ? status : STATUS(STRAYED);
-    apart = difference(step, whole, halves);
+    apart = difference(step->q0, whole, halves);
     *error = larger(*error, apart);
+    if (dp && k == 0)
+      *error = larger(*error, difference(step->p0, dp, changes));
     if (!(apart <= GROSS_DIFFERENCE))
       return STATUS(STRAYED);
     if (!(apart > RESOLVED_STEP && apart > before))

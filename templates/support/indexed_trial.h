@@ -5,7 +5,7 @@
 /* What the trials of a step share. */
 typedef struct {
   const problem *given;
-  long long n, guess;
+  long long n, guess, change; /* the last: of rungs, from the step before */
   struct {
     double t, t_low;
   } at;

@@ -8,6 +8,7 @@ typedef struct {
   error_limits limits;
   real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
   long long guess, rung; /* of the length */
+  long long change; /* of rungs, from the step before to this */
   real length; /* 0 before the first trial */
   int last; /* whether the step ends at t_end */
 } trial;

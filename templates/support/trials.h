@@ -1,5 +1,5 @@
 /* Trials of a step, until one is as long as its error allows. Before it: rungs.h; the type trial with at.t, at.t_low,
- * t_end, limits, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether rounding
+ * t_end, limits, change, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether rounding
  * alone may make a step fail; HOT. After it: what makes the step that was found the state. */
 
 /* By how many rungs the first step may be longer at once. */
@@ -55,6 +55,7 @@ static int shorten(run_memory *run, const trial *now)
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
+  now->change = run->change - run->rung;
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else
@@ -65,6 +66,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
     try_step(run, now, least, options, report);
   }
   now->error = larger(now->error, least);
+  now->change += run->rung;
   return OK;
 }
 

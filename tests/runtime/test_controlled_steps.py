@@ -403,6 +403,19 @@ def test_forces_that_set_out_beyond_the_degree_are_said():
     assert run.q[-1, 0] == pytest.approx(1.0 + math.cos(2.0), rel=1e-13)
 
 
+def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
+    """The force -log((t - 1)^2): q(2) = q(0) + 4 from rest. The step across t = 1 has the error of the whole run."""
+    singular = sc.LagrangianSystem.from_text(
+        name="singular", coordinates=["q"], lagrangian="q_dot**2/2 - q*log((t - 1)**2)"
+    )
+    stepper = sc.compile_stepper(singular, sc.SVI(8))
+    for tolerance in (1e-8, 1e-10, None):
+        run = stepper.integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance, check_growth=False)
+        error, wanted = abs(run.q[-1, 0] - 5.0) / 5.0, tolerance or 1e-13
+        assert error < 100.0 * wanted, tolerance
+        assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
+
+
 def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
     stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
