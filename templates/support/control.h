@@ -4,14 +4,27 @@
 #define ALLOWED_TO_HALVES 100 /* times the error allowed to a step, what its halves may differ from it by */
 #define SPURIOUS REAL(1e-8) /* of the state: by less than that other solutions of the equations differ not */
 
+#define SMALL_PART REAL(0.1)
 #define DOUBTED 16 /* steps that are compared after one that was shortened because of it */
 
-/* Whether a step is compared in momenta, too: where its size fell by an octave or more, and after a step that was wrong.
- * Where forces are not smooth, as at a singular time, the coefficients of a curve do not decay, so that they do not show
- * its error; and steps are so short that momenta have most of it. */
+/* Whether momenta change by a small part of the largest: so they do where forces that are not smooth shorten a step. */
+static SELDOM int changes_little(const trial *now)
+{
+  real change = 0, size = 0;
+  for (int i = 0; i < M; i++) {
+    change = larger(change, MATH(fabs)(now->dp[i]));
+    size = larger(size, MATH(fabs)(now->at.p[i]));
+  }
+  return change < SMALL_PART * size;
+}
+
+/* Whether a step is compared in momenta, too: where its size fell by an octave or more although little changes, and
+ * after a step that was wrong. Where forces are not smooth, as at a singular time, the coefficients of a curve do not
+ * decay, so that they do not show its error; and steps are so short that momenta have most of it. Not by Newton's
+ * iteration, whose steps may leave vibrations of stiff systems unresolved. */
 static inline int is_doubted(const run_memory *run, const trial *now)
 {
-  return now->change <= -OCTAVE || run->doubted > 0;
+  return SHORT_STEPS_FAIL && (run->doubted > 0 || (now->change <= -OCTAVE && changes_little(now)));
 }
 
 /* Compares a step with its halves, and shortens it while it is wrong by far more than its curve estimates. */
