@@ -1,6 +1,6 @@
 /* Trials of a step, until one is as long as its error allows. Before it: rungs.h; the type trial with at.t, at.t_low,
- * t_end, limits, change, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether rounding
- * alone may make a step fail; HOT. After it: what makes the step that was found the state. */
+ * t_end, limits, change, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether
+ * rounding alone may make a step fail; HOT. After it: what makes the step that was found the state. */
 
 /* By how many rungs the first step may be longer at once. */
 static int rungs_up(const trial *now)

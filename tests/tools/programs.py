@@ -20,8 +20,8 @@ __all__ = ["REQUIRED", "UndeclaredProgramError", "audit", "forget", "needs"]
 REQUIRED = frozenset(Path(__file__).with_name("required_programs.txt").read_text(encoding="utf-8").split())
 """Names of the programs that the test command of the README may call on any machine, beside Python."""
 
-TRIED_BY_PYTHON = frozenset(["ldconfig"])
-"""Programs that the standard library calls if they are there, and does without (``ctypes.util.find_library``)."""
+TRIED_BY_LIBRARIES = frozenset(["fc-list", "ldconfig"])
+"""Programs that libraries call if they are there, and do without: Matplotlib's fonts, ``ctypes.util.find_library``."""
 
 REMEDY = {
     "arm-none-eabi-gcc": "Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi",
@@ -69,5 +69,5 @@ def audit(event: str, arguments: tuple[Any, ...]) -> None:
     """Audit hook (``sys.addaudithook``): raise an error where a test starts a program that it has not declared."""
     if event in ("subprocess.Popen", "os.posix_spawn", "os.exec") and "PYTEST_CURRENT_TEST" in os.environ:
         name = _program(arguments[0])
-        if name is not None and name not in REQUIRED | TRIED_BY_PYTHON | _declared and not name.startswith("python"):
+        if name is not None and name not in REQUIRED | TRIED_BY_LIBRARIES | _declared and not name.startswith("python"):
             raise UndeclaredProgramError(f"{name} is not required by the README; call programs.needs({name!r}) first")
