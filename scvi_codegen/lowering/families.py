@@ -24,7 +24,7 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["argument_name", "has_action", "lowered_family"]
 
 MOST_COMPARED, UNLIKE = 16, mp.mpf(10) ** -20
-"""Pairs of slopes written differently that are compared by value, and by how much these may differ."""
+"""Pairs of derivatives written differently that are compared by value, and by how much these may differ."""
 
 
 def has_action(system: MechanicalSystem) -> bool:
@@ -146,7 +146,7 @@ def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
 
 
 def _check_symmetry(family: PointFamily, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
-    """Raise :class:`MethodError` where slopes differ within a pair: Newton's iteration would not converge by them."""
+    """Raise :class:`MethodError` if mixed derivatives differ: Newton's iteration would not converge with them."""
     unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
     for i, j in unlike[:MOST_COMPARED]:
         pair = entries[i, j], entries.get((j, i), sympy.S.Zero)

@@ -63,7 +63,7 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) ->
     raise StateError(
         "this is a saved run of fixed steps, which has no t_end: leave it out"
         if to_a_goal
-        else "this is a saved run whose steps choose their length: give its t_end"
+        else "this is a saved run with adaptive steps: give its t_end"
     )
 
 
