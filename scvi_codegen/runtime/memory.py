@@ -33,7 +33,7 @@ __all__ = ["Memory", "fill"]
 UNHEARD_STEPS = 10**5
 """Between looks at the keyboard."""
 RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction"), 2**16
-"""Fields of adaptive steps that index the tables of the step-size grid, and a bound beyond all exponents of a double."""
+"""Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
 NEVER = LARGEST_COUNT
 """No step's number: of states that are to be kept."""
 
