@@ -26,7 +26,7 @@ stepper = compile_stepper(cart, SVI(4))
 def after_a_sample(state: np.ndarray, force: float) -> np.ndarray:
     """(x, a, p_x, p_a) a sample later."""
     run = stepper.start(state[:2], state[2:], h=SAMPLE / STEPS)
-    run.hold(u=force)
+    run.set_inputs(u=force)
     run.advance(STEPS)
     return np.concatenate([run.q, run.p])
 
@@ -47,7 +47,7 @@ run = stepper.start([0.0, 0.35], velocity=[0.0, 0.0], h=SAMPLE / STEPS)
 times, forces, tilt = [], [], []
 for _ in range(300):
     force = -(gain @ np.concatenate([run.q, run.p])).item()
-    run.hold(u=force)
+    run.set_inputs(u=force)
     times.append(run.t), forces.append(force), tilt.append(run.q[1])
     run.advance(STEPS)
 print(f"tilt {tilt[0]:.2f} at first, {abs(tilt[100]):.0e} after 2 s, {abs(run.q[1]):.0e} after 6 s")

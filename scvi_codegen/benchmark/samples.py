@@ -53,7 +53,7 @@ class Sampling:
         at = np.full(stepper.dimension, 0.3)
         self.advanced, self.held, bare = (each.start(at, 0.0 * at, h=STEP) for each in (stepper, stepper, alone))
         for run in (self.advanced, bare):
-            run.hold(u=PUSH)
+            run.set_inputs(u=PUSH)
         binding, self._values = alone.binding, bare.parameters
         self._memory, report, room = binding.new("run *"), binding.new("report *"), binding.workspace()
         binding.buffer(self._memory)[:] = bare.save()
@@ -61,7 +61,7 @@ class Sampling:
         self.calls: dict[str, Callable[[], object]] = {
             "bare": lambda: step(1, 2**53, values, null, null, null, null, null, report, room),
             "assign": self._assign,
-            "hold": lambda: self.advanced.hold(u=PUSH),
+            "hold": lambda: self.advanced.set_inputs(u=PUSH),
             "advance": lambda: self.advanced.advance(1),
             "sample": self._sample,
             "look": lambda: (self.advanced.q, self.advanced.p),
@@ -71,7 +71,7 @@ class Sampling:
         self._values[-5:] = PUSH, 0.0, 0.0, 0.0, 0.0
 
     def _sample(self) -> None:
-        self.held.hold(u=PUSH)
+        self.held.set_inputs(u=PUSH)
         self.held.advance(1)
 
     def states(self) -> list[list[float]]:
@@ -96,8 +96,9 @@ def run_samples(plan: Plan, say: Say) -> ResultTable:
         rows=tuple(rows),
         remarks=(
             "bare: C's function, called with pointers at hand, a step; assign: NumPy's, of the five numbers of an",
-            "input; hold: run.hold(u=...); advance: run.advance(1); sample: both; look: run.q and run.p; over: what a",
-            "call costs beyond NumPy's, and C's. Minima of processor time; a call from a Python function is in each.",
+            "input; hold: run.set_inputs(u=...); advance: run.advance(1); sample: both; look: run.q and run.p; over:",
+            "what a call costs beyond NumPy's, and C's. Minima of processor time; a call from a Python function is in",
+            "each.",
         ),
     )
 

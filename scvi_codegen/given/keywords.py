@@ -12,7 +12,7 @@ __all__ = ["keyword_meant"]
 
 ELSEWHERE: Final = {
     "inputs": "a system with inputs runs by .drive(..., inputs={'u': (t, values)}), many at once by "
-    ".drive_ensemble, and between samples by run.hold(u=...)",
+    ".drive_ensemble, and between samples by run.set_inputs(u=...)",
     "t_eval": "keep all states, and ask the run for those at times: run.at(times)",
     "events": "they are of .integrate(..., events=...) or of compile_stepper(..., events=...)",
     "every": "it is of run.record(n, every=...), and of .integrate",

@@ -224,11 +224,11 @@ def stretches(
     """
     if run.goal is None:
         for stretch in planned(run.t, t_end, run.h, inputs):
-            run.change(parameters=values(stretch.middle), h=stretch.h)
+            run.update(parameters=values(stretch.middle), h=stretch.h)
             yield stretch.steps
         return
     for end in ends_on_the_way(run.t, t_end, inputs):
-        run.change(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
+        run.update(parameters=values(run.t + 0.5 * (end - run.t)), goal=replace(run.goal, t_end=end))
         yield None
 
 
@@ -249,7 +249,7 @@ class Driven(Standing, Protocol):
     def advance(self, steps: int) -> None:
         """So many steps, or those that lead to the goal."""
 
-    def change(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
+    def update(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with others."""
 
 

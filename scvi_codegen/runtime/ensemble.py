@@ -272,7 +272,7 @@ class LaneBlock:
     def _change(self, h: float, own: Array) -> None:
         """Another step, before which what the curve of the last one says of the next is forgotten, and parameters."""
         for lane, alone in self.left.items():
-            alone.change(h, own[lane])
+            alone.update(h, own[lane])
         self.parameters[:, : self.count] = own.T
         self.parameters[:, self.count :] = own[-1:].T
         if h == self.memory.h:
@@ -337,7 +337,7 @@ class _SingleBlock:
         for portion in self.run.work.portions(self.step, size):
             self.step += portion.steps
             if portion.change is not None:
-                self.run.change(portion.change.h, portion.change.parameters(slice(self.run.j, self.run.j + 1))[0])
+                self.run.update(portion.change.h, portion.change.parameters(slice(self.run.j, self.run.j + 1))[0])
             self.run.advance_to(self.step, portion.every)
 
 
@@ -360,10 +360,10 @@ class _Alone:
                 run.resume_at(step, time, carries)
             self.run = run
 
-    def change(self, h: float, parameters: Array) -> None:
+    def update(self, h: float, parameters: Array) -> None:
         """Go on with others."""
         if self.run is not None:
-            self.run.change(h=h, parameters=parameters)
+            self.run.update(h=h, parameters=parameters)
 
     def advance_to(self, step: int, every: int) -> None:
         """On to ``step``, unless it failed before."""

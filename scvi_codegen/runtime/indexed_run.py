@@ -131,7 +131,7 @@ class IndexedRun(OneThread):
             raise StateError(f"{what} has no positive mass: every one needs a kinetic energy")
 
     @alone
-    def change(
+    def update(
         self,
         *,
         parameters: Mapping[str, ArrayLike] | Sequence[float] | Numbers | None = None,
@@ -164,7 +164,7 @@ class IndexedRun(OneThread):
                 raise
 
     @alone
-    def hold(self, **inputs: float) -> None:
+    def set_inputs(self, **inputs: float) -> None:
         """Go on with inputs held at numbers: between the samples of a controller."""
         self._take(self.problem.held(inputs))
 

@@ -284,7 +284,7 @@ class IndexedStepper:
             return _said(record, check)
         record.take(keep=True)
         for part in planned(run.t, t_end, h, {}):
-            run.change(h=part.h)
+            run.update(h=part.h)
             record.go_on(run.steps + part.steps, every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
@@ -346,7 +346,7 @@ class IndexedStepper:
         run = self.start(q, p, velocity=velocity, **controlled, **beside)
         numbers = np.array(run.problem.arrays.numbers)
         values = partial(parameters_at, self.interface.parameters, numbers, data)
-        run.change(parameters=values(entered(t, end)))
+        run.update(parameters=values(entered(t, end)))
         check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
         record = IndexedRecord(run, observe, as_events(events))
         record.take(keep=True)

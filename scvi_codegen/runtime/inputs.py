@@ -128,7 +128,7 @@ def missing_input(name: str) -> StateError:
     """How it is said."""
     return StateError(
         f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
-        f"run.hold({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
+        f"run.set_inputs({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
     )
 
 

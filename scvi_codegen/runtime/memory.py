@@ -45,8 +45,8 @@ class Memory(OneThread):
         stepper: the compiled integrator.
         longest: the most time between states that were kept, so far.
 
-    A step of a system with inputs waits until each of them was given (:meth:`hold`, or its parameters). What C is given
-    with each call stays where it is as long as the run lasts, so that a call costs little more than its steps.
+    A step of a system with inputs requires that each of them was set (:meth:`set_inputs`, or its parameters). What C is
+    given with each call stays where it is as long as the run lasts, so that a call costs little more than its steps.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Memory(OneThread):
         return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
 
     @alone
-    def change(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
+    def update(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
         """Go on with other parameters, another step, another goal; what is not given stays.
 
         Args:
@@ -187,10 +187,10 @@ class Memory(OneThread):
         if goal is not None:
             self.goal = goal
 
-    def hold(self, **inputs: float) -> None:
+    def set_inputs(self, **inputs: float) -> None:
         """Go on with inputs held at numbers: between the samples of a controller.
 
-        >>> run.hold(u=-1.5); run.advance(10)  # doctest: +SKIP
+        >>> run.set_inputs(u=-1.5); run.advance(10)  # doctest: +SKIP
         """
         values = self._parameters.copy()
         for name, value in inputs.items():

@@ -91,7 +91,7 @@ class TestLongSteps:
         stepper.drive([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
         going = stepper.start([0.0], [0.0], h=0.1)
         for k in range(200):
-            going.hold(u=math.cos(0.1 * k))
+            going.set_inputs(u=math.cos(0.1 * k))
             going.record(1)
         assert 0.0 < going.step_error[0] < 1e-3
 

@@ -340,7 +340,7 @@ def test_positions_do_not_follow_constraints_that_jump():
     with pytest.raises(StateError, match="the input u is not given"):
         stepper.start(given["q"], velocity=given["velocity"], h=0.05)
     run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})
-    for go_on in (lambda: run.hold(u=0.3), lambda: run.change(parameters={"u_0": 0.3})):
+    for go_on in (lambda: run.set_inputs(u=0.3), lambda: run.update(parameters={"u_0": 0.3})):
         with pytest.raises(StateError, match=r"at t = 0 the constraint .* jumps"):
             go_on()
         assert run.parameters[0] == 0.0

@@ -111,7 +111,7 @@ def test_inputs_are_held_and_parameters_may_change_on_the_way(fmu):
     for k in range(8):
         u, w = -1.5 * one.get("q")[0], 0.1 + 0.01 * k
         assert one.set(u=u, w=w) == OK
-        run.hold(u=u, w=w)
+        run.set_inputs(u=u, w=w)
         assert one.step(0.5 + 2 * k * H, 2 * H) == OK
         run.advance(2)
         assert one.get("q", "p_q") == [*run.q, *run.p]

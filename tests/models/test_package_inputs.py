@@ -89,7 +89,7 @@ def test_stretches_of_c_are_those_of_python(model, seed):
         assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == n
         assert theirs.h == ours.h
         assert (values == ours.parameters).all()
-        theirs.change(parameters=values)
+        theirs.update(parameters=values)
         theirs.advance(n)
     assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == 0
     assert len(kept) == 4
@@ -106,7 +106,7 @@ def test_a_step_much_longer_than_the_way_is_cut_there(model):
     taken = []
     while stepper.binding.function("next_steps")(run._memory, 0.9, 1e11, table, stepper.binding.pointer(values)) == 1:
         taken.append(run.h)
-        run.change(parameters=values)
+        run.update(parameters=values)
         run.advance(1)
     assert_allclose(taken, [0.4, 0.5])
     assert run.t == 0.9

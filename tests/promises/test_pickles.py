@@ -119,7 +119,7 @@ def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
 
 def test_a_run_may_be_given_another_goal_and_keeps_it() -> None:
     run = stepper("").start(Q, P, t_end=5.0)
-    run.change(goal=Goal(t_end=0.7, tolerance=1e-6))
+    run.update(goal=Goal(t_end=0.7, tolerance=1e-6))
     assert copied(run).goal == Goal(t_end=0.7, tolerance=1e-6)
     assert copied(run).record().t[-1] == 0.7
 
@@ -138,12 +138,12 @@ def driven() -> Stepper:
 @pytest.mark.parametrize("held", [(), ("u",), ("w",), ("u", "w")])
 def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -> None:
     run = driven().start([0.3], [0.1], h=H)
-    run.hold(**dict.fromkeys(held, 0.7))
+    run.set_inputs(**dict.fromkeys(held, 0.7))
     copy = copied(run)
     for each in (run, copy):
         for name in {"u", "w"} - set(held):
             with pytest.raises(sc.StateError, match=name):
                 each.advance(1)
-            each.hold(**{name: 0.2})
+            each.set_inputs(**{name: 0.2})
         each.advance(2)
     assert copy.save() == run.save()

@@ -102,4 +102,4 @@ def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):
     with pytest.raises(StateError, match=r"'u1' is no input of this system, which has u; did you mean 'u'\?"):
         stepper.drive([0.2], [0.0], h=0.1, steps=3, inputs={"u1": DATA["u"]})
     with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
-        chain.start(np.zeros(3), h=0.1).hold(w=1.0)
+        chain.start(np.zeros(3), h=0.1).set_inputs(w=1.0)

@@ -472,5 +472,5 @@ def test_inputs_that_nobody_gave_leave_no_folder_behind():
     with pytest.raises(StateError, match=r"the input u is not given.*data is kept in memory.*drive\(...\)\.save"):
         record_run(run, "pushed.run", steps=4)
     assert not Path("pushed.run").exists()
-    run.hold(u=0.5, w=0.0)
+    run.set_inputs(u=0.5, w=0.0)
     assert len(record_run(run, "pushed.run", steps=4)) == 5

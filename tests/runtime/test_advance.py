@@ -74,13 +74,13 @@ def test_so_does_one_whose_steps_a_monitor_chooses():
 
 def test_an_input_that_is_no_number_changes_none(pushed):
     run = pushed.start([0.3], [0.1], h=0.05)
-    run.hold(u=0.4)
+    run.set_inputs(u=0.4)
     before = run.parameters
     for wrong in (float("nan"), "1", [0.1]):
         with pytest.raises(StateError, match="the input u"):
-            run.hold(u=wrong)
+            run.set_inputs(u=wrong)
     with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
-        run.hold(u=0.1, w=0.2)
+        run.set_inputs(u=0.1, w=0.2)
     assert np.array_equal(run.parameters, before)
 
 
@@ -88,7 +88,7 @@ def test_goals_and_parameters_are_changed_on_the_way(pushed):
     """By what is heard of in the next call, whatever was given to the last."""
     run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
     run.advance(10**6)
-    run.change(parameters={"k": 2.0, "u_0": -0.1}, goal=Goal(t_end=2.0, tolerance=1e-9))
+    run.update(parameters={"k": 2.0, "u_0": -0.1}, goal=Goal(t_end=2.0, tolerance=1e-9))
     run.advance(10**6)
     first = pushed.integrate([0.3], [0.1], t_end=1.0, tolerance=1e-12, parameters={"u_0": 0.2})
     then = {"k": 2.0, "u_0": -0.1}
@@ -103,7 +103,7 @@ def test_runs_of_one_stepper_share_nothing(pushed):
     def held(force):
         run = pushed.start([0.3], [0.1], h=0.05, parameters=given)
         for k in range(200):
-            run.hold(u=force * (-1) ** k)
+            run.set_inputs(u=force * (-1) ** k)
             run.advance(5)
         return standing(run)
 

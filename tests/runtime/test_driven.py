@@ -103,25 +103,25 @@ def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
     run = stepper.start([0.3], [0.0], h=0.01)
     states = []
     for _ in range(50):
-        run.hold(u=-2.0 * run.q[0] - 0.5 * run.p[0], w=0.0)
+        run.set_inputs(u=-2.0 * run.q[0] - 0.5 * run.p[0], w=0.0)
         run.advance(4)
         states.append((run.q[0], run.p[0]))
     assert abs(run.q[0]) < 0.2
     again = stepper.start([0.3], [0.0], h=0.01)
     for k in range(50):
-        again.change(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0], "w_0": 0.0})
+        again.update(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0], "w_0": 0.0})
         again = stepper.restore(again.save(), parameters=again.parameters)
         again.advance(4)
         assert (again.q[0], again.p[0]) == states[k]
     sloped = {"u_0": 1.0, "u_1": 2.0, "u_2": -1.0, "u_3": 0.5, "u_t": 0.3, "w_0": 0.0}
     after, plain = (stepper.start([0.3], [0.0], h=0.01, parameters=given) for given in (sloped, {"w_0": 0.0}))
     for one in (after, plain):
-        one.hold(u=0.4)
+        one.set_inputs(u=0.4)
         one.advance(10)
     assert after.q == plain.q
     with at_most(100_000):  # microseconds each, where a new run would be compiled and checked
         for _ in range(1000):
-            run.hold(u=0.1)
+            run.set_inputs(u=0.1)
 
 
 def test_from_sympy_and_what_scipy_gives():
@@ -271,9 +271,9 @@ def test_names_and_runs_without_an_end(pendulum):
     with pytest.raises(StateError, match="t_end"):
         stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
     with pytest.raises(StateError, match="no input"):
-        stepper.start([0.3], [0.0], h=0.1).hold(v=1.0)
+        stepper.start([0.3], [0.0], h=0.1).set_inputs(v=1.0)
     with pytest.raises(StateError, match="input u must be real numbers, not None"):
-        stepper.start([0.3], [0.0], h=0.1).hold(u=None)
+        stepper.start([0.3], [0.0], h=0.1).set_inputs(u=None)
     for steps, said in ((-1, "at least 0"), (2.5, "whole number"), ("3", "whole number")):
         with pytest.raises(StateError, match=f"steps must be .*{said}"):
             stepper.start([0.3], [0.0], h=0.1, parameters={"u_0": 0.0, "w_0": 0.0}).advance(steps)
@@ -317,11 +317,11 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
             step()
     given = stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 0.7, "w_0": 0.0})
     run = stepper.start(*state, h=0.1)
-    run.hold(w=0.0)
+    run.set_inputs(w=0.0)
     run = pickle.loads(pickle.dumps(run))
     with pytest.raises(StateError, match="the input u"):
         run.advance(1)
-    run.hold(u=0.7)
+    run.set_inputs(u=0.7)
     assert np.array_equal(run.record(2).q, given.q)
     lanes = stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2, parameters=given.parameters)
     assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)

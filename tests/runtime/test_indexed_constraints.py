@@ -262,7 +262,7 @@ def test_parameters_of_constraints_do_not_jump(stepper):
     q, data = chain(3)
     run = stepper.start(q, h=0.01, **data)
     with pytest.raises(StateError, match="without jumps"):
-        run.change(parameters={"l": 0.5})
+        run.update(parameters={"l": 0.5})
     run.advance(1)
     assert residuals(run)[0] < 1e-15
 

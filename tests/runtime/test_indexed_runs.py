@@ -216,12 +216,12 @@ class TestInputs:
         runs = (stepper.start(Q, velocity=V, h=0.1), other.start(Q, velocity=V, h=0.1))
         for force in (1.0, -2.0):
             for run in runs:
-                run.hold(F=force)
+                run.set_inputs(F=force)
             runs[0].advance(5)
             runs[1].advance(5)
         assert np.abs(runs[0].q["q"] - runs[1].q).max() < 1e-14
         with pytest.raises(StateError, match="'G' is no input"):
-            runs[0].hold(G=1.0)
+            runs[0].set_inputs(G=1.0)
 
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_what_is_held_leaves_the_guess_of_the_next_step(self, driven, method):
@@ -229,15 +229,15 @@ class TestInputs:
         stepper = sc.compile_indexed(driven, method)
         runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
         for run in runs:
-            run.hold(F=0.3)
+            run.set_inputs(F=0.3)
             run.advance(1)
         free, same, others, none = runs
         free.advance(100)
         for _ in range(100):
-            same.hold(F=0.3)
+            same.set_inputs(F=0.3)
             same.advance(1)
             for run in (others, none):
-                run.hold(F=math.cos(run.t))
+                run.set_inputs(F=math.cos(run.t))
                 if run is none:
                     run.rewind(run.mark)
                 run.advance(1)
@@ -254,7 +254,7 @@ class TestInputs:
         with pytest.raises(StateError, match="the input F is not given"):
             run.advance(1)
         assert run.steps == 0
-        run.change(parameters={"F_0": 0.0})
+        run.update(parameters={"F_0": 0.0})
         run.advance(1)
         assert run.steps == 1
         with pytest.raises(StateError, match="is given from t = 0 to 5"):
@@ -273,7 +273,7 @@ def test_parameters_change_the_first_kick_of_an_explicit_method():
     stepper = sc.compile_indexed(spring, "stoermer-verlet")
     run = stepper.start([1.0, 0.5], h=0.1)
     run.advance(3)
-    run.change(parameters={"k": 5.0})
+    run.update(parameters={"k": 5.0})
     other = stepper.start(run.q, run.p, h=0.1, parameters={"k": 5.0})
     for each in (run, other):
         each.advance(1)

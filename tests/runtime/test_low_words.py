@@ -209,7 +209,7 @@ def test_times_are_sums_of_all_steps(lengths: str) -> None:
     start = (own.time(), *own.invariants())
     if lengths == "inputs":
         for h in (0.1, 0.03, 1 / 7):
-            own.run.change(h=h)
+            own.run.update(h=h)
             own.run.advance(5)
         assert abs(own.time() - (start[0] + 5 * exact(0.1, 0.03, 1 / 7))) < Fraction(1, 2**100)
         return

@@ -65,8 +65,8 @@ def entries(run: Any) -> dict[str, Callable[[], Any]]:
     """What a second thread may try, by name."""
     found = {
         "advance": lambda: run.advance(1),
-        "change": lambda: run.change(h=0.2),
-        "hold": lambda: run.hold(),
+        "update": lambda: run.update(h=0.2),
+        "set_inputs": lambda: run.set_inputs(),
         "save": lambda: run.save(),
         "copy": lambda: copy.copy(run),
     }

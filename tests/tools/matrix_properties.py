@@ -418,7 +418,7 @@ def changes(case: Case) -> None:
     run.advance(10)
     first = case.truth
     t, state = run.t, (tuple(first.q(run.t)[0]), tuple(first.p(run.t)[0]))
-    run.change(parameters=case.parameters(others), h=0.5 * case.h)
+    run.update(parameters=case.parameters(others), h=0.5 * case.h)
     run.advance(12)
     truth = truth_of(case.problem)
     x = _velocity_of(case, truth, t, state, others)
