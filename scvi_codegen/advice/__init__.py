@@ -1,1 +1,1 @@
-"""Which step and which degree a wanted error needs, and a motion in one call."""
+"""Choice of step size and degree for a given error, and integration in one call."""

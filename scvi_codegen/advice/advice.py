@@ -1,9 +1,8 @@
-"""Which step (and which degree) for a wanted error: the longest that a short pilot says will do, with its evidence.
+"""Choice of a fixed step size (and degree) for a wanted error: the largest one that short pilot runs confirm.
 
-Steps are halved until the error at the end is small enough, as the pilot predicts it
-(:mod:`scvi_codegen.advice.pilot`); between the two lengths that enclose it the answer is bisected, so that the step
-advised was tried, not only fitted. Methods of low order may need steps too short to try: their number follows from the
-order.
+Steps are halved until the error at the end, as predicted by the pilot runs (:mod:`scvi_codegen.advice.pilot`), is small
+enough; bisection between the two step sizes that enclose it follows, so that the recommended step was tried and not
+only fitted. Methods of low order may need steps too small to try: their number follows from the order.
 """
 
 from __future__ import annotations
@@ -35,28 +34,31 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["Advice", "Evidence", "advise"]
 
 DEGREES = (2, 4, 6, 8, 10, 12)
+"""Degrees, or numbers of stages, among which ``advise`` chooses."""
 SAFETY = 2.0
-"""The error aimed at is the tolerance divided by this."""
+"""Ratio of the tolerance to the error aimed at."""
 CLOSE = 1.5
-"""Bisection ends where the errors of neighbours differ by this factor."""
+"""Ratio of the errors of neighbouring step sizes at which bisection ends."""
 ORDER_MARGIN = 0.3
+"""Largest relative deviation of the measured from the claimed order for extrapolating to untried steps."""
 LANES = 8
+"""Numbers in a vector register, for the cost of an evaluation."""
 OVERHEAD = 3.0
-"""Cost of a step beside its iterations, in iterations."""
+"""Cost of a step in addition to its iterations, in iterations."""
 MUCH_LESS = 0.9
-"""Part of the work by which a shorter step is preferred to the longest."""
+"""Ratio of work at which a smaller step is preferred to the largest admissible one."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
-"""Positions at points of steps in one pilot run, as far as that makes neither fewer nor more steps than these."""
+"""Number of stage positions computed in one pilot run, and bounds of its number of steps."""
 
 
 class Evidence(NamedTuple):
-    """One pilot run.
+    """Result of one pilot run.
 
     Attributes:
-        h: its step size.
-        error: estimate of the error at the end of the span; infinite where a step failed.
-        iterations: of the solver at each step.
-        seconds: time taken for a unit of time of the motion.
+        h: step size.
+        error: estimate of the error at the end of the span; infinite if a step failed.
+        iterations: iterations of the solver per step.
+        seconds: computing time per unit of time t.
     """
 
     h: float
@@ -67,17 +69,17 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """A step size and why.
+    """Recommended step size, and the pilot runs that support it.
 
     Attributes:
         h: step size, ``span / steps``; negative for a span backward.
         steps: number of steps.
         degree: degree or number of stages of ``method``, ``None`` if it has none.
-        method: the method advised: that asked about, or the one of the best degree.
-        expected_error: of the positions at the end, relative to their size.
-        evidence: the pilot runs of ``method``, the longest steps first.
-        message: the advice in a few sentences.
-        warnings: what may not be as wished; empty if all is well.
+        method: recommended method: the one passed, or the one of the best degree.
+        expected_error: error of the positions at the end, relative to their size.
+        evidence: pilot runs of ``method``, largest step size first.
+        message: recommendation in a few sentences.
+        warnings: reasons why the tolerance may be missed; empty if there are none.
     """
 
     h: float
@@ -120,33 +122,34 @@ def advise(
     solver: str = "auto",
     options: SolverOptions | None = None,
 ) -> Advice:
-    """The longest step with which the positions at the end of a run are as right as wished.
+    """Recommend the largest fixed step size with which positions at the end of a run meet a tolerance.
 
-    Where shorter ones need less work in all (near the limit of the fixed point), it is one of them.
+    A smaller one is recommended if it needs less work in all, near the largest step at which the fixed-point iteration
+    converges.
 
-    The step is one number for the whole run: a symplectic method whose step follows the motion is symplectic no longer,
-    and its energy drifts. Motions with rare violent moments (a close encounter) therefore need the small step of these
-    moments all the time; a pilot that ends before them does not know of them.
+    The step size is constant over the run: a symplectic method with a step size that depends on the state is no longer
+    symplectic, and its energy drifts. Close encounters therefore determine the step size of the whole run; a pilot run
+    that ends before an encounter does not resolve it.
 
     Args:
-        system: what moves.
-        method: how its motion is discretised, or its name, ``"svi:8"``.
+        system: mechanical system.
+        method: method, or its name, as ``"svi:8"``.
         q, p: (m,) initial positions and momenta.
-        span: length of time of the run, negative to go back.
-        tolerance: wanted error ``|q - q_exact| / |q|`` at the end; half of it is aimed at.
-        parameters: by name (others keep their defaults) or all in order.
+        span: duration of the run, negative to integrate backward.
+        tolerance: wanted error ``|q - q_exact| / |q|`` at the end; the step size aims at half of it.
+        parameters: values by name (others keep their defaults), or all in order.
         t: initial time.
-        degree: choose the degree (or number of stages) among 2, 4, ..., 12 too, the one with the fewest evaluations in
-            full vector registers of 8 points.
-        solver, options: of the stage equations, as of ``compile_stepper`` and of the run.
+        degree: also choose the degree (or number of stages) among 2, 4, ..., 12: the one with the fewest evaluations in
+            vector registers of 8 points.
+        solver, options: solver of the stage equations, as of ``compile_stepper``, and options of the run.
 
     Returns:
-        The advice, the same for the same question. It has warnings if the tolerance cannot be met (round-off, chaos),
-        or if that is not certain.
+        The recommendation, reproducible. It has warnings if the tolerance cannot be met (round-off, chaos), or if that
+        is uncertain.
 
     Raises:
         StateError: on wrong shapes, names or numbers, or if every pilot run fails.
-        MethodError: if the degree is to be chosen of a method that has none.
+        MethodError: if the degree is to be chosen for a method that has none, or time is transformed.
         BuildError: without a C compiler.
     """
     method = as_method(method, system)
@@ -184,8 +187,8 @@ def _advised(
     span: float,
     tolerance: float,
 ) -> tuple[float, Advice]:
-    """What pilot runs of one stepper advise, and what a unit of time costs then."""
-    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks them
+    """Return the cost of a unit of time with the recommendation for one stepper, and the recommendation."""
+    start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks the arguments
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
     pilot = launch(
@@ -202,7 +205,7 @@ def _advised(
 
 
 def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator[Stepper]:
-    """That asked for; but for ``"auto"`` first the fixed point alone, whose limit of h a good step should keep to."""
+    """Yield steppers for a solver; for ``"auto"`` the fixed-point solver first, whose limit on h is best respected."""
     if solver == "auto":
         with suppress(MethodError):
             yield compile_stepper(system, method, solver="fixed-point")
@@ -210,7 +213,7 @@ def _steppers(system: MechanicalSystem, method: Method, solver: str) -> Iterator
 
 
 def _candidates(method: Method) -> list[Method]:
-    """The method with each degree."""
+    """Return the method with each degree."""
     specification = dict(method.specification())
     sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
     if not sized:
@@ -221,19 +224,19 @@ def _candidates(method: Method) -> list[Method]:
 
 
 def _points(method: Method) -> int:
-    """Number of places on a step where the Lagrangian is evaluated, the same for every system."""
+    """Return the number of evaluation points of the Lagrangian per step, which is the same for every system."""
     simplest = LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
     return sum(len(family.abscissae) for family in method.stage_system(simplest).families)
 
 
 def _cost(pilot: Pilot, n: float, points: int) -> float:
-    """Evaluations in full registers of points, for a unit of time."""
+    """Return the number of evaluations, in full vector registers, per unit of time."""
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / n)))
     return (pilot.legs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES / pilot.step(n)
 
 
 class _Choice(NamedTuple):
-    """A number of steps for the length of the pilot, its error at the end of the span, doubts."""
+    """Number of steps for the length of the pilot, expected error at the end of the span, and warnings."""
 
     n: float
     error: float
@@ -242,7 +245,7 @@ class _Choice(NamedTuple):
 
 
 def _choose(pilot: Pilot, tolerance: float) -> _Choice:
-    """The longest step that meets the tolerance, or that rounding makes as good as any shorter one."""
+    """Return the largest step that meets the tolerance, or whose error is dominated by round-off."""
     floor, (coarse, fine) = pilot.floor_at_end, pilot.judged[-2:]
     goal = max(tolerance / SAFETY, 2.0 * floor)
     n = _cheapest(pilot, _bisected(pilot, goal))
@@ -261,7 +264,7 @@ def _choose(pilot: Pilot, tolerance: float) -> _Choice:
 
 
 def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
-    """What may spoil the promise, or does."""
+    """Yield warnings about conditions that prevent, or may prevent, the tolerance from being met."""
     floor = pilot.floor_at_end
     if pilot.rate:
         tenfold = math.log(10.0) / pilot.rate
@@ -280,7 +283,7 @@ def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
 
 
 def _bisected(pilot: Pilot, goal: float) -> int | None:
-    """The fewest steps that meet the goal as all more do; ``None`` if the finest run judged does not."""
+    """Return the fewest steps that meet the bound, as all larger numbers do; ``None`` if the finest run does not."""
     fits = list(takewhile(lambda n: pilot.error(n) <= goal, reversed(pilot.judged)))
     if not fits:
         return None
@@ -295,7 +298,7 @@ def _bisected(pilot: Pilot, goal: float) -> int | None:
 
 
 def _cheapest(pilot: Pilot, n: int | None) -> int | None:
-    """n, or more steps that need much less work: near the limit of the fixed point a step needs many sweeps."""
+    """Return n, or a larger number of steps with much less work: iterations increase near the convergence limit."""
     if n is None:
         return None
     work = {k: k * (pilot.legs[k].iterations + OVERHEAD) for k in pilot.judged if k >= n}
@@ -304,13 +307,13 @@ def _cheapest(pilot: Pilot, n: int | None) -> int | None:
 
 
 def _sampled(n: float) -> int:
-    """A number of steps near n that is a multiple of a power of 2, so that a run has states in common with others."""
+    """Return a number near n that is a multiple of a power of 2, so that runs have sample times in common."""
     unit = 1 << min(6, max(0, int(n).bit_length() - 6))
     return math.ceil(n / unit) * unit
 
 
 def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
-    """All of it, in numbers and words."""
+    """Return the recommendation in numbers and words."""
     steps = max(1, math.ceil(choice.n * (pilot.span / pilot.length) * (1.0 - 1e-12)))
     specification = method.specification()
     degree = specification.get("degree", specification.get("stages"))

@@ -1,7 +1,7 @@
-"""How much of a final state is known: a second run, more accurate and from a state changed in its last places.
+"""Estimate of the correct digits of a final state, by a second, more accurate run from a perturbed state.
 
-The second run is by another method, SVI(8) with steps that choose their length, so what it differs by holds all errors
-of the first: of its steps, its round-off and what the motion makes of them.
+The second run uses another method, SVI(8) with adaptive step size, so that the difference includes all errors of the
+first run: truncation, round-off, and their growth along the trajectory.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ __all__ = ["SECOND_RUN", "Known", "known_digits"]
 Array = NDArray[np.float64]
 
 SECOND_RUN = 10_000
-"""Steps that a second run may take beside four times those of the first."""
+"""Steps that a second run may take in addition to four times those of the first."""
 SAMPLES, NEAR = 1024, 0.01
-"""States that are compared, and the part of their size up to which two motions are near each other."""
+"""Number of states compared, and the distance relative to their size up to which linearised growth is assumed."""
 QUARTERS, DECADES = 4, 0.5
-"""Nearby motions part exponentially if they part by so many decades from each quarter of the time to the next."""
+"""Growth is exponential if the distance grows by ``DECADES`` decades in each quarter of the time."""
 NUDGE = 2.0**-50
+"""Relative perturbation of the initial positions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Known:
-    """What is known of the last state of a run.
+    """Error estimate of the last state of a run.
 
     Attributes:
         q, p: (m,) absolute errors.
-        tenfold: time in which nearby motions part tenfold; infinite unless they part exponentially.
+        tenfold: time in which neighbouring trajectories diverge tenfold; infinite unless they diverge exponentially.
     """
 
     q: Array
@@ -50,12 +51,12 @@ class Known:
 
     @property
     def chaotic(self) -> bool:
-        """Whether nearby motions part exponentially."""
+        """True if neighbouring trajectories diverge exponentially."""
         return math.isfinite(self.tenfold)
 
 
 class _TooLongError(Exception):
-    """The second run would take too many steps."""
+    """Raised if the second run would take too many steps."""
 
 
 @unwarned()
@@ -66,9 +67,9 @@ def known_digits(
     most: int,
     inputs: Mapping[str, Any] | None = None,
 ) -> Known | None:
-    """What is known of the last state of ``trajectory``, a motion of ``system``, with its inputs if it has any.
+    """Estimate the error of the last state of ``trajectory``, a trajectory of ``system`` with ``inputs``.
 
-    ``None`` where a second run fails, would take more than about ``most`` steps, or time is transformed.
+    Returns ``None`` if a second run fails, would take more than about ``most`` steps, or time is transformed.
     """
     if system.clock is not None or len(trajectory) < 2:
         return None
@@ -98,14 +99,14 @@ def known_digits(
 
 
 def _at_the_end(apart: Array) -> Array:
-    """At the last state; it may be a lucky moment, so no less than in the mean over the last sixteenth."""
+    """Return the error at the last state, at least the mean over the last sixteenth, as zero crossings occur."""
     late = apart[-max(1, len(apart) // 16) :]
     error: Array = np.maximum(apart[-1], np.sqrt(np.mean(late**2, axis=0)))
     return error
 
 
 def _tenfold(apart: Array, span: float) -> float:
-    """From distances at equal times, as parts of the size of the motion, to the time of their growth tenfold."""
+    """Return the time of tenfold growth from relative distances at equal times; infinity if not exponential."""
     far = np.flatnonzero(apart > NEAR)
     near = apart[1 : int(far[0]) if len(far) else len(apart)]
     length = len(near) // QUARTERS

@@ -1,4 +1,4 @@
-"""A motion by one call, with the result that ``scipy.integrate.solve_ivp`` taught everyone to read."""
+"""Integration in one call, with arguments and result like ``scipy.integrate.solve_ivp``."""
 
 from __future__ import annotations
 
@@ -34,22 +34,23 @@ Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
 REACHED, EVENT, FAILED, BROKEN = 0, 1, -1, -2
 ADVISED = 1e-9
-"""What steps of one length are advised for where none is given and the method knows no other."""
+"""Tolerance of the recommended fixed step size for methods without adaptive steps, if none is passed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Motion:
-    """What :func:`solve_motion` returns; y is (q, p), positions and then momenta.
+    """Result of :func:`solve_motion`; y is (q, p), positions and then momenta.
 
     Attributes:
         t: (n,) times.
         y: (2 m, n) states.
-        sol: from times to states, (2 m,) of a number and (2 m, n) of n times; ``None`` without ``dense_output``.
+        sol: function from times to states, (2 m,) for a number, (2 m, n) for n times; ``None`` without
+            ``dense_output``.
         t_events: (k,) times of the crossings of each event, ``None`` without events.
-        y_events: (k, 2 m) states there.
-        status: 0 the end of the span, 1 a terminal event, -1 a step failed, -2 a promise of :func:`advise` broke.
-        message: the same in words.
-        trajectory: the states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
+        y_events: (k, 2 m) states at these times.
+        status: 0 end of the span, 1 terminal event, -1 a step failed, -2 the tolerance was missed.
+        message: description of the status.
+        trajectory: states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
     """
 
     t: Array
@@ -63,7 +64,7 @@ class Motion:
 
     @property
     def success(self) -> bool:
-        """Whether the end of the span or a terminal event was reached, as well as promised."""
+        """True if the end of the span or a terminal event was reached within the tolerance."""
         return self.status >= 0
 
 
@@ -91,34 +92,35 @@ def solve_motion(
     max_step: float | None = None,
     first_step: float | None = None,
 ) -> Motion:
-    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, for a run backward).
+    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, to integrate backward).
 
-    By steps that choose their length; with ``h`` or ``tolerance``, or by a method that cannot do so, by steps of one.
+    The step size is adaptive by default; it is fixed with ``h`` or ``tolerance`` and for methods without adaptive
+    steps.
 
     Args:
-        system: what moves; or its compiled stepper, which takes the place of ``method``.
+        system: mechanical system; or its compiled stepper, which takes the place of ``method``.
         t_span: two times.
-        y0: (2 m,) initial positions, then momenta; (m,) positions alone beside ``velocity``.
-        velocity: (m,) initial velocities, in place of momenta.
-        method: or its name, ``"svi:6"``; by default ``SVI(8)``, of constraints SVI(6) with Lobatto's points.
-        h: longest step of one length, taken a little shorter so that whole steps fill the span.
-        tolerance: in place of ``h``: the error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses it.
-            Where the run breaks the promise, ``success`` is False.
-        rtol: the relative error of the end of each step whose length is its own; by default round-off.
-        error: bound of the relative global error of the whole run by adaptive steps, as of :meth:`Stepper.integrate`;
-            ``trajectory.global_error`` and ``confirmed_until`` tell what is confirmed. ``success`` is False where the
-            bound is not.
-        monitor: g of :func:`reparametrise`: by equal steps of tau, dt = g dtau, symplectic and of variable length in t.
-            ``h`` is then of tau; without it :func:`longest_step` finds one for ``rtol``. A run with steps that do not
-            keep it is no success.
-        controller: ``"reversible"``: the monitor is that of :func:`compile_stepper`, for systems that depend on time or
-            on which forces act, too; ``"symplectic"``, by default, that of :func:`reparametrise`.
-        t_eval: (n,) times at which states are wanted; by default the ends of the steps.
-        dense_output: whether ``sol`` is wanted, for which all steps are kept.
+        y0: (2 m,) initial positions, then momenta; (m,) positions alone if ``velocity`` is passed.
+        velocity: (m,) initial velocities, instead of momenta.
+        method: method, or its name, as ``"svi:6"``; by default ``SVI(8)``, with constraints SVI(6) with Lobatto points.
+        h: upper bound of a fixed step size, reduced so that whole steps fill the span.
+        tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
+            ``success`` is False if the run misses it.
+        rtol: relative local error of adaptive steps; by default round-off.
+        error: bound on the relative global error of the whole run with adaptive steps, as of :meth:`Stepper.integrate`;
+            ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
+            is not confirmed.
+        monitor: time-rescaling function g of :func:`reparametrise`: equal steps of tau, dt = g dtau, symplectic and
+            with variable step size in t. ``h`` is then in tau; without it :func:`longest_step` finds one for ``rtol``,
+            and ``success`` is False if the run misses that.
+        controller: ``"reversible"``: the time-rescaling function of :func:`compile_stepper`, also for systems with
+            explicit time or forces; ``"symplectic"`` (default): that of :func:`reparametrise`.
+        t_eval: (n,) times at which to return states; by default the ends of the steps.
+        dense_output: return ``sol``; all steps are then saved.
         events: zero crossings to record, and to end at, as of :meth:`Stepper.integrate`.
         parameters, options: as of :meth:`Stepper.integrate`.
-        args: as of ``solve_ivp``: all parameters in order, in place of ``parameters``.
-        atol, max_step, first_step: of ``solve_ivp`` alone; the error says what to give instead.
+        args: as of ``solve_ivp``: all parameters in order, instead of ``parameters``.
+        atol, max_step, first_step: arguments of ``solve_ivp`` that are not supported; the error names the alternative.
 
     Raises:
         StateError, EventError: on wrong shapes, names or numbers.
@@ -148,7 +150,7 @@ def solve_motion(
 
 
 class _Wish(NamedTuple):
-    """The steps asked for; with nothing of it they choose their length."""
+    """Requested step-size selection; adaptive if nothing is requested."""
 
     h: float | None
     rtol: float | None
@@ -157,7 +159,7 @@ class _Wish(NamedTuple):
 
 
 class _Chosen(NamedTuple):
-    """The steps to take, and what a run of them belies of what was promised, in words."""
+    """Step-size selection, and a check of the completed run that returns a message if the tolerance is missed."""
 
     h: float | None
     rtol: float | None
@@ -171,7 +173,7 @@ def _stepper(
     pace: tuple[str | Expr | None, str | None],
     wish: _Wish,
 ) -> tuple[Stepper, tuple[MechanicalSystem, Method] | None]:
-    """The stepper, and of what it was compiled if it was not given; ``pace`` is a monitor and its controller."""
+    """Return the stepper, and its system and method if it was compiled here; ``pace`` is g and its controller."""
     if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or pace != (None, None)):
         raise StateError(
             "a tolerance of the end chooses steps of one length, h gives it, rtol lets each choose its own: give one, "
@@ -195,7 +197,7 @@ def _plan(
     motion: tuple[ArrayLike, ArrayLike, float],
     along: dict[str, Any],
 ) -> _Chosen:
-    """Steps for a wish, of a motion from (q, p) over a span."""
+    """Return the step-size selection for a request and an initial state (q, p) over a span."""
     if wish.error is not None:
         return _Chosen(None, None, _unconfirmed, wish.error)
     if wish.h is not None:
@@ -213,7 +215,7 @@ def _plan(
 
 
 def _unconfirmed(trajectory: Trajectory) -> str:
-    """Return how far the wanted global error is confirmed, where that is not the end of the run."""
+    """Return the time until which the global error is confirmed, as a message; empty at the end of the run."""
     found = trajectory.confirmation
     if found is None or found.confirmed:
         return ""
@@ -225,7 +227,7 @@ INSTEAD = {
     "max_step": "steps choose their length with rtol, or all have one: give h, the longest that may be",
     "first_step": "the first step chooses its length like the others: give rtol, or h for steps of one length",
 }
-"""What serves in place of an argument of ``solve_ivp`` that has no meaning here."""
+"""Alternatives to arguments of ``solve_ivp`` that are not supported."""
 
 
 def _refuse(given: Mapping[str, float | None]) -> None:
@@ -235,12 +237,12 @@ def _refuse(given: Mapping[str, float | None]) -> None:
 
 
 def _paced(stepper: Stepper) -> bool:
-    """Whether its steps are of tau."""
+    """Return True if the steps are of tau."""
     return bool(stepper.interface.energy_parameter or stepper.interface.monitor)
 
 
 def _chooses(stepper: Stepper) -> bool:
-    """Whether its steps can choose their length."""
+    """Return True if the stepper has adaptive steps."""
     try:
         stepper.controlled()
     except MethodError:
@@ -249,7 +251,7 @@ def _chooses(stepper: Stepper) -> bool:
 
 
 def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[str, Any]:
-    """What :meth:`Stepper.integrate` is told of steps: whole ones that fill the span, or to choose their length."""
+    """Return the arguments of :meth:`Stepper.integrate`: whole fixed steps that fill the span, or adaptive steps."""
     if plan.error is not None:
         return {"t_end": end, "error": plan.error}
     if plan.rtol is not None or plan.h is None:
@@ -262,7 +264,7 @@ def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[st
 
 
 def _outcome(trajectory: Trajectory, plan: _Chosen) -> tuple[int, str]:
-    """Status and message of a run none of whose steps failed."""
+    """Return status and message of a run without failed steps."""
     if broken := plan.broken(trajectory):
         return BROKEN, broken
     if trajectory.ended_by is not None:
@@ -289,7 +291,7 @@ def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, sta
 
 
 def _states(trajectory: Trajectory, t: ArrayLike) -> Array:
-    """(2 m,) or (2 m, n)."""
+    """Return the states at times t, (2 m,) or (2 m, n)."""
     return np.concatenate([half.T for half in trajectory.at(t)])
 
 

@@ -1,12 +1,12 @@
-"""Pilot runs: a motion with steps of several lengths, each judged by the run with the shortest.
+"""Pilot runs: integrations with several step sizes, each compared with the one of the smallest step.
 
-A pilot covers the whole span or a quarter, a sixteenth, ... of it, the longest part that a few thousand steps resolve.
-It grows from a moment to that length, and steps grow with it, so that none is ever trusted that is far too long. Errors
-at the end of the span are those at the end of the pilot, extrapolated by the growth seen there, linear or quadratic in
-time; or exponentially, if two runs from nearly the same state part so (chaos).
+A pilot run covers the whole span or a quarter, a sixteenth, ... of it, the longest part that a few thousand steps
+resolve. Its length grows from a short one, and the step sizes with it, so that no step that is far too large is ever
+trusted. Errors at the end of the span are extrapolated from the end of the pilot run by the growth observed: linear or
+quadratic in time, or exponential if two runs from neighbouring states diverge exponentially (chaos).
 
 Error means |q - q_exact| / |q| with Euclidean norms over all coordinates; |q| is the root mean square over the later
-half of the pilot.
+half of the pilot run.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ Array = NDArray[np.float64]
 Integrate = Callable[..., Trajectory]
 
 SAMPLES = 64
-"""States of each run that are compared."""
+"""Number of states of each run that are compared."""
 RESOLVED, DUST = 0.01, 1e-9
-"""Errors above the one do not follow a power of the step yet, errors below the other need not."""
+"""Bounds of the asymptotic regime: larger errors do not follow a power of h yet, smaller ones are round-off."""
 CUT, MOST_CUTS = 4, 20
+"""Factor by which pilot runs are shortened, and the largest number of times."""
 SEARCH = 16
-"""The length of the pilot is found with so many times fewer steps than a run may have."""
+"""Ratio of the steps that a run may have to those used to find the length of the pilot run."""
 STEEP, NEARLY_LINEAR, ROUNDING = 2.5, 1.35, 1.5
-"""Powers of time: above the first distances of motions grow exponentially, below the second errors of a symplectic
-method grow linearly; the third is that of positions whose energy is changed at random by every step."""
+"""Powers of time: distances growing faster than the first are exponential; errors of a symplectic method slower than
+the second are linear; the third is the growth of position errors by random-walk energy errors."""
 NUDGE = 1e-9
-"""Relative change of the initial positions whose growth tells chaos."""
+"""Relative perturbation of the initial positions, whose growth indicates chaos."""
 EARLY, LATE = 0.38, 0.76
-"""Times, in parts of the pilot, at which a steadily growing error has its root mean square over the second quarter and
-over the second half."""
+"""Times, relative to the pilot run, at which a linearly growing error has its root mean square over the second
+quarter and over the second half."""
 
 
 class Leg(NamedTuple):
-    """One run: (samples, m) positions at equal distances, iterations a step, seconds, why a step failed or ``""``."""
+    """One run: (samples, m) positions at equal intervals, iterations per step, seconds, reason of failure or ``""``."""
 
     q: Array
     iterations: float
@@ -58,19 +59,19 @@ class Leg(NamedTuple):
 def launch(
     integrate: Integrate, method: Method, q: Array, span: float, *, symplectic: bool, goal: float, most: int
 ) -> Pilot:
-    """The pilot over the longest part of the span that can be resolved, down to steps with errors below the goal.
+    """Return pilot runs over the longest part of the span that can be resolved, with steps down to the error bound.
 
     Args:
-        integrate: ``Stepper.integrate``, to be called with q, h, steps and every.
-        method: of the stepper.
+        integrate: ``Stepper.integrate``, called with q, h, steps and every.
+        method: method of the stepper.
         q: (m,) initial positions.
-        span: length of time, not 0; negative to go back.
-        symplectic: whether steps keep the symplectic form.
-        goal: error at the end of the span.
-        most: steps of any run.
+        span: duration, not 0; negative to integrate backward.
+        symplectic: True if steps preserve the symplectic form.
+        goal: error bound at the end of the span.
+        most: largest number of steps of a run.
 
     Raises:
-        StateError: if the motion seems to end, or is not to be resolved from the first moment.
+        StateError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
     for cuts in range(MOST_CUTS, -1, -1):
@@ -93,9 +94,9 @@ def launch(
 
 
 class Pilot:
-    """Runs over ``length``, the beginning of ``span``, each known by its number n of steps.
+    """Runs over ``length``, the beginning of ``span``, each identified by its number n of steps.
 
-    Errors are extrapolated with ``rate``, that of their exponential growth, if it is not 0.
+    Errors are extrapolated exponentially with ``rate`` if it is not 0.
     """
 
     def __init__(
@@ -107,27 +108,27 @@ class Pilot:
 
     @property
     def whole(self) -> bool:
-        """Whether the runs cover the span, so that nothing is extrapolated in time."""
+        """True if the runs cover the span, so that nothing is extrapolated in time."""
         return self.length == self.span
 
     @property
     def good(self) -> list[int]:
-        """Runs without a failure, the longest steps first."""
+        """Numbers of steps of the runs without a failure, largest step size first."""
         return sorted(n for n, leg in self.legs.items() if not leg.failure)
 
     @property
     def judged(self) -> list[int]:
-        """All of them but the finest, by which they are judged."""
+        """All successful runs but the finest, with which they are compared."""
         return self.good[:-1]
 
     @property
     def finest(self) -> int:
-        """The run with the shortest steps, good or not."""
+        """Number of steps of the run with the smallest step, successful or not."""
         return max(self.legs)
 
     @property
     def resolved(self) -> bool:
-        """Whether the errors of the last two runs judged are small, and fall."""
+        """True if the errors of the two finest judged runs are small and decrease."""
         if len(self.judged) < 2:
             return False
         coarse, fine = map(self.late_error, self.judged[-2:])
@@ -135,7 +136,7 @@ class Pilot:
 
     @property
     def floor(self) -> float:
-        """Error of the pilot below which shorter steps do not lead, 0 if the runs do not show it."""
+        """Round-off level of the error, 0 if the runs do not reach it."""
         errors = [self.late_error(n) for n in self._halved()][-3:]
         falls = max(0.5, 2.0 ** (-0.3 * self.order))
         levelled = [fine > coarse * falls for coarse, fine in pairwise(errors)]
@@ -144,22 +145,22 @@ class Pilot:
 
     @property
     def growth(self) -> float:
-        """Power of time with which errors grow, of the coarsest resolved runs, which show more than rounding."""
+        """Exponent of the growth of errors in time, from the coarsest resolved runs, where truncation dominates."""
         return float(np.median([_power(self._errors(n)) for n in self._halved()[:3]]))
 
     @property
     def floor_at_end(self) -> float:
-        """What rounding makes of any step at the end of the span, 0 if the runs do not show it."""
+        """Round-off level of the error at the end of the span, 0 if the runs do not reach it."""
         if self.rate:
             return self._exploded(max(self.floor, 2.0**-52))
         return self.floor * float((self.span / self.length) ** ROUNDING)
 
     def step(self, n: float) -> float:
-        """|h| of n steps."""
+        """Return the step size |h| of n steps."""
         return abs(self.length) / n
 
     def run(self, n: int) -> None:
-        """One more, sampled as often as its number of steps allows."""
+        """Perform one more run, sampled as often as its number of steps allows."""
         began = time.perf_counter()
         try:
             trajectory = self.integrate(self.q, h=self.length / n, steps=n, every=n // math.gcd(n, SAMPLES))
@@ -170,20 +171,20 @@ class Pilot:
             self.legs[n] = Leg(trajectory.q[1:], iterations, time.perf_counter() - began)
 
     def resolve(self, n: int, most: int) -> None:
-        """Halve the steps, from n of them, until errors are small."""
+        """Halve the step size, starting with n steps, until errors are small."""
         while not self.resolved and n <= most:
             self.run(n)
             n *= 2
 
     def complete(self, goal: float, most: int) -> None:
-        """Shorter steps until the goal is met or rounding or cost end it, longer ones until no digit is right."""
+        """Add smaller steps until the bound is met, round-off or cost ends it; larger ones until no digit is right."""
         while self.error(self.judged[-1]) > goal and not self.floor and 2 * self.finest <= most:
             self.run(2 * self.finest)
         while min(self.legs) > 1 and self.error(min(self.legs)) < 1.0:
             self.run(min(self.legs) // 2)
 
     def rate_of_parting(self, most: int) -> float:
-        """Rate of the exponential growth of a small change of the initial positions, 0 if it does not grow so."""
+        """Return the exponential growth rate of a perturbation of the initial positions, 0 if not exponential."""
         h = math.copysign(self.step(self.finest), self.span)
         steps = min(most, int(self.span / h))
         nudged = self.q + NUDGE * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
@@ -197,11 +198,11 @@ class Pilot:
         return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > STEEP else 0.0
 
     def error(self, n: int) -> float:
-        """Of the run with n steps, expected at the end of the span; infinite where it failed."""
+        """Return the expected error at the end of the span of the run with n steps; infinite if it failed."""
         if n not in self.judged:
             return math.inf
         if self.whole:
-            return max(float(self._errors(n)[-1]), self.late_error(n) / 3.0)  # the end may be a lucky moment
+            return max(float(self._errors(n)[-1]), self.late_error(n) / 3.0)  # the error may cross zero at the end
         if self.rate:
             return self._exploded(self.late_error(n))
         early, late = _windows(self._errors(n))
@@ -212,16 +213,19 @@ class Pilot:
         return max(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
 
     def late_error(self, n: int) -> float:
-        """Of the run with n steps, in the last quarter of the pilot."""
+        """Return the root-mean-square error of the run with n steps in the last quarter of the pilot run."""
         errors = self._errors(n)
         return _rms(errors[-max(1, len(errors) // 4) :])
 
     def _halved(self) -> list[int]:
-        """Runs whose steps came of halving and whose errors are small."""
+        """Return the runs obtained by halving whose errors are small."""
         return [n for n in self.judged if n.bit_count() == 1 and self.late_error(n) < RESOLVED]
 
     def _errors(self, n: int) -> Array:
-        """Of a run at its samples by the finest good one, which is not exact either."""
+        """Return the errors of a run at its samples relative to the finest run.
+
+        That run is not exact: errors are corrected by the factor 1 - (n/finest)^order (Richardson extrapolation).
+        """
         finest = self.good[-1]
         reference, positions = self.legs[finest].q, self.legs[n].q
         size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0
@@ -235,13 +239,13 @@ class Pilot:
 
 
 def _windows(errors: Array) -> tuple[float, float]:
-    """Root mean squares over the second quarter and over the second half."""
+    """Return root mean squares over the second quarter and over the second half."""
     half, quarter = len(errors) // 2, len(errors) // 4
     return _rms(errors[quarter:half]), _rms(errors[half:])
 
 
 def _power(errors: Array) -> float:
-    """Of time, with which errors at equal distances grow."""
+    """Return the exponent of the growth in time of errors at equal intervals."""
     early, late = _windows(errors)
     return math.log2(late / early) if 0.0 < early <= late else 0.0
 

@@ -1,4 +1,4 @@
-"""What an advised step promised, checked on the whole run that was made with it."""
+"""Verification, on the whole run, of the error for which a step size was recommended."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["broken_promise"]
 
 STEP_MARGIN = 10.0
-"""What the estimate of the error of a step may be off by, where steps are so long that few digits are right."""
+"""Safety factor for the estimate of the local error, which is inaccurate for large steps."""
 ENERGY_MARGIN = 100.0
-"""Energies may be off by so many times more, as part of their size, than positions: near a collision they are."""
+"""Ratio of the relative energy error allowed to the tolerance; energies are sensitive near collisions."""
 ROUNDING = 1e-11
+"""Relative energy error that round-off may cause."""
 SECOND_MARGIN, KNOWN_TO = 2.0, 1e-12
-"""A second run tells of the last sixteenth, of whose errors that at the end may be the least; it has errors, too."""
+"""Safety factor and absolute slack for the error measured with a second run, which has errors, too."""
 INSTEAD = "let steps choose their length (t_end, --tolerance)"
+"""Remedy that the messages name."""
 
 
 def broken_promise(
@@ -30,16 +32,17 @@ def broken_promise(
     tolerance: float,
     known: Known | None = None,
 ) -> str:
-    """Why the error of a run at its end is not below ``tolerance``, whatever was expected; ``""`` if nothing tells so.
+    """Return why the error at the end of a run exceeds ``tolerance``; ``""`` if there is no evidence for it.
 
-    A second run decides, if there is one. Without, the worst step must be right to the tolerance; and where the energy
-    is conserved, it must be. The error of a step is often estimated as more than it is: who fails so is run again.
+    The comparison with a second run decides, if there is one. Otherwise the largest local error and the energy error,
+    if energy is conserved, are compared with the tolerance. These estimates are often too large; a run that fails them
+    is compared with a second run.
 
     Args:
-        system: what moves.
-        trajectory: the run, each of its states at a whole step.
-        tolerance: |q - q_exact| / |q| that was promised for its end.
-        known: what a second run told of the end.
+        system: mechanical system.
+        trajectory: run whose states are all at the ends of steps.
+        tolerance: error |q - q_exact| / |q| for which the step size was recommended.
+        known: error estimate from a second run.
     """
     doubt = _worst_step(trajectory, tolerance) or _lost_energy(system, trajectory, tolerance)
     if known is None and doubt:
@@ -54,7 +57,7 @@ def broken_promise(
 
 
 def _late_size(trajectory: Trajectory | DrivenTrajectory) -> float:
-    """Of the states whose errors a second run tells."""
+    """Return the size of the last states, whose errors a second run measures."""
     late = trajectory.q[-max(1, len(trajectory.q) // 16) :]
     return float(np.linalg.norm(np.maximum(np.abs(late[-1]), np.sqrt(np.mean(late**2, axis=0)))))
 

@@ -1,6 +1,6 @@
-"""The command line: what each command does stands in ``commands``, in a file of its name, imported when it is called.
+"""Entry point of the command line; each command is a module of ``commands``, imported when it is called.
 
-So ``--help`` and ``--version`` wait for neither SymPy nor NumPy.
+``--help`` and ``--version`` therefore import neither SymPy nor NumPy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``scvi-codegen run``: the model with steps that choose their length, or with an advised one, and its evidence."""
+"""Step-size selection of ``scvi-codegen run``: ``--tolerance``, ``--error`` and ``--advise``."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ __all__ = ["advised_model", "confirmed_model", "controlled_model"]
 
 AnyModel = TypeVar("AnyModel", Model, IndexedModel)
 ROUND_OFF = 2.0**-52
+"""Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""
 MOST_STEPS = 10**9
-"""More are not begun unasked: at a microsecond each these take a quarter of an hour."""
+"""Largest number of steps that is started without ``--step``: a quarter of an hour at one microsecond each."""
 
 
 def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
-    """The model with steps that choose their length, each right to the tolerance, or as right as doubles allow.
+    """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off.
 
     Raises:
         StateError: unless the tolerance is positive and below 1.
@@ -43,16 +44,17 @@ def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
 def confirmed_model(
     model: AnyModel, error: float, *, solver: str = "", options: SolverOptions | None, threads: int | None = None
 ) -> tuple[AnyModel, GlobalError]:
-    """Return the model with the local tolerance whose run other runs confirm, and what they confirm; prints it.
+    """Return the model with a local tolerance that meets a global error bound, and the estimate of that error.
 
-    Steps of the same tolerance are the same, to the last bit, so that the run to come is the one that was confirmed.
+    The estimate compares runs with different steps and is printed. Adaptive steps of one tolerance are reproducible to
+    the last bit, so that the run that follows is the one whose error was estimated.
 
     Raises:
-        StateError: unless the error is positive and below 1, and for steps of tau.
+        StateError: unless the error is positive and below 1, and for steps of tau (a time transformation).
     """
     wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AccuracyWarning)  # in words below
+        warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
         if isinstance(wanted, IndexedModel):
             found = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
         else:
@@ -76,11 +78,13 @@ def confirmed_model(
 
 
 def advised_model(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:
-    """The model with step and number of steps for an error at the end; prints why, and warnings to stderr.
+    """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
+
+    Prints the recommendation and its pilot runs to stdout, warnings to stderr.
 
     Raises:
-        StateError: with a monitor, if the tolerance is not positive, every pilot run fails, or very many steps are
-            needed.
+        StateError: with a time transformation, if the tolerance is not positive, if every pilot run fails, or if more
+            than ``MOST_STEPS`` steps are needed.
     """
     if model.paced:
         raise StateError("steps of tau are chosen by the error of a step: give --tolerance in place of --advise")
@@ -108,7 +112,7 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
 
 
 def _text(advice: Advice) -> str:
-    """The message and a line a pilot run."""
+    """Return the recommendation and one line for each pilot run."""
     lines = [f"  h = {row.h:<12.6g} {_outcome(row, abs(advice.h) * advice.steps)}" for row in advice.evidence]
     return "\n".join([advice.message, *lines, ""])
 

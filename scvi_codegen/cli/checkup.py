@@ -1,4 +1,4 @@
-"""What a machine has and lacks: what ``scvi-codegen doctor`` finds."""
+"""Checks of a machine's equipment for ``scvi-codegen doctor``: libraries, compiler, a trial run, the cache."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ PACKAGE = "scvi-codegen"
 REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)(\[(?P<own>\w+)\])?\s*(>=\s*(?P<least>[\w.]+))?.*?(extra == ['\"](?P<extra>\w+)['\"])?$"
 )
-"""A line of a package's metadata: a library, perhaps with an extra of its own, and the extra that wants it."""
+"""A requirement in a package's metadata: library, its own extra, least version, and the extra that requires it."""
 TRIAL_SECONDS = 120
 VECTOR_CALL = b"_ZGV"
-"""Begins the names of vector functions, by the vector ABI of x86-64."""
+"""Prefix of the names of vector functions in the vector ABI of x86-64."""
 KEPT = 1e-6
-"""Of the energy of the trial, which is kept much better."""
+"""Bound on the relative energy error of the trial run, which is far below it on a sound machine."""
 
 TRIAL = f"""
 import os, sys
@@ -46,18 +46,18 @@ stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "svi:4")
 energy = stepper.integrate([0.5], [0.0], h=0.1, steps=1000).energy()
 print(abs(energy / energy[0] - 1).max())
 """
-"""In a process of its own, because instructions that the processor does not have end it."""
+"""Source of the trial run, which has a process of its own: an instruction unknown to the processor would kill it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Equipment:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
-        name: of the thing.
-        status: ``"ok"``; ``"lacks"`` for what the rest does without; ``"fails"`` for what everything needs.
-        found: what there is.
-        remedy: what to do where something is not as it should be, else ``""``.
+        name: name of the check.
+        status: ``"ok"``, ``"lacks"`` (an optional item is missing) or ``"fails"`` (a required item is missing).
+        found: description of what is installed.
+        remedy: what to do if the status is not ``"ok"``, else ``""``.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Equipment:
 
 
 def examine() -> Iterator[Equipment]:
-    """All findings, one by one: the slow one, a stepper compiled and run, takes some seconds."""
+    """Yield the results of all checks one by one; the trial run, which compiles a stepper, takes some seconds."""
     yield Equipment(name="python", status=OK, found=f"{platform.python_version()}, {platform.platform()}")
     yield Equipment(name="cores", status=OK, found=_cores())
     yield _packages("", "libraries")
@@ -87,7 +87,7 @@ def _cores() -> str:
 
 
 def _requirements(package: str, extra: str) -> Iterator[dict[str, str]]:
-    """What an installed package says that an extra of it wants ("": what it always does), and these want in turn."""
+    """Yield the requirements of an extra of an installed package ("": the unconditional ones), recursively."""
     for wanted in _described(package):
         if wanted["extra"] == extra:
             yield wanted
@@ -96,7 +96,7 @@ def _requirements(package: str, extra: str) -> Iterator[dict[str, str]]:
 
 
 def _described(package: str) -> list[dict[str, str]]:
-    """Names, least versions and extras; none of a package that is not installed."""
+    """Return names, least versions and extras of a package's requirements; an empty list if it is not installed."""
     try:
         lines = requires(package) or []
     except PackageNotFoundError:
@@ -105,7 +105,7 @@ def _described(package: str) -> list[dict[str, str]]:
 
 
 def _packages(extra: str, name: str) -> Equipment:
-    """The libraries of an extra, or those without which nothing works."""
+    """Check the libraries of an extra, or the required libraries ("")."""
     present, absent = [], []
     for wanted in _requirements(PACKAGE, extra):
         try:
@@ -127,12 +127,12 @@ def _packages(extra: str, name: str) -> Equipment:
 
 
 def _numbers(text: str) -> tuple[int, ...]:
-    """Of a version, as far as it is numbers."""
+    """Return the first three numbers of a version."""
     return tuple(int(part) for part in re.findall(r"\d+", text)[:3])
 
 
 def _compilation() -> Iterator[Equipment]:
-    """The compiler, its flags, a stepper by them, and whether that has the vector library."""
+    """Check the compiler, its flags, a compiled stepper, and the vector library."""
     try:
         command = find_compiler()
         title = compiler_title()
@@ -155,7 +155,7 @@ def _compilation() -> Iterator[Equipment]:
 
 
 def _trial(folder: Path) -> Equipment:
-    """A pendulum, derived, compiled and run in a folder."""
+    """Derive, compile and run a pendulum in a folder."""
     began = time.perf_counter()
     with running([sys.executable, "-c", TRIAL], folder) as process:
         try:
@@ -182,7 +182,7 @@ def _untried(why: str) -> Equipment:
 
 
 def _ending(status: int) -> str:
-    """Of a process that said nothing; a shell in between makes 128 + its number of a signal."""
+    """Return the reason why a process without output ended; shells report a signal as 128 + its number."""
     number = -status if status < 0 else status - 128
     with suppress(ValueError):
         return f"what was compiled ended by {signal.Signals(number).name}"
@@ -190,7 +190,7 @@ def _ending(status: int) -> str:
 
 
 def _vectors(folder: Path) -> Equipment:
-    """Whether the library that was built calls glibc's vector functions."""
+    """Check if the compiled library calls glibc's vector functions."""
     if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
         return Equipment(name="vectors", status=OK, found="libmvec: sines and exponentials of several points at once")
     return Equipment(
@@ -203,7 +203,7 @@ def _vectors(folder: Path) -> Equipment:
 
 
 def _cache() -> Equipment:
-    """The folder where compiled integrators are kept."""
+    """Check the folder of the cache of compiled integrators."""
     folder = cache_folder()
     nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:

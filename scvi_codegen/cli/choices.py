@@ -1,4 +1,4 @@
-"""MODEL and the options that override it: from the words of a command line to a :class:`Model`."""
+"""The argument MODEL and the options that override it, converted to a :class:`Model`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 METHOD_CHOICES = (
     *("method", "degree", "stages", "order", "nodes", "quadrature", "space", "form", "variational", "abscissae"),
 )
-"""Options that say something of the method."""
+"""Options that specify the method."""
 OFFERED_SIZES = range(1, 17)
-"""Numbers that a shell offers after ``svi:``."""
+"""Numbers that shell completion offers after ``svi:``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """What the command line says beside MODEL; ``None`` (or nothing) where it is silent."""
+    """Options of the command line that override MODEL; ``None`` or an empty tuple for options that are absent."""
 
     method: str | None
     degree: int | None
@@ -62,7 +62,7 @@ class Choices:
     size: tuple[tuple[str, int], ...] | None = None
 
     def sections(self) -> dict[str, dict[str, Any]]:
-        """The same as sections of a model file."""
+        """Return the options as sections of a model file."""
         named: dict[str, dict[str, Any]] = {
             "system": {"monitor": self.monitor},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
@@ -125,7 +125,7 @@ def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str
 def _input_files(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
 ) -> tuple[tuple[str, dict[str, str]], ...]:
-    """NAME=FILE[:KIND] as entries of the section [inputs]; a file beside the shell, not beside the model."""
+    """Return NAME=FILE[:KIND] as entries of the section [inputs]; paths are relative to the working directory."""
     result = []
     for text in values:
         name, _, given = (part.strip() for part in text.partition("="))
@@ -142,14 +142,14 @@ def _option(*names: str, **settings: Any) -> Callable[[Command], Command]:
 
 
 def complete_method(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of methods, for a shell; after a colon with their degree, number of stages or order."""
+    """Offer names of methods for shell completion; after a colon with degree, number of stages or order."""
     name, colon, _ = incomplete.partition(":")
     offered = [f"{name}:{number}" for number in OFFERED_SIZES] if colon and size_of(name) else METHODS
     return [CompletionItem(one) for one in offered if one.startswith(incomplete)]
 
 
 def complete_model(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of the catalogue, and files, for a shell; bash forgets what it was told before it is sent to files."""
+    """Offer files and names of the catalogue for shell completion; files first, as bash requires."""
     names = [CompletionItem(name) for name in PROBLEMS if name.startswith(incomplete)]
     return [CompletionItem(incomplete, type="file"), *names]
 
@@ -250,7 +250,7 @@ SOLVER_OPTION = _option(
 
 
 def model_arguments(command: Command, *, required: bool = True) -> Command:
-    """Give a command the argument MODEL and the options of :class:`Choices`."""
+    """Add the argument MODEL and the options of :class:`Choices` to a command."""
     for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
         command = option(command)
     return click.argument(
@@ -262,7 +262,7 @@ def model_arguments(command: Command, *, required: bool = True) -> Command:
 
 
 def _check_method(choices: Choices) -> None:
-    """Refuse options that the method given beside them does not take, or whose number its name gives otherwise."""
+    """Reject options that the chosen method does not take or that contradict the number in its name."""
     if choices.method is None:
         return
     said = specification_of(choices.method)
@@ -279,10 +279,10 @@ def _check_method(choices: Choices) -> None:
 
 
 def read_model(name: str, choices: Choices) -> Model | IndexedModel:
-    """The model of a file or of the catalogue, with the choices of the command line laid over it.
+    """Return the model of a file or of the catalogue, overridden by the options of the command line.
 
     Raises:
-        click.UsageError: if choices exclude or contradict each other, or are none of the chosen method.
+        click.UsageError: if options exclude or contradict each other, or are not options of the chosen method.
         ScviCodegenError: as reading and building the model do.
     """
     if choices.p is not None and choices.velocity is not None:

@@ -1,4 +1,4 @@
-"""What a run should have conserved, and how well it did: energy, and the momentum maps of the symmetries."""
+"""Report of conserved quantities of a run: energy error, energy balance and momentum maps."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ __all__ = ["Balance", "energy_balance", "energy_report", "momentum_report"]
 Array = NDArray[np.float64]
 
 MOST_SHOWN = 12
+"""Largest number of momentum maps that are listed one by one."""
 LARGE_ERROR, LOST = 1e-3, 0.1
-"""Relative errors from which a quantity is said to be hardly conserved, and not at all."""
+"""Relative errors from which a quantity is reported as hardly conserved, and as not conserved."""
 BALANCED_STEPS, BALANCED_COORDINATES = 10_000, 12
-"""The most for which a balance is drawn: Newton's iteration takes each step again, for some tens of microseconds."""
+"""Limits for computing the energy balance: Newton's iteration recomputes each step, some tens of microseconds each."""
 
 
 class Balance(NamedTuple):
-    """The work W of forces and damping over a run, and by how much E - E0 - W was off 0 at most."""
+    """Work W of forces and damping over a run, and the largest |E - E0 - W| of its states."""
 
     work: float
     error: float
 
 
 def energy_balance(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, steps: int) -> Balance | None:
-    """What the steps of a run account for; ``None`` where they keep no account, or it takes long.
+    """Return the energy balance of a run; ``None`` if the method has none or computing it would take long.
 
     Args:
-        system: of the run.
-        trajectory: its states, of which each is the start of the steps to the next.
-        steps: their number.
+        system: system that was integrated.
+        trajectory: saved states; the steps between two of them are repeated to sum up the work.
+        steps: number of steps.
     """
     short = 0 < steps <= BALANCED_STEPS and system.dimension <= BALANCED_COORDINATES
     if not (short and system.balances_energy):
@@ -46,14 +47,14 @@ def energy_balance(system: MechanicalSystem, trajectory: Trajectory | DrivenTraj
     try:
         energy, work = trajectory.energy(), trajectory.work()
     except ScviCodegenError:
-        return None  # of a method, or of states that are not kept, which tell no work; of a machine without a compiler
+        return None  # the method or the states do not determine the work, or there is no compiler
     return Balance(float(work[-1]), float(np.abs(energy - energy[0] - work).max()))
 
 
 def energy_report(
     system: MechanicalSystem, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None
 ) -> str:
-    """One line: the largest relative energy error and its drift, the part that grows linearly; or the balance."""
+    """Return one line: largest relative energy error and its linear drift, or the energy balance of forces."""
     energy = trajectory.energy()
     scale = abs(float(energy[0]))
     error = (energy - energy[0]) / (scale or 1.0)
@@ -67,7 +68,7 @@ def energy_report(
 
 
 def _verdict(error: float) -> str:
-    """What is said of an error that is no small one, with a warning."""
+    """Return a remark on an error that is not small, and issue a warning."""
     if error < LARGE_ERROR:
         return ""
     warn(
@@ -78,7 +79,7 @@ def _verdict(error: float) -> str:
 
 
 def _drift(t: Array, error: Array) -> float:
-    """Change over the run of the straight line fitted to the error."""
+    """Return the change over the run of the least-squares line through the error."""
     if len(t) < 3:
         return float(error[-1])
     centred = (t - t.mean()) / (t[-1] - t[0])
@@ -86,7 +87,7 @@ def _drift(t: Array, error: Array) -> float:
 
 
 def momentum_report(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> Iterator[str]:
-    """A line a momentum map: its largest change, relative to the largest size of its terms."""
+    """Yield a line for each momentum map: its largest change, relative to the largest size of its terms."""
     described = result.stepper.interface
     try:
         changes = np.abs(result.momentum_errors())

@@ -1,4 +1,4 @@
-"""``scvi-codegen run --ensemble``: all trajectories of a grid or a table, summed up together."""
+"""Runs of ``scvi-codegen run --ensemble``: trajectories of a grid or a table, and their summary."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
 
 SHOWN_FAILURES = 8
+"""Largest number of failed trajectories that are listed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnsembleOutcome:
-    """What came of an ensemble.
+    """Result of an ensemble run.
 
     Attributes:
-        result: the states kept, of each trajectory as far as it went.
+        result: saved states, of each trajectory up to its last completed step.
         preparation: seconds to derive, compile and load the stepper.
-        seconds: spent in steps.
-        interrupted: whether the user or the system stopped it.
+        seconds: seconds spent in steps.
+        interrupted: True if a signal ended the run.
     """
 
     result: EnsembleTrajectory
@@ -45,19 +46,19 @@ class EnsembleOutcome:
     interrupted: bool
 
 
-class _Stop(Exception):  # noqa: N818  (a wish, not an error)
-    """The user wants no more."""
+class _Stop(Exception):  # noqa: N818  (no error)
+    """Raised from the progress callback to end the run after a signal."""
 
 
 def integrate_states(
     states: EnsembleStates, *, solver: str = "auto", options: SolverOptions | None = None
 ) -> EnsembleOutcome:
-    """Run the model of the states from each of them, with a progress bar, as far as it goes.
+    """Integrate the model from each initial state, with a progress bar, until all end or a signal arrives.
 
     Raises:
         BuildError: without a C compiler.
         MethodError: for a solver that the method does not have.
-        StateError: if a state is unfit, or all of them need more memory than there is.
+        StateError: if a state is not finite or violates the constraints, or memory does not suffice.
     """
     model, began = states.model, time.perf_counter()
     check_memory(model, len(states))
@@ -87,7 +88,7 @@ def integrate_states(
 def _work(
     model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None
 ) -> Ensemble | EnsembleToEnds:
-    """What is to be done, compiled while Ctrl-C still ends it."""
+    """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
     common: dict[str, Any] = {"every": model.every, "t": model.t, "parameters": states.parameters, "options": options}
     if model.system.inputs:
@@ -101,7 +102,7 @@ def _work(
 
 
 def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
-    """The ensemble in a few lines."""
+    """Return a summary of an ensemble in a few lines."""
     result = outcome.result
     steps = int(result.steps.sum())
     lines = [
@@ -130,7 +131,7 @@ def _way(model: Model, result: EnsembleTrajectory) -> str:
 
 
 def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
-    """Numbers of trajectories, those that reached the end first."""
+    """Return the number of trajectories for each status, completed ones first."""
     counts = Counter(result.status.tolist())
     return [("ok", counts.pop("ok", 0)), *sorted(counts.items())]
 
@@ -147,7 +148,7 @@ def _failures(result: EnsembleTrajectory) -> Iterator[str]:
 
 
 def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
-    """The largest change of the energy of any trajectory."""
+    """Return one line: the largest change of the energy among all trajectories."""
     energies = result.energy()
     sizes = np.abs(energies[0])
     why = model.system.changes_energy

@@ -1,7 +1,7 @@
-"""What all commands share: the group that finds them, errors as one line and an exit status, files to be written.
+"""Framework shared by all commands: command group, error handling, exit status, reports and output files.
 
-A command whose result is of use to a program has :func:`reporting` above it and tells by :func:`tell` what it finds, in
-words and in numbers: people read the words, ``--json`` prints the numbers, ``--quiet`` neither.
+A command whose result a program can use is decorated with :func:`reporting` and reports with :func:`tell`, as text and
+as numbers: by default the text is printed, with ``--json`` the numbers, with ``--quiet`` neither.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ __all__ = [
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 REPORT, QUIET = f"{__name__}.report", f"{__name__}.quiet"
-"""Where a command keeps what ``--json`` is to print, and whether it is to be silent."""
+"""Keys of click's context for the document of ``--json`` and for the flag of ``--quiet``."""
 
 FAILURE, USAGE, INTERRUPTED = 1, 2, 130
-"""Exit statuses: numerical failure or no compiler; faulty input; Ctrl-C."""
+"""Exit statuses: numerical failure, no compiler or no file written; invalid input; Ctrl-C."""
 
 
 class CommandFailure(click.ClickException):
-    """A message for people, and the exit status of the command."""
+    """Error of a command: a message for the user and an exit status."""
 
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
@@ -64,15 +64,15 @@ class CommandFailure(click.ClickException):
 
     @property
     def exit_code(self) -> int:  # type: ignore[override]  # click's is a class variable
-        """The status."""
+        """Exit status of the command."""
         return self.status
 
 
 class Commands(click.Group):
-    """A command NAME is the function of that name in the module NAME of a folder, imported when it is called.
+    """Command group that imports the module ``folder``.NAME for the function NAME when a command is called.
 
-    So a module imports what its command needs in plain words, and the overview waits for none of it. Whatever error a
-    user can meet becomes one message and an exit status.
+    The module of a command can therefore import what it needs at the top, while ``--help`` imports none of them. Every
+    error that a user can cause becomes one message and an exit status.
     """
 
     def __init__(self, *words: Any, folder: str, about: Mapping[str, str], **settings: Any) -> None:
@@ -80,11 +80,11 @@ class Commands(click.Group):
         self.folder, self.about = folder, about
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in alphabetical order."""
+        """Return the names in alphabetical order."""
         return sorted(self.about)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of a name, imported here."""
+        """Return the command of a name; imports its module."""
         if cmd_name not in self.about:
             return None
         command: click.Command = getattr(import_module(f"{self.folder}.{cmd_name}"), cmd_name)
@@ -93,25 +93,25 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that the words name; one that is misspelt is told the nearest."""
+        """Return the command that the arguments name; propose the closest name for an unknown one."""
         if args and args[0] not in self.about and not args[0].startswith("-"):
             hint = closest(args[0], self.about)
             ctx.fail(f"there is no command '{args[0]}'{hint} Known: {', '.join(sorted(self.about))}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The part of the overview that lists the commands."""
+        """Write the list of commands of the overview."""
         with formatter.section("Commands"):
             formatter.write_dl(sorted(self.about.items()))
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """What a shell offers for the beginning of a name."""
+        """Offer names of commands for shell completion."""
         names = [name for name in sorted(self.about) if name.startswith(incomplete)]
         found = [CompletionItem(name, help=self.about[name]) for name in names]
         return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
 
     def main(self, *given: Any, **named: Any) -> Any:
-        """Run with streams that can be written, also where a shell closed them (``2>&-``)."""
+        """Run with writable streams, also if a shell closed them (``2>&-``)."""
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:
                 nowhere = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  (as long as the process)
@@ -119,7 +119,7 @@ class Commands(click.Group):
         return super().main(*given, **named)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; errors become messages."""
+        """Run a command; convert errors into messages and exit statuses."""
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)
@@ -145,7 +145,7 @@ class Commands(click.Group):
 
 @contextmanager
 def _warnings_as_lines() -> Iterator[None]:
-    """Show the warnings of this package as one line each, once."""
+    """Print each warning of this package once, as one line."""
     shown: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
@@ -161,7 +161,7 @@ def _warnings_as_lines() -> Iterator[None]:
 
 
 def reporting(command: Command) -> Command:
-    """Give a command the options ``--json`` and ``--quiet``, which :func:`tell` obeys."""
+    """Add the options ``--json`` and ``--quiet``, which :func:`tell` obeys, to a command."""
     options = (
         click.option(
             *("--json", "as_json"),
@@ -203,19 +203,19 @@ def _be_quiet(context: click.Context, parameter: click.Parameter, wanted: bool) 
 
 
 def is_quiet() -> bool:
-    """Whether the command that runs, if one does, was told to be."""
+    """Return True if the running command, if any, has the option ``--quiet``."""
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.meta.get(QUIET))
 
 
 def note(text: str) -> None:
-    """Say on stderr what goes on beside the result."""
+    """Print a remark to stderr, unless ``--quiet``."""
     if not is_quiet():
         click.echo(text, err=True)
 
 
 def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
-    """Say a text, or with ``--json`` have the numbers in the document printed at the end, also after an error."""
+    """Print a text; with ``--json`` add the numbers to the document that is printed at the end, also after an error."""
     meta = click.get_current_context().meta
     if REPORT in meta:
         meta[REPORT] |= numbers
@@ -224,7 +224,7 @@ def tell(text: str = "", /, *, nl: bool = True, **numbers: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it, which knows no NaN, infinity or number of NumPy's: ``None`` where there is no number."""
+    """Return a value in the types of JSON: NaN and infinity as ``None``, arrays as lists, paths as strings."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -237,7 +237,13 @@ def _plain(value: Any) -> Any:
 
 
 def check_writable(path: Path, hint: str) -> None:
-    """Find out before long work whether its result can be written; ``hint`` names the option that wants it."""
+    """Raise an error of usage unless a file can be written; ``hint`` names the option that requires it.
+
+    Called before long computations.
+
+    Raises:
+        click.BadParameter: if the path is a folder, or its folder is missing or not writable.
+    """
     if path.is_dir() and path.suffix.lower() != ".zarr":
         raise click.BadParameter(f"'{path}' is a folder", param_hint=hint)
     if not path.parent.is_dir():
@@ -247,7 +253,7 @@ def check_writable(path: Path, hint: str) -> None:
 
 
 def emit(text: str, /, output: str | None, **numbers: Any) -> None:
-    """Print a text, or write it to a file whole or not at all; ``numbers`` as for :func:`tell`."""
+    """Print a text, or write it to a file atomically; ``numbers`` as for :func:`tell`."""
     if output is None:
         tell(text, **numbers)
         return

@@ -1,4 +1,4 @@
-"""Whether the states of a run fit into memory, asked before it begins: a process that takes more is killed unheard."""
+"""Check of the memory that a run needs, before it starts: the system kills larger processes without a message."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from scvi_codegen.models.model import Model
 __all__ = ["check_memory", "check_room", "check_states", "usable_memory"]
 
 COPIES = 2
-"""Kept in pieces, then joined and summed up."""
+"""Copies of the states that exist at once: the segments, and the arrays that join them."""
 LIMIT_OF_GROUP = Path("/sys/fs/cgroup/memory.max")
-"""What Linux gives a container."""
+"""File with the memory limit of a Linux control group (container)."""
 
 
 def check_memory(model: Model, trajectories: int = 1) -> None:
-    """Refuse a run whose states do not fit, and say how it would.
+    """Reject a run whose saved states do not fit into memory.
 
     Raises:
-        StateError: naming the size, and the distance between states at which they fit.
+        StateError: with the size needed and a ``--every`` at which the states fit.
     """
     check_room(model, 0 if model.ends_at_time else model.step_count, trajectories)
 
 
 def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
-    """The same for so many steps: also of a run under way whose steps choose their length, and have no number before.
+    """Reject a run of ``steps`` steps whose states do not fit; adaptive runs call it as they proceed.
 
     Raises:
         StateError: as :func:`check_memory`.
@@ -39,7 +39,7 @@ def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
 
 
 def check_states(m: int, steps: int, every: int, trajectories: int = 1, *, ways: Sequence[str] = ()) -> None:
-    """The same for states of m coordinates, with ways to do without memory.
+    """Reject a run whose states, of ``m`` coordinates each, do not fit; ``ways`` are remedies to propose.
 
     Raises:
         StateError: as :func:`check_memory`.
@@ -56,7 +56,7 @@ def check_states(m: int, steps: int, every: int, trajectories: int = 1, *, ways:
 
 
 def usable_memory() -> float:
-    """Bytes for this process; infinitely many where the system does not tell."""
+    """Return the bytes of memory available to this process; infinity if the system does not report them."""
     found = [math.inf]
     with suppress(AttributeError, OSError, ValueError):
         found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))

@@ -1,4 +1,4 @@
-"""What ``--json`` says of runs: the numbers of which their summaries are made."""
+"""Documents of ``scvi-codegen run --json``: the numbers behind the summaries of runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"
 def run_numbers(
     model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None
 ) -> dict[str, Any]:
-    """Of one run in memory."""
+    """Return the numbers of a run in memory."""
     run, trajectory = outcome.run, outcome.trajectory
     t, q, p = outcome.end
     return {
@@ -50,14 +50,14 @@ def run_numbers(
 
 
 def failure_text(outcome: RunOutcome | RecordedOutcome) -> str | None:
-    """Why a run is not what was asked for."""
+    """Return the reason why a run is incomplete; ``None`` if it is complete."""
     if outcome.interrupted:
         return "interrupted"
     return None if outcome.failure is None else str(outcome.failure)
 
 
 def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
-    """Of a run in a folder."""
+    """Return the numbers of a run in a folder."""
     interface = recorded.manifest.interface
     return {
         "system": interface.system,
@@ -75,7 +75,7 @@ def recorded_numbers(recorded: RecordedRun) -> dict[str, Any]:
 
 
 def ensemble_numbers(model: Model, outcome: EnsembleOutcome) -> dict[str, Any]:
-    """Of an ensemble."""
+    """Return the numbers of an ensemble."""
     result = outcome.result
     return {
         **_about(model),
@@ -103,7 +103,7 @@ def _by_name(names: Sequence[str], vector: np.ndarray[Any, Any]) -> dict[str, fl
 
 
 def _conserved(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> dict[str, Any]:
-    """Largest changes: of energies, and of momentum maps relative to the sizes of their terms."""
+    """Return the largest changes of the energy and of the momentum maps, these relative to the size of their terms."""
     found: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
     try:
         with np.errstate(all="ignore"):
@@ -114,11 +114,11 @@ def _conserved(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> di
             names = result.stepper.interface.map_names
             found["momentum_errors"] = {name: _largest(errors[..., k]) for k, name in enumerate(names)}
     except StateError:
-        pass  # of a state without a velocity; the summary says so
+        pass  # a state without a velocity; the summary reports it
     return found
 
 
 def _largest(changes: np.ndarray[Any, Any]) -> float | None:
-    """In size; ``None`` where none is a number."""
+    """Return the largest finite absolute value; ``None`` if there is none."""
     sizes = np.abs(changes)[np.isfinite(changes)]
     return float(sizes.max()) if sizes.size else None

@@ -1,4 +1,4 @@
-"""How far a run is, shown while it lasts, and the wish to end it."""
+"""Progress bar of a run, and handling of SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from scvi_codegen.cli.frame import is_quiet
 __all__ = ["PARTS", "interruptions", "progress_bar"]
 
 PARTS = 1000
-"""That a bar shows of a run whose steps have no number before."""
+"""Length of the progress bar of a run whose number of steps is not known in advance."""
 
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[list[int]]:
-    """Note the first SIGINT or SIGTERM instead of dying of it; a second one acts as always."""
+    """Record the first SIGINT or SIGTERM in a list instead of ending the process; a second one acts as usual."""
     caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield caught  # only the main thread may handle signals
@@ -44,7 +44,7 @@ def interruptions() -> Iterator[list[int]]:
 
 @contextlib.contextmanager
 def progress_bar(steps: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr if that is a terminal; the function given is told how many steps are done in all."""
+    """Show a bar on stderr if that is a terminal; the function it yields takes the number of completed steps."""
     if not sys.stderr.isatty() or steps == 0 or is_quiet():
         yield lambda done: None
         return

@@ -1,4 +1,4 @@
-"""``scvi-codegen run -o FOLDER.run``, ``run --resume FOLDER`` and ``export``: runs of any length in a folder."""
+"""Runs in folders, with checkpoints: ``run -o FOLDER.run``, ``run --resume FOLDER`` and ``export``."""
 
 from __future__ import annotations
 
@@ -30,17 +30,22 @@ __all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "is_
 
 SUFFIX = ".run"
 LOOKED_AT = 10_000
-"""States at most in which it is looked at what was conserved."""
+"""Largest number of states used to summarise what was conserved."""
 WITH_RESUME = {"resume", "steps", "span", "checkpoint", "checkpoint_steps"}
+"""Options that are allowed with ``--resume``."""
 
 
 def is_folder(output: str) -> bool:
-    """Whether an output is a folder for a run: NAME.run, or anything that ends in a slash."""
+    """Return True if an output is a folder for a run: NAME.run, or a path that ends in a slash."""
     return output.endswith(("/", os.sep)) or Path(output).suffix.lower() == SUFFIX
 
 
 def check_format(output: str, *, ensemble: bool) -> None:
-    """Find out whether there is such a kind of file, and its library."""
+    """Check that a file format exists and that its library is installed.
+
+    Raises:
+        click.BadParameter: for an unknown format.
+    """
     known = tuple(export.WRITERS)
     if Path(output).suffix.lower() not in known:
         what = f"an ensemble is written as {', '.join(known)}"
@@ -51,7 +56,7 @@ def check_format(output: str, *, ensemble: bool) -> None:
 
 
 def check_resumed(context: click.Context) -> None:
-    """Refuse whatever would make another run of the one that is to go on."""
+    """Reject options that would change the run that ``--resume`` continues."""
     for name in context.params:
         given = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
         if given and name not in WITH_RESUME:
@@ -63,15 +68,15 @@ def check_resumed(context: click.Context) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedOutcome:
-    """What came of recording.
+    """Result of a run in a folder.
 
     Attributes:
-        recorded: the run as it lies in the folder.
-        run: as it stands there.
-        first: number of steps that had been done before.
-        seconds: spent from there on.
-        failure: the error of the step that failed, or ``None``.
-        interrupted: whether the user or the system stopped it.
+        recorded: contents of the folder.
+        run: state of the integration at the last checkpoint.
+        first: number of steps completed before this call.
+        seconds: seconds spent in this call.
+        failure: error of the step that failed, or ``None``.
+        interrupted: True if a signal ended the run.
     """
 
     recorded: RecordedRun
@@ -82,7 +87,7 @@ class RecordedOutcome:
     interrupted: bool
 
     def summary(self) -> str:
-        """The run in a few lines."""
+        """Return a summary of the run in a few lines."""
         steps = self.run.steps - self.first
         lines = [standing(self.recorded)]
         if steps:
@@ -93,7 +98,7 @@ class RecordedOutcome:
         )
 
     def _conserved(self) -> list[str]:
-        """What was conserved, if there is a model to tell what should be."""
+        """Return lines on conserved quantities if the folder names a model that determines them."""
         text = self.recorded.manifest.model
         if text is None or not self.run.steps:
             return []
@@ -103,7 +108,7 @@ class RecordedOutcome:
         return [f"in one of {stride} states kept:", *lines] if stride > 1 else lines
 
     def kept(self) -> str:
-        """What was written, and how to go on if that makes sense."""
+        """Return a line on what was written, and the command that continues the run unless a step failed."""
         folder = self.recorded.folder
         states = f"the {len(self.recorded)} states up to there are in '{folder}'"
         if self.failure is not None:
@@ -113,11 +118,12 @@ class RecordedOutcome:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """How often it is written, and what is put beside the states.
+    """Checkpoint interval and certificate of a run in a folder.
 
     Attributes:
-        seconds, steps: between checkpoints; ``None`` for the default, and for none.
-        certificate: path of a JSON file, or ``None``.
+        seconds: seconds between checkpoints; ``None`` for the default.
+        steps: steps between checkpoints; ``None`` for no such limit.
+        certificate: path of a JSON file to store with the run, or ``None``.
     """
 
     seconds: float | None
@@ -125,14 +131,14 @@ class Recording:
     certificate: str | None
 
     def check(self, recorded: bool) -> None:
-        """Refuse options that would have no effect."""
+        """Reject options that have no effect on a run in memory."""
         given = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
         for name, value in given.items():
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} is for a run that is written into a folder (-o NAME{SUFFIX})")
 
     def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions | None) -> RecordedOutcome:
-        """Run a model into a folder, as far as it goes. Raises as :func:`record_run`."""
+        """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
         text = None
         with suppress(ModelFileError):
             text = dump_model(model)
@@ -153,7 +159,7 @@ class Recording:
         )
 
     def resume(self, folder: str, *, steps: int | None, span: float | None) -> RecordedOutcome:
-        """Go on with the run in a folder. Raises as :func:`resume_run`."""
+        """Continue the run in a folder; raises as :func:`resume_run`."""
         if steps is not None and span is not None:
             raise click.UsageError("--span and --steps exclude each other")
         recorded = load_run(folder)
@@ -169,7 +175,7 @@ class Recording:
         return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal, **further)
 
     def _watched(self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any) -> RecordedOutcome:
-        """With a progress bar, ended by Ctrl-C or SIGTERM at a state that is written."""
+        """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
         pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
         settings |= {name: value for name, value in pace.items() if value is not None}
         folder, failure, began = arguments[-1], None, time.perf_counter()
@@ -196,7 +202,7 @@ class Recording:
 
 
 def standing(recorded: RecordedRun) -> str:
-    """What runs in a folder and how far it is, in two lines."""
+    """Return two lines: the integrator of a run in a folder, and its progress."""
     manifest = recorded.manifest
     done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
     if manifest.goal:

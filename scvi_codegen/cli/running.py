@@ -1,4 +1,4 @@
-"""``scvi-codegen run``: integrate in short portions, so that Ctrl-C and a failing step lose nothing, and sum it up."""
+"""Integration for ``scvi-codegen run`` in short chunks, so that Ctrl-C and failed steps lose nothing; its summary."""
 
 from __future__ import annotations
 
@@ -40,21 +40,23 @@ __all__ = [
 ]
 
 PORTION_SECONDS = 0.2
+"""Target duration of a chunk in seconds; bounds the delay of Ctrl-C."""
 SHOWN_COORDINATES = 6
+"""Largest number of coordinates that the final state lists."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutcome:
-    """What came of a run.
+    """Result of a run.
 
     Attributes:
-        trajectory: the states kept, up to the last one computed.
-        run: as it stands after the last step completed.
+        trajectory: saved states, up to the last one computed.
+        run: state of the integration after the last completed step.
         preparation: seconds to derive, compile and load the stepper.
-        seconds: spent in steps.
-        failure: the error of the step that failed, or ``None``.
-        interrupted: whether the user or the system stopped the run.
-        broken: what was promised of its steps and not kept, or ``None``.
+        seconds: seconds spent in steps.
+        failure: error of the step that failed, or ``None``.
+        interrupted: True if a signal ended the run.
+        broken: message if the steps of tau miss the tolerance that they were chosen for, else ``None``.
     """
 
     trajectory: Trajectory | DrivenTrajectory
@@ -67,7 +69,10 @@ class RunOutcome:
 
     @property
     def end(self) -> tuple[float, Array, Array]:
-        """Time, positions and momenta; in transformed time the run itself stands before a last, shorter step."""
+        """Time, positions and momenta at the end.
+
+        In transformed time the last saved state lies inside the last step, before the state of the run.
+        """
         run, kept = self.run, self.trajectory
         inside = run.stepper.interface.energy_parameter and (kept.t[-1] - run.t) * run.h > 0.0
         return (float(kept.t[-1]), kept.q[-1], kept.p[-1]) if inside else (run.t, run.q, run.p)
@@ -75,12 +80,12 @@ class RunOutcome:
 
 @unwarned()
 def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> RunOutcome:
-    """Run a model with a progress bar, as far as it goes.
+    """Integrate a model with a progress bar until its end, a failed step or a signal.
 
     Raises:
         BuildError: without a C compiler.
         MethodError: for a solver that the method does not have.
-        StateError: if the initial state is unfit, or there is not the memory for all states.
+        StateError: if the initial state is invalid, or memory does not suffice for all states.
     """
     check_memory(model)
     began = time.perf_counter()
@@ -108,12 +113,12 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
 
 
 class _Portions:
-    """A run in short portions, so that a signal is heard; ends before a step that fails.
+    """Integration of a run in short chunks between which signals are handled; ends before a step that fails.
 
     Attributes:
-        seconds: spent in steps.
-        failure: the error of the step that failed, or ``None``.
-        stopped: whether a signal came first.
+        seconds: seconds spent in steps.
+        failure: error of the step that failed, or ``None``.
+        stopped: True if a signal arrived first.
     """
 
     def __init__(self, model: Model, run: Run, caught: Sequence[int], reach: Callable[[int], None]) -> None:
@@ -122,7 +127,7 @@ class _Portions:
         self.failure: StepFailedError | None = None
 
     def stretch(self, steps: int | None) -> Trajectory:
-        """So many steps, or all that lead to the goal; fewer if there are no more."""
+        """Advance ``steps`` steps, or up to the target time of the run (``None``), and return the states."""
         run, pieces = self.run, [self.run.record(0, every=self.model.every)]
         last = None if steps is None else run.steps + steps
         while self.failure is None and not (run.arrived if last is None else run.steps >= last):
@@ -149,7 +154,7 @@ class _Portions:
 
 
 def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
-    """A run of steps of tau to the end of the model's span of time."""
+    """Integrate with steps of tau, dt = g dtau, to the end of the model's time span."""
     end, began, failure = model.t + model.covered, time.perf_counter(), None
     observed = Observation(run, every=model.every, end=end)
     with interruptions() as caught, progress_bar(PARTS) as reach:
@@ -174,7 +179,7 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
 
 
 def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
-    """What is to be said where the step of tau was chosen by the first steps, and others belie it."""
+    """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
     allowed = allowed_error(model)
     if allowed is None or not model.paced:
         return None
@@ -182,22 +187,22 @@ def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | No
 
 
 def _length(model: Model) -> int:
-    """Of the bar: steps, or parts of the time."""
+    """Return the length of the progress bar: the number of steps, or ``PARTS`` for the time span."""
     return PARTS if _by_time(model) else model.step_count
 
 
 def _reached(model: Model, run: Run) -> int:
-    """Of that length."""
+    """Return the progress in units of :func:`_length`."""
     return int(PARTS * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
 
 
 def _by_time(model: Model) -> bool:
-    """Whether the number of steps is not known before."""
+    """Return True if the number of steps is not known in advance."""
     return model.ends_at_time or bool(model.system.inputs)
 
 
 def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None) -> str:
-    """The run in a few lines; little if not one step was made."""
+    """Return a summary of a run in a few lines; shorter if no step was completed."""
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     order = "no order claimed" if method.order is None else f"order {method.order}"
     lines = [
@@ -216,14 +221,14 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
 
 
 def _geometry(model: Model, run: Run) -> str:
-    """Whether areas are kept: by steps of one length, if at all."""
+    """Return whether the map is symplectic; adaptive steps destroy this property."""
     if not is_symplectic(model.method, model.system):
         return "not symplectic"
     return "symplectic" if run.goal is None else "symplectic where steps have one length"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
-    """What is known of the state at the end of a run that came to its end, where that was kept."""
+    """Return the digits of the final state that a second run confirms; ``None`` if the run is incomplete."""
     run, trajectory = outcome.run, outcome.trajectory
     if not run.steps or outcome.failure is not None or outcome.interrupted or trajectory.t[-1] != run.t:
         return None
@@ -231,7 +236,7 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
 
 
 def of_length(h: float | None, run: Run) -> str:
-    """How long the steps of a run are."""
+    """Return a description of the step sizes of a run."""
     if run.stepper.interface.energy_parameter:
         return f"of {run.h:g} in tau"
     if run.goal and run.goal.tau:
@@ -241,15 +246,15 @@ def of_length(h: float | None, run: Run) -> str:
 
 def _speed(outcome: RunOutcome, every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
-    driven = bool(outcome.run.stepper.interface.inputs)  # states at breakpoints and at the end are kept, too
-    watched = outcome.run.steps if driven else (len(outcome.trajectory) - 1) * every  # steps up to the last state kept
+    driven = bool(outcome.run.stepper.interface.inputs)  # states at breakpoints and at the end are saved, too
+    watched = outcome.run.steps if driven else (len(outcome.trajectory) - 1) * every  # steps up to the last saved state
     if not watched:
         return text
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"
 
 
 def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None) -> Iterator[str]:
-    """A line for each quantity that should have been conserved: how well it was."""
+    """Yield a line for each quantity that should be conserved, with its error."""
     try:
         yield energy_report(model.system, trajectory, balance)
     except StateError as error:
@@ -258,7 +263,10 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: 
 
 
 def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) -> Iterator[str]:
-    """How well the worst step was resolved; a warning where it was too long, so that no option silences it."""
+    """Yield a line with the largest error estimate of a step; warn if that step is too large.
+
+    The warning does not depend on options such as ``--quiet``.
+    """
     error, begun = trajectory.step_error, f"from t = {trajectory.step_error_t:g}"
     if math.isnan(error):
         yield "worst step: its error is not known, nothing tells it here"
@@ -274,7 +282,7 @@ def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) ->
 
 
 def final_state(names: Sequence[str], positions: Array, momenta: Array, known: Known | None = None) -> Iterator[str]:
-    """Where a run stands: lines with coordinates and momenta, in the digits that are known."""
+    """Yield lines with the final coordinates and momenta, in the digits that are known to be right."""
     shown = names[:SHOWN_COORDINATES]
     width = max(map(len, shown))
     yield f"final state ({_how_known(known)})"
@@ -293,7 +301,7 @@ def _how_known(known: Known | None) -> str:
 
 
 def _joined(pieces: list[Trajectory]) -> Trajectory:
-    """One trajectory; each piece but the first begins with a state that is there already, or was not to be kept."""
+    """Join trajectories; drop the first state of each but the first, which repeats the last of the one before."""
     first, *rest = pieces
     last, t = pieces[-1], np.concatenate([first.t, *(piece.t[1:] for piece in rest)])
     return replace(

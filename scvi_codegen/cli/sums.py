@@ -1,4 +1,4 @@
-"""``scvi-codegen run`` for sums over indices: in portions, so that Ctrl-C and failing steps lose nothing."""
+"""Integration of indexed systems for ``scvi-codegen run``, in chunks, so that Ctrl-C and a failed step lose nothing."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajec
 __all__ = ["refuse", "run_sums", "solved_by"]
 
 MOST_SHOWN = 4
-"""Entries of an array at the end."""
+"""Largest number of entries of an array that the final state lists."""
 INSTEAD = {"advise": "give --tolerance"}
-"""Of options that sums over indices do not have."""
+"""Alternatives to options that indexed systems do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SumsOutcome:
-    """What came of a run: its states, where it stands, seconds before and in its steps, and what ended it."""
+    """Result of a run: saved states, state of the run, seconds of preparation and of steps, and why it ended."""
 
     trajectory: IndexedTrajectory
     run: IndexedRun
@@ -48,7 +48,11 @@ class SumsOutcome:
 
 
 def refuse(what: dict[str, object]) -> None:
-    """Refuse options, by name, that sums over indices do not have."""
+    """Reject options, by name, that indexed systems do not have.
+
+    Raises:
+        click.UsageError: if one of them is set.
+    """
     for name, value in what.items():
         if value not in (None, False):
             instead = INSTEAD.get(name, "leave it out, or write the system out (expand_sums)")
@@ -56,7 +60,7 @@ def refuse(what: dict[str, object]) -> None:
 
 
 def solved_by(solver: str, model: IndexedModel) -> IndexedModel:
-    """The model with the solver of the command line in place of its own, unless that leaves it the choice."""
+    """Return the model with the solver of the command line; with ``"auto"`` the model's own solver stays."""
     return model if solver == "auto" else replace(model, solver=solver)
 
 
@@ -67,10 +71,10 @@ def run_sums(
     options: SolverOptions | None,
     threads: int | None = None,
 ) -> None:
-    """Integrate, sum up, write what is asked for.
+    """Integrate an indexed system, print a summary and write the files asked for.
 
     Raises:
-        CommandFailure: where a step failed, or a signal ended the run, with the states before it summed up and written.
+        CommandFailure: if a step failed or a signal ended the run; the states before are summarised and written.
     """
     if output is not None:
         check_npz(output)
@@ -157,7 +161,7 @@ def _energy(model: IndexedModel, outcome: SumsOutcome) -> str:
 
 
 def _energies(outcome: SumsOutcome) -> Numbers:
-    """Of all states kept, and of the last, which may not be."""
+    """Return the energies of all saved states and of the final state, which may not be saved."""
     return np.vstack([outcome.trajectory.energies, outcome.run.energies])
 
 
@@ -166,14 +170,14 @@ def _energy_error(outcome: SumsOutcome) -> float:
 
 
 def _map_changes(outcome: SumsOutcome) -> Iterator[tuple[str, float]]:
-    """The largest change of each momentum map."""
+    """Return the largest change of each momentum map."""
     maps = np.vstack([outcome.trajectory.momentum_maps(), outcome.run.momentum_maps])
     changes = np.abs(maps - maps[0]).max(axis=0)
     return zip(outcome.stepper.momentum_map_names, changes.tolist(), strict=True)
 
 
 def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
-    """What ``--json`` says."""
+    """Return the document of ``--json``."""
     run, trajectory = outcome.run, outcome.trajectory
     failure = "interrupted" if outcome.interrupted else None
     return {

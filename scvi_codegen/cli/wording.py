@@ -1,4 +1,4 @@
-"""Numbers, times and tables as people read them."""
+"""Formatting of numbers, durations and tables for people."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ __all__ = ["counted", "duration", "in_known_digits", "table", "whole_steps"]
 
 
 def counted(count: int, what: str) -> str:
-    """A number with its noun, in the plural if need be."""
+    """Return a number with its noun, in the plural unless the number is 1."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def duration(seconds: float) -> str:
-    """A time in a unit that suits it."""
+    """Return a duration with a suitable unit."""
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if seconds >= scale:
             return f"{seconds / scale:.3g} {unit}"
@@ -34,7 +34,7 @@ def whole_steps(span: float | None, h: float, steps: int, t: float) -> list[str]
 
 
 def in_known_digits(x: float, error: float) -> str:
-    """A number to the last place that an error of this size leaves right; all 17 digits where there is none."""
+    """Return a number rounded to the digits that an error leaves right; 17 digits if the error is 0 or not finite."""
     if error == 0.0 or not math.isfinite(error):
         return f"{x: .17g}"
     places = math.floor(-math.log10(2.0 * error))
@@ -43,7 +43,7 @@ def in_known_digits(x: float, error: float) -> str:
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Lines with the columns below each other."""
+    """Return rows as lines with aligned columns."""
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return "\n".join(
         "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows

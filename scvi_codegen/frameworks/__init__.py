@@ -1,1 +1,1 @@
-"""What other libraries take: steps as functions of JAX and CasADi, optimal control by these, bodies for REBOUND."""
+"""Interfaces to other libraries: flows for JAX, PyTorch and CasADi, optimal control, bodies of REBOUND."""

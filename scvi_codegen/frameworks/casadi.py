@@ -1,4 +1,4 @@
-"""A flow for CasADi: an external function in C, with its derivatives, for trajectory optimisation and estimation."""
+"""Flow map as a CasADi external function in C with derivatives, for trajectory optimisation and estimation."""
 
 from __future__ import annotations
 
@@ -18,29 +18,31 @@ ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
 def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None, hessian: bool = False) -> Any:
-    """So many steps of a stepper as a ``casadi.Function``.
+    """Return a fixed number of steps of a stepper as a ``casadi.Function``.
 
-    It is an external function in compiled C, which CasADi calls without Python, with its Jacobian and its adjoint by
-    CasADi's naming convention: ``jacobian``, ``gradient``, ``jtimes``, ``map`` and nonlinear programs take it like any
-    other. Derivatives are exact, those of the computed map. Second ones are there with ``hessian``; without, give IPOPT
-    ``{"ipopt.hessian_approximation": "limited-memory"}``, or steps as constraints (:func:`optimal_control`).
+    It is an external function in compiled C, which CasADi calls without Python, with Jacobian and adjoint in CasADi's
+    naming convention: ``jacobian``, ``gradient``, ``jtimes``, ``map`` and nonlinear programs accept it. Derivatives are
+    those of the computed map, exact up to round-off. Second derivatives require ``hessian``; without them pass
+    ``{"ipopt.hessian_approximation": "limited-memory"}`` to IPOPT, or use steps as constraints
+    (:func:`optimal_control`).
 
     Args:
-        stepper: system and method.
-        steps: how many.
-        every: keep every so-many-th state and the initial one; by default that at the end alone.
-        hessian: with second derivatives, exact, too, whose kernels are then derived and compiled.
+        stepper: compiled stepper.
+        steps: number of steps.
+        every: save the initial state and every ``every``-th one; by default only the final state.
+        hessian: derive and compile exact second derivatives, too.
 
     Returns:
-        A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by place or by
-        name, t then being 0 where it is left out. Its values q1 and p1 are (m), with ``every`` (m, n), states in
-        columns. Where a step fails, so does the call, and solvers try shorter ways. Where there are constraints,
-        states off them are taken as they are, and the first step leads to them.
+        A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by position or by
+        name; t defaults to 0. Its values q1 and p1 are (m), with ``every`` (m, n), states in columns. If a step fails,
+        the call fails, and solvers shorten their step. States that violate the constraints are not projected; the first
+        step moves them onto the constraint manifold.
 
     Raises:
-        MethodError: in transformed time, and where a monitor chooses the steps; for second derivatives with damping.
+        MethodError: in transformed time, for steps of a time-rescaling function, and for second derivatives with
+            damping.
         MissingLibraryError: without CasADi (extra ``casadi``).
-        StateError: for steps that are no multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``every``.
     """
     flow = Flow.checked(stepper, steps, every)
     ca = imported("casadi", "casadi")

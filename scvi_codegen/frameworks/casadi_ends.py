@@ -1,4 +1,4 @@
-"""States between steps in CasADi: formulas in them, and how velocities and momenta belong together."""
+"""Formulas in the states at the ends of steps as CasADi functions, and the Legendre transform between v and p."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ __all__ = ["Ends", "numeric", "own_parameters", "read"]
 
 @dataclass(frozen=True)
 class Ends:
-    """Functions of q, v, p, t and the parameters that are no parts of inputs, at the beginning or the end of a step."""
+    """Functions of q, v, p, t and the parameters, without inputs, at the beginning or the end of a step."""
 
     ca: Any
     system: MechanicalSystem
 
     @cached_property
     def symbols(self) -> tuple[Symbol, ...]:
-        """What formulas may have in them."""
+        """Symbols that formulas may contain."""
         system = self.system
         return (*system.coordinates, *system.velocities, *system.momentum_symbols, system.time, *own_parameters(system))
 
     def formula(self, text: str) -> Any:
-        """A formula. Raises ExpressionError for one outside the grammar."""
+        """Return a formula as a function; raises ExpressionError for one outside the grammar."""
         return self._function(read([text], self.symbols))
 
     @cached_property
     def legendre(self) -> Any:
-        """What vanishes where v and p belong together: p - L_v, or v - H_p of a Hamiltonian.
+        """Residual of the Legendre transform: p - L_v, or v - H_p for a Hamiltonian.
 
         Raises:
-            MethodError: where they do so by an input, as which they would jump.
+            MethodError: if it contains an input, at whose jumps it would be discontinuous.
         """
         forms, system = forms_of(self.system), self.system
         bound = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
@@ -53,10 +53,10 @@ class Ends:
 
     @cached_property
     def held(self) -> Any:
-        """What vanishes at a state on the constraints: their g of positions, and what they say of velocities.
+        """Residual of the constraints g(q) = 0 and of their time derivatives.
 
         Raises:
-            MethodError: where they have an input in them.
+            MethodError: if they contain an input.
         """
         found = [each for each in (*positions_held(self.system), *constraint_rates(self.system)) if each != 0]
         if any(each.free_symbols - {*self.symbols} for each in found):
@@ -64,21 +64,21 @@ class Ends:
         return self._function(found)
 
     def momentum(self, q: Any, v: Any, t: Any, parameters: Any) -> Any:
-        """P of a velocity: exact unless H is not quadratic in p, when it is a first guess."""
+        """Return the momentum of a velocity: exact if H is quadratic in p, otherwise an initial guess."""
         return self._updated("by_p", q=q, v=v, p=self.ca.DM.zeros(*q.shape), t=t, parameters=parameters)
 
     def velocity(self, q: Any, p: Any, t: Any, parameters: Any) -> Any:
-        """V of a momentum: exact unless L is not quadratic in v, when it is a first guess."""
+        """Return the velocity of a momentum: exact if L is quadratic in v, otherwise an initial guess."""
         return self._updated("by_v", q=q, v=self.ca.DM.zeros(*q.shape), p=p, t=t, parameters=parameters)
 
     def _updated(self, slopes: str, **values: Any) -> Any:
-        """What one update of Newton's iteration makes of 0."""
+        """Return the result of one Newton update from 0."""
         found = self._slopes(**values)
         return -self.ca.solve(found[slopes], found["residual"], "qr")
 
     @cached_property
     def _slopes(self) -> Any:
-        """The residual of :attr:`legendre`, and its derivatives by v and by p."""
+        """Residual of :attr:`legendre`, and its derivatives with respect to v and p."""
         given = self.legendre.sx_in()
         residual = self.legendre(*given)
         results = [residual, *(self.ca.jacobian(residual, given[place]) for place in (1, 2))]
@@ -93,19 +93,19 @@ class Ends:
 
 
 def own_parameters(system: MechanicalSystem) -> Mapping[Symbol, float]:
-    """Default values of the parameters that are no parts of inputs."""
+    """Return the default values of the parameters that do not belong to inputs."""
     parts = input_parameters(system.inputs)
     return {name: value for name, value in system.constants.items() if name.name not in parts}
 
 
 def read(texts: Sequence[str], symbols: Sequence[Symbol]) -> list[Expr]:
-    """Formulas in symbols. Raises ExpressionError for one outside the grammar."""
+    """Return formulas as expressions in symbols; raises ExpressionError for one outside the grammar."""
     known = {each.name: each for each in symbols}
     return [parse_expression(text, known) for text in texts]
 
 
 def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Callable[..., list[Any]]:
-    """Expressions as a function of CasADi's symbols, common parts shared."""
+    """Return expressions as a function of CasADi's symbols, with common subexpressions shared."""
     names = {name: getattr(ca, name) for name in FUNCTIONS}
     constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
     given: dict[str, Any] = {"modules": [names | constants], "cse": True, "dummify": True}  # a symbol may be called e

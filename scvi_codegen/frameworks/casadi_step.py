@@ -1,8 +1,8 @@
-"""A step for CasADi, not solved: its equations as constraints of a nonlinear program, differentiated by CasADi.
+"""Stage equations of a step as CasADi expressions: constraints of a nonlinear program, differentiated by CasADi.
 
-The stage equations of a method (:mod:`scvi_codegen.methods.stage_system`) are kernels and tables; here they are written
-in CasADi's scalar symbols, so that Jacobians and Hessians of any order are exact and sparse, and its maps, root finders
-and code generation apply.
+The stage equations of a method (:mod:`scvi_codegen.methods.stage_system`) are kernels and tables; here they are
+evaluated with CasADi's scalar symbols, so that Jacobians and Hessians of any order are exact and sparse, and its maps,
+root finders and code generation apply.
 """
 
 from __future__ import annotations
@@ -30,37 +30,37 @@ __all__ = ["casadi_step", "straight"]
 ARGUMENTS = ("q", "p", "stages", "inputs", "parameters", "t", "h")
 RESULTS = ("q1", "p1", "residual", "along", "integrals")
 HIGHEST = len(PARTS) - 2
-"""Degree of inputs, which are cubics in compiled steps."""
+"""Highest degree of inputs within a step; compiled steps have cubics."""
 
 
 @takes(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
 def casadi_step(
     system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
 ) -> Any:
-    """One step as equations, a ``casadi.Function``: constraints of a nonlinear program, or of a root finder.
+    """Return one step as equations, a ``casadi.Function``: constraints of a nonlinear program or a root finder.
 
-    The step from (q, p) at t to t + h ends at q1 and p1 where the residual is 0; its unknowns are the stages. Nothing
-    is solved or compiled; everything has exact derivatives of any order, and IPOPT takes the Hessian as it is.
+    The step from (q, p) at t to t + h ends at q1 and p1 if the residual is 0; the unknowns are the stages. Nothing is
+    solved or compiled; everything has exact derivatives of any order, and IPOPT can use the exact Hessian.
 
     Args:
-        system: a Lagrangian or a Hamiltonian.
-        method: or its name.
-        degree: of the inputs within the step, 0 (held) to 3.
-        along: formulas in coordinates, velocities (momenta of a Hamiltonian, too), inputs, parameters and t, taken at
-            the g points of the method's quadrature.
-        solved: let CasADi's Newton iteration solve the equations at each call, to 1e-12: the step is then a map without
-            stages and residual, that has second derivatives, too. A call fails where they are not solved.
+        system: Lagrangian or Hamiltonian system.
+        method: method, or its name.
+        degree: degree of the inputs within the step, 0 (constant) to 3.
+        along: formulas in coordinates, velocities (for a Hamiltonian also momenta), inputs, parameters and t, evaluated
+            at the g points of the method's quadrature.
+        solved: solve the equations by CasADi's Newton method at each call, to 1e-12: the step is then a map without
+            stages and residual, also with second derivatives. A call fails if they are not solved.
 
     Returns:
-        A ``casadi.Function`` by place or by name of q (m), p (m), stages (s), inputs (k, degree + 1) in Bernstein's
-        form (a polynomial stays between the least and the largest of its coefficients, the first and last of which are
-        its values at the ends), parameters (those that are no parts of inputs), t and h. Its values are q1 (m), p1 (m),
-        residual (s), along (texts, g), and integrals (texts), their quadratures over the step.
+        A ``casadi.Function`` by position or by name of q (m), p (m), stages (s), inputs (k, degree + 1) in Bernstein
+        form (a polynomial lies between its least and largest coefficient, the first and last of which are its values at
+        the ends), parameters (without those of inputs), t and h. Its values are q1 (m), p1 (m), residual (s), along
+        (formulas, g), and integrals (formulas), their quadratures over the step.
 
     Raises:
         ExpressionError: for a formula outside the grammar.
-        MethodError: for a method that does not serve the system, or that has no quadrature along a curve where
-            formulas are to be taken; for a system in transformed time, for degrees above 3.
+        MethodError: for a method that does not apply to the system, formulas with a method without quadrature along a
+            curve, a system in transformed time, and degrees above 3.
         MissingLibraryError: without CasADi (extra ``casadi``).
 
     Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, ESAIM: COCV 17 (2011) 322; C. M. Campos, S. Ober-Bloebaum,
@@ -81,7 +81,7 @@ def casadi_step(
 
 
 def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
-    """A guess of each block of unknowns: the straight line from (q, p) with a velocity."""
+    """Return an initial guess of each block of unknowns: the straight line from (q, p) with velocity v."""
     return [
         float(block.straight[0]) * q + float(block.straight[1]) * h ** (1 - block.power) * v + block.momentum * p
         if block.size is None
@@ -91,7 +91,7 @@ def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
 
 
 def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
-    """The step with its equations solved, of the same arguments and results without the stages."""
+    """Return the step with its equations solved, without the argument stages and the result residual."""
     symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
     unknowns = symbols.pop("stages")
     equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
@@ -105,7 +105,7 @@ def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
 
 
 class _Written:
-    """A stage system in symbols of CasADi: gathered into arguments, these into kernels, results into rows."""
+    """Stage system in CasADi's symbols: gather arguments, evaluate kernels, scatter results into rows."""
 
     def __init__(self, ca: Any, system: MechanicalSystem, stages: StageSystem, degree: int) -> None:
         self.ca, self.system, self.stages = ca, system, stages
@@ -119,7 +119,7 @@ class _Written:
         self.columns = ((0, self.q), *zip(powers, blocks, strict=True))
 
     def rows(self) -> list[Any]:
-        """The residuals of all rows, and p1."""
+        """Return the residuals of all rows, and p1."""
         sizes = self.stages.row_sizes(self.system.dimension)
         momenta = (*(row.momentum for row in self.stages.rows), self.stages.end_momentum)
         powers = (*(row.power for row in self.stages.rows), 0)
@@ -137,21 +137,21 @@ class _Written:
         return [*rows[:-1], rows[-1] / self._growth(1)]
 
     def _growth(self, abscissa: Any) -> Any:
-        """What damping makes of a weight at a point of the step: e^(gamma c h) of it."""
+        """Return the factor e^(gamma c h) of the weight at abscissa c in a system with damping gamma."""
         if self.stages.damping == 0:
             return 1.0
         rate = numeric(self.ca, [self.stages.damping], tuple(own_parameters(self.system)))
         return self.ca.exp(float(abscissa) * rate(*self.ca.vertsplit(self.parameters))[0] * self.h)
 
     def end_position(self) -> Any:
-        """q1."""
+        """Return q1."""
         return self._gathered(self.stages.end_position, 0, power=0, scale=1.0)
 
     def along(self, texts: Sequence[str]) -> tuple[Any, Any]:
-        """Values of formulas at the points of the quadrature, and its weights.
+        """Return the values of formulas at the points of the quadrature, and its weights.
 
         Raises:
-            MethodError: where the action is no quadrature of L along a curve.
+            MethodError: if the action is not a quadrature of L along a curve.
         """
         system = self.system
         families = [family for family in self.stages.families if family.in_action]
@@ -175,18 +175,18 @@ class _Written:
         return self.ca.horzcat(*columns), self.ca.SX(weights)
 
     def _kernel(self, family: PointFamily) -> Callable[..., list[Any]]:
-        """Results by arguments, time and all parameters, inputs counted from the time of the point itself."""
+        """Return results as a function of arguments, time and parameters, inputs expanded at the point's time."""
         from_here = {symbol(f"{name}_t"): self.system.time for name in self.system.inputs}
         results = [result.xreplace(from_here) for result in family.results]
         return numeric(self.ca, results, (*family.arguments, self.system.time, *self.system.parameters))
 
     def _arguments(self, family: PointFamily, n: int) -> list[Any]:
-        """Of the kernel of a family at its point n."""
+        """Return the arguments of the kernel of a stage group at its point n."""
         parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in family.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 
     def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:
-        """A line of a table times q and the stages."""
+        """Return the product of a row of a table with q and the stages."""
         terms = [
             scale * float(entry) * self.h ** (power + own) * values
             for entry, (own, values) in zip(table.entries[n], self.columns, strict=True)
@@ -198,7 +198,7 @@ class _Written:
         return self.t + float(abscissa) * self.h
 
     def _surroundings(self, abscissa: Any) -> list[Any]:
-        """Time at a point of the step, and all parameters of the system there."""
+        """Return the time at a point of the step, and all parameters of the system there."""
         time = self._time(abscissa)
         values = dict(zip(own_parameters(self.system), self.ca.vertsplit(self.parameters), strict=True))
         for name, parts in zip(self.system.inputs, self._input_parts(float(abscissa)), strict=True):
@@ -206,7 +206,7 @@ class _Written:
         return [time, *(values[name] for name in self.system.parameters)]
 
     def _input_parts(self, c: float) -> list[list[Any]]:
-        """Coefficients by power of time since the point c, of each input."""
+        """Return the coefficients of each input in powers of the time since the point c."""
         degree, differences, found = self.inputs.shape[1] - 1, self.inputs, []
         for power in range(HIGHEST + 1):
             left, values = degree - power, self.ca.SX.zeros(self.inputs.shape[0], 1)

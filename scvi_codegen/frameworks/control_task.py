@@ -1,7 +1,7 @@
-"""A task of optimal control as a nonlinear program: what is unknown, what binds it, and what it is at first.
+"""Optimal control problem as a nonlinear program: unknowns, constraints, cost and initial guess.
 
-Unknown are the states (q, p) between steps, the stages and inputs of each step, the velocities at both ends, and the
-duration. Maps of one step keep the program small: CasADi differentiates a step, not the motion.
+Unknowns are the states (q, p) between steps, the stages and inputs of each step, the velocities at both ends, and the
+duration. The program is a map of one step, so that CasADi differentiates a step and not the trajectory.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["Conditions", "Task", "check_known", "interval"]
 
 ZERO = 1e-16
-"""Beside the largest of a coordinate or momentum along the motion: rounding, of which constraints would be asked."""
+"""Relative size below which components of the result are set to 0; constraints would otherwise be violated."""
 
 Conditions = Mapping[str, Any]
-"""Formulas, and the number that each is, or the least and the largest, ``None`` where there is none."""
+"""Formulas with their values, or with least and largest value, ``None`` for no bound."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is asked for (:func:`~scvi_codegen.frameworks.optimal_control.optimal_control` says what each is)."""
+    """Optimal control problem, as described in :func:`~scvi_codegen.frameworks.optimal_control.optimal_control`."""
 
     ca: Any
     system: MechanicalSystem
@@ -53,11 +53,11 @@ class Task:
 
     @property
     def between(self) -> dict[str, tuple[float, float]]:
-        """The bounds that are not those of inputs."""
+        """Bounds on formulas other than inputs."""
         return {text: interval(text, value) for text, value in self.bounds.items() if text not in self.system.inputs}
 
     def program(self) -> NonlinearProgram:
-        """The residuals of the steps first, whose multipliers are slopes of the cost."""
+        """Return the nonlinear program; the step equations come first, as their multipliers are the costates."""
         ca, m, n, own = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
         step = casadi_step(self.system, self.method, degree=self.degree, along=[self.cost, *self.between])
         self._check_degree(step.size2_out("along"))
@@ -87,7 +87,7 @@ class Task:
         )
 
     def _check_degree(self, points: int) -> None:
-        """A quadrature of so many points must see all of an input's coefficients."""
+        """Raise MethodError unless the quadrature has more points than the degree of the inputs."""
         if self.degree >= points:
             raise MethodError(
                 f"inputs of degree {self.degree} have {self.degree + 1} coefficients a step, which the {points} points "
@@ -95,12 +95,12 @@ class Task:
             )
 
     def _input_limits(self) -> tuple[Array, Array]:
-        """Least and largest, a line an input."""
+        """Return least and largest values, a row for each input."""
         found = [interval(name, self.bounds.get(name, (None, None))) for name in self.system.inputs]
         return np.array([[least] for least, _ in found]), np.array([[largest] for _, largest in found])
 
     def _at_end(self, side: Sequence[Any], conditions: Conditions) -> Iterator[tuple[Any, float, float]]:
-        """What binds velocities and momenta there, and the conditions."""
+        """Yield the Legendre transform and the conditions at one end."""
         yield self.ends.legendre(*side), 0.0, 0.0
         for text, value in conditions.items():
             yield self.ends.formula(text)(*side), *interval(text, value)
@@ -111,7 +111,7 @@ class Task:
         return Ends(self.ca, self.system)
 
     def first(self, guess: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of all unknowns: positions as guessed, momenta and stages as these move."""
+        """Return initial values of all unknowns: positions as guessed, momenta and stages computed from them."""
         system, n = self.system, self.steps
         names = [q.name for q in system.coordinates]
         check_known(guess, (*names, *system.inputs, "duration"), "coordinate or input")
@@ -133,13 +133,13 @@ class Task:
         }
 
     def _between_ends(self, name: str) -> list[float]:
-        """Of a coordinate at both ends as far as conditions tell, else the same as at the other, or 0."""
+        """Return the values of a coordinate at both ends as the conditions determine them, or 0."""
         limits = [interval(name, side[name]) for side in (self.start, self.end) if name in side]
         known = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
         return known if len(known) == 2 else (known or [0.0]) * 2
 
     def motion(self, program: NonlinearProgram, found: Any, stats: Mapping[str, Any]) -> ControlledMotion:
-        """What was found, with the multipliers of the steps' equations as slopes of the cost."""
+        """Return the solution, with the multipliers of the step equations as costates."""
         m, n = self.system.dimension, self.steps
         values = program.split(found["x"])
         states = values["states"]
@@ -163,10 +163,10 @@ class Task:
 
 
 def interval(name: str, value: Any) -> tuple[float, float]:
-    """Least and largest of a condition or bound.
+    """Return least and largest value of a condition or bound.
 
     Raises:
-        StateError: for anything but a number or two in order.
+        StateError: unless it is a number or two numbers in ascending order.
     """
     if not isinstance(value, tuple | list):
         number = checked_number(value, name)
@@ -181,14 +181,14 @@ def interval(name: str, value: Any) -> tuple[float, float]:
 
 
 def check_known(given: Mapping[str, Any], known: Sequence[str], what: str) -> None:
-    """Raise :class:`StateError` for a name that is not among those known."""
+    """Raise :class:`StateError` for a name that is not known."""
     for name in given:
         if name not in known:
             raise StateError(f"there is no {what} '{name}'{closest(name, known)} There are: {', '.join(known)}")
 
 
 def _resampled(name: str, values: Any, at: Array) -> Array:
-    """Values at equal times of [0, 1], or one for all, at others by lines."""
+    """Return values at equidistant points of [0, 1], or one number, interpolated linearly at ``at``."""
     own = np.atleast_1d(real_array(values, f"the guess of {name}"))
     if own.ndim != 1 or not np.isfinite(own).all():
         raise StateError(f"the guess of {name} is a finite number, or a list of them from start to end")

@@ -1,4 +1,4 @@
-"""What optimal control gives: a motion of the integrator, the inputs that steer it, and what they cost."""
+"""Result of optimal control: a trajectory of the integrator, its inputs and their cost."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ __all__ = ["ControlledMotion"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControlledMotion:
-    """A motion of n steps and its inputs.
+    """Trajectory of n steps with its inputs.
 
     Attributes:
         t, q, p: (n + 1,), (n + 1, m), (n + 1, m) times and states, those of the integrator with these inputs.
-        coefficients: (n, degree + 1) of each input by name, in Bernstein's form, one line a step.
+        coefficients: (n, degree + 1) of each input by name, in Bernstein form, one row a step.
         coordinates: names.
-        cost: what was least: the integral and the cost of the end.
-        costates: (n, 2 m) slopes of the cost that is still to come by q and p, at all times but the first.
-        iterations, status, solved: of IPOPT, and what it said.
-        unknowns, equations: how many the nonlinear program has, inequalities and conditions of the ends among these.
+        cost: minimum of the cost: the integral and the cost of the end.
+        costates: (n, 2 m) derivatives of the remaining cost with respect to q and p, at all times but the first.
+        iterations, status, solved: iterations of IPOPT, its return status, and True on success.
+        unknowns, equations: size of the nonlinear program; inequalities and end conditions count as equations.
     """
 
     t: Array
@@ -44,19 +44,19 @@ class ControlledMotion:
 
     @property
     def h(self) -> float:
-        """The length of the steps."""
+        """Step size."""
         return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))
 
     @property
     def inputs(self) -> dict[str, PPoly]:
-        """The inputs as functions of time, which :meth:`Stepper.drive` takes."""
+        """Inputs as functions of time, in the form that :meth:`Stepper.drive` takes."""
         from scipy.interpolate import BPoly, PPoly  # here: slow to import
 
         return {name: PPoly.from_bernstein_basis(BPoly(own.T, self.t)) for name, own in self.coefficients.items()}
 
     @property
     def guess(self) -> dict[str, Any]:
-        """Positions, inputs (their means over steps) and duration, to begin with when more is asked for."""
+        """Positions, mean inputs of the steps and duration: an initial guess for a further problem."""
         found: dict[str, Any] = dict(zip(self.coordinates, self.q.T, strict=True))
         found |= {name: own.mean(axis=1) for name, own in self.coefficients.items()}
         return {**found, "duration": float(self.t[-1] - self.t[0])}

@@ -1,4 +1,4 @@
-"""What a flow is in any framework: so many steps as a function of (q, p, parameters, t, h)."""
+"""Flow map, independent of the framework: a number of steps as a function of (q, p, parameters, t, h)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["Flow", "imported"]
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """So many steps of a stepper.
+    """Fixed number of steps of a stepper.
 
     Attributes:
-        stepper: system and method.
-        steps: how many.
-        every: steps between kept states, the first of which is the initial one; 0 where only the end is wanted.
+        stepper: compiled stepper.
+        steps: number of steps.
+        every: steps between saved states, the first of which is the initial one; 0 to return only the final state.
     """
 
     stepper: Stepper
@@ -32,11 +32,11 @@ class Flow:
 
     @classmethod
     def checked(cls, stepper: Stepper, steps: int, every: int | None) -> Self:
-        """From what users give.
+        """Return a flow for arguments of users.
 
         Raises:
-            MethodError: for a stepper that has no derivatives, or whose steps are not all of h.
-            StateError: for numbers of steps that are none, or do not fit.
+            MethodError: for a stepper without derivatives or without fixed steps.
+            StateError: for invalid numbers of steps.
         """
         stepper.check_steps_of_h("a flow")
         steps = checked_count(steps, "steps", least=1)
@@ -46,41 +46,41 @@ class Flow:
         return cls(stepper, steps, every)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (type(self), (self.stepper, self.steps, self.every))  # not what this process knows of it
+        return (type(self), (self.stepper, self.steps, self.every))  # without cached libraries
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>"
 
     @property
     def spacing(self) -> int:
-        """Steps between kept states in C, where there are always some."""
+        """Steps between saved states in C, which always saves the final one."""
         return self.every or self.steps
 
     @property
     def kept(self) -> int:
-        """Number of these states."""
+        """Number of saved states."""
         return self.steps // self.spacing + 1
 
     @property
     def derivatives(self) -> Source:
-        """The C text with derivatives of steps."""
+        """C source with derivatives of steps."""
         source = self.stepper.derivatives
         assert source is not None
         return source
 
     @property
     def second_derivatives(self) -> Source:
-        """The same with second derivatives; MethodError where there are none."""
+        """C source with first and second derivatives; raises MethodError if there are none."""
         self.stepper.curvature  # noqa: B018
         source = self.stepper.second_derivatives
         assert source is not None
         return source
 
     def parameter_values(self, parameters: Any) -> Any:
-        """All in order: a list of numbers and whatever stood in a mapping, or, not given by name, as they are.
+        """Return all parameters in order as a list, or, unless passed by name, unchanged.
 
         Raises:
-            StateError: for unknown names, and inputs that are not given.
+            StateError: for unknown names, and missing inputs.
         """
         interface = self.stepper.interface
         check_inputs_given(interface, parameters)
@@ -93,7 +93,7 @@ class Flow:
 
 
 def imported(library: str, extra: str) -> Any:
-    """A library; MissingLibraryError without it, which names the extra."""
+    """Import a library; raise MissingLibraryError, which names the extra, if it is not installed."""
     try:
         return importlib.import_module(library)
     except ImportError as error:

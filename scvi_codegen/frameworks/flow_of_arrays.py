@@ -1,4 +1,4 @@
-"""A flow as a function of the arrays of a framework: what of it is the same in all of them."""
+"""Flow map as a function of the arrays of a framework."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ __all__ = ["ArrayFlow", "Arrays"]
 
 
 class Arrays(Protocol):
-    """What a flow asks of the arrays of a framework, beside their shapes and indices."""
+    """Array operations of a framework that a flow needs."""
 
     def binary64(self, value: Any, name: str) -> Any:
-        """An array; StateError for numbers of fewer digits, to which a flow would be rounded without a word."""
+        """Return an array in double precision; raise StateError for lower precision."""
 
     def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """The array in a shape that its own fits."""
+        """Return the array broadcast to a shape."""
 
     def joined(self, parts: Sequence[Any]) -> Any:
-        """(.., n) arrays, one behind the other along the last axis."""
+        """Concatenate (.., n) arrays along the last axis."""
 
 
 class ArrayFlow(Flow):
-    """The states of a motion, as a function that a framework differentiates."""
+    """States of a trajectory as a differentiable function of a framework."""
 
     @property
     @abstractmethod
     def _arrays(self) -> Arrays:
-        """Those of the framework."""
+        """Array operations of the framework."""
 
     @abstractmethod
     def _along(self, x: Any) -> Any:
-        """(.., kept, 2m) states of the flows from (.., given) numbers each."""
+        """Return (.., saved, 2m) states of the flows from (.., n) arguments each."""
 
     @takes(StateError)
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
-        """States at the end, or where every so-many-th is kept, at these.
+        """Return the final state, or with ``every`` all saved states.
 
         Args:
-            q, p: (.., m) initial positions and momenta. Leading axes are broadcast against each other. Where there are
-                constraints, states off them are taken as they are, and the first step leads to them.
-            h: (..) step.
+            q, p: (.., m) initial positions and momenta. Leading axes are broadcast. States that violate the constraints
+                are not projected; the first step moves them onto the constraint manifold.
+            h: (..) step size.
             t: (..) initial time.
-            parameters: by name, (..) each, others keeping their defaults; or (.., k) in order.
+            parameters: by name, (..) each, others keep their defaults; or (.., k) in order.
 
         Returns:
             (q, p), (.., m) each; with ``every`` (.., n, m).
@@ -71,7 +71,7 @@ class ArrayFlow(Flow):
         return found[..., :m], found[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:
-        """(.., 1)."""
+        """Return a number as an array (.., 1)."""
         return self._arrays.binary64(value, name)[..., None]
 
     def _vector(self, value: Any, length: int, name: str) -> Any:
@@ -81,7 +81,7 @@ class ArrayFlow(Flow):
         return array
 
     def _beside(self, *parts: Any) -> Any:
-        """(.., n) arrays, one behind the other."""
+        """Broadcast (.., n) arrays and concatenate them along the last axis."""
         try:
             batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""A flow of many rows of numbers in compiled C, for frameworks that call it with arrays."""
+"""Flow map of many rows of numbers in compiled C, for frameworks that call it with arrays."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["FlowOfRows"]
 
 
 class FlowOfRows(Flow):
-    """A flow with its C functions."""
+    """Flow with its compiled C functions."""
 
     @cached_property
     def library(self) -> Binding:
-        """Values and derivatives, compiled when first asked for."""
+        """Values and derivatives, compiled on first use."""
         source = with_flow_of_rows(self.derivatives)
         return Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     @cached_property
     def second_library(self) -> Binding:
-        """The same with second derivatives."""
+        """Values and derivatives up to second order, compiled on first use."""
         source = with_flow_of_rows(self.second_derivatives, second=True)
         return Binding(building.load(source, flags=self.stepper.flags), source.prefix)

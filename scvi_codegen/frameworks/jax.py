@@ -1,4 +1,4 @@
-"""A flow for JAX: called by XLA in C, with derivatives forward and back, batches, and compilation."""
+"""Flow map for JAX: a C function called by XLA, with JVP, VJP, batches and compilation."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _registered: set[str] = set()
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper))
 def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFlow:
-    """So many steps of a stepper as a function of JAX.
+    """Return a fixed number of steps of a stepper as a function of JAX.
 
-    It is compiled C that XLA calls itself, without Python: ``jit``, ``vmap``, ``grad``, ``jvp``, ``vjp``, ``jacfwd``
-    and ``jacrev`` apply, in any order, on processors (not on GPUs) and in binary64 (``jax_enable_x64``). Derivatives
-    are exact, those of the computed map: forward by the linearised steps, back by their transpose; both take memory
-    for all states of one trajectory. Second ones are those of ``jax.hessian``, ``jacfwd`` or ``jacrev`` of a gradient
-    or of ``jacrev``; there are none forward of forward.
+    XLA calls the compiled C directly, without Python: ``jit``, ``vmap``, ``grad``, ``jvp``, ``vjp``, ``jacfwd`` and
+    ``jacrev`` apply, in any order, on CPUs (not on GPUs) and in binary64 (``jax_enable_x64``). Derivatives are those of
+    the computed map, exact up to round-off: JVPs by the linearised steps, VJPs by their transpose; both store all
+    states of one trajectory. Second derivatives are available as ``jax.hessian``, ``jacfwd`` or ``jacrev`` of a
+    gradient or of ``jacrev``; forward over forward is not.
 
     Args:
-        stepper: system and method.
-        steps: how many.
-        every: keep every so-many-th state and the initial one; by default that at the end alone.
+        stepper: compiled stepper.
+        steps: number of steps.
+        every: save the initial state and every ``every``-th one; by default only the final state.
 
     Raises:
-        MethodError: in transformed time, and where a monitor chooses the steps.
+        MethodError: in transformed time, and for steps of a time-rescaling function.
         MissingLibraryError: without JAX (extra ``jax``).
-        StateError: for steps that are no multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``every``.
     """
     flow = JaxFlow.checked(stepper, steps, every)
     imported("jax", "jax")
@@ -46,15 +46,15 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
 
 
 class JaxFlow(ArrayFlow):
-    """The states of a motion, as a function that JAX differentiates."""
+    """States of a trajectory as a function that JAX differentiates."""
 
     @property
     def _arrays(self) -> Arrays:
-        """See :attr:`ArrayFlow._arrays`."""
+        """Array operations of JAX."""
         return _JaxArrays()
 
     def _along(self, x: Any) -> Any:
-        """See :meth:`ArrayFlow._along`."""
+        """Return the saved states; see :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.jax_primitives import states_along
 
         size = 2 * self.stepper.dimension
@@ -62,7 +62,7 @@ class JaxFlow(ArrayFlow):
 
     @cached_property
     def _target(self) -> str:
-        """The name under which XLA knows the C functions, compiled and registered when first asked for."""
+        """Name under which the C functions are registered with XLA; compiled and registered on first use."""
         import jaxlib
 
         from scvi_codegen.frameworks.jax_primitives import SECOND
@@ -73,7 +73,7 @@ class JaxFlow(ArrayFlow):
 
     @cached_property
     def _second_target(self) -> str:
-        """The same of second derivatives, which are derived when JAX first asks for them."""
+        """Name of the second derivatives, which are compiled when JAX first needs them."""
         import jaxlib
 
         return self._registered(with_xla_flow(self.second_derivatives, jaxlib.__version__, second=True), [XLA_SECOND])
@@ -94,10 +94,10 @@ class JaxFlow(ArrayFlow):
 
 
 class _JaxArrays:
-    """Arrays of JAX."""
+    """Array operations of JAX."""
 
     def binary64(self, value: Any, name: str) -> Any:
-        """See :meth:`Arrays.binary64`."""
+        """Return an array in double precision; see :meth:`Arrays.binary64`."""
         import jax
         import jax.numpy as jnp
 
@@ -111,13 +111,13 @@ class _JaxArrays:
         return array.astype(jnp.float64)
 
     def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """See :meth:`Arrays.expanded`."""
+        """Return the array broadcast to a shape; see :meth:`Arrays.expanded`."""
         import jax.numpy as jnp
 
         return jnp.broadcast_to(array, shape)
 
     def joined(self, parts: Sequence[Any]) -> Any:
-        """See :meth:`Arrays.joined`."""
+        """Concatenate along the last axis; see :meth:`Arrays.joined`."""
         import jax.numpy as jnp
 
         return jnp.concatenate(parts, axis=-1)

@@ -1,8 +1,8 @@
-"""The flow of JAX: four primitives that XLA calls in C, and the rules by which JAX transforms them.
+"""JAX primitives of the flow: four C functions that XLA calls, and their transformation rules.
 
-``states`` has the values; ``push``, linear in its second argument, is the derivative applied to changes, and ``pull``
-its transpose applied to slopes; ``bend``, linear in slopes and in changes, is how ``pull`` changes with the start.
-Changes and slopes have an axis of their own, of those that share a trajectory: the steps are then linearised once for
+``states`` computes the states; ``push``, linear in its second argument, is the JVP, and ``pull`` the VJP; ``bend``,
+linear in cotangents and in tangents, is the derivative of ``pull`` with respect to the start (Hessian-vector product).
+Tangents and cotangents have an axis of their own for those that share a trajectory: the steps are linearised once for
 all of them, so that a Jacobian costs far less than its columns one by one.
 """
 
@@ -23,23 +23,23 @@ __all__ = ["states_along"]
 
 STATIC = ("target", "steps", "every", "size")
 SECOND: dict[str, Callable[[], str]] = {}
-"""By the name of a target, what gives that of the one with second derivatives."""
+"""Functions that return the target with second derivatives, by name of the target."""
 
 
 def states_along(x: Any, *, target: str, steps: int, every: int, size: int) -> Any:
-    """(.., n, size) states from (.., given) numbers (q, p, parameters, t, h) through so many steps.
+    """Return (.., n, size) states of ``steps`` steps from (.., k) numbers (q, p, parameters, t, h).
 
     Args:
-        x: where they start.
-        target: the C functions are registered under this name with ``_states``, ``_push`` and ``_pull`` behind it.
-        steps, every: how many, and how many between kept states.
+        x: initial values.
+        target: name under which the C functions are registered, with the suffixes ``_states``, ``_push`` and ``_pull``.
+        steps, every: number of steps, and of steps between saved states.
         size: 2m.
     """
     return STATES.bind(x, target=target, steps=steps, every=every, size=size)
 
 
 def _primitive(part: str, shape: Callable[..., tuple[int, ...]], batched: Callable[..., Any]) -> Primitive:
-    """One that XLA calls in C on processors; ``shape`` is that of its result."""
+    """Return a primitive that XLA calls in C on CPUs; ``shape`` is that of its result."""
     primitive = Primitive(f"scvi_flow_{part}")
 
     def called(*arguments: Any, target: str, steps: int, every: int, size: int) -> Any:
@@ -61,7 +61,7 @@ def _states_batched(arguments: Sequence[Any], axes: Sequence[int], **static: Any
 
 
 def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[Any, int]]:
-    """Each with a trajectory of its own, or all that share one beside each other."""
+    """Return a batching rule: each element has its own trajectory, or all share one and are stacked."""
 
     def batched(arguments: Sequence[Any], axes: Sequence[Any], **static: Any) -> tuple[Any, int]:
         count = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
@@ -81,7 +81,7 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
 
 
 def _repeated(given: Any, count: int, place: int) -> Any:
-    """With an axis of so many that are all the same."""
+    """Return the array repeated along a new axis of length ``count``."""
     return jnp.broadcast_to(jnp.expand_dims(given, place), (*given.shape[:place], count, *given.shape[place:]))
 
 
@@ -139,7 +139,7 @@ def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
 
 
 def _bend_transposed(slopes: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
-    """By changes it is its own transpose: second derivatives are symmetric."""
+    """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
     if ad.is_undefined_primal(own):
         raise MethodError("a flow has no second derivatives forward of forward: take jacfwd or jacrev of jacrev")
     if type(slopes) is ad.Zero:

@@ -1,4 +1,4 @@
-"""A nonlinear program for IPOPT: unknowns by name, what they and the constraints are between, and what is least."""
+"""Nonlinear program for IPOPT: named unknowns, their bounds, constraints and cost."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["NonlinearProgram"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
+"""Options that suppress the output of IPOPT."""
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,11 @@ class NonlinearProgram:
     """Unknowns and constraints as symbols and expressions of CasADi, each a matrix.
 
     Attributes:
-        ca: CasADi.
-        unknowns: by name.
-        limits: of unknowns by name, the least and the largest; no others are bounded.
-        constraints: expression, least, largest.
-        cost: what is least.
+        ca: module ``casadi``.
+        unknowns: symbols by name.
+        limits: least and largest values of unknowns by name; other unknowns are unbounded.
+        constraints: expressions, each with least and largest value.
+        cost: expression to minimise.
     """
 
     ca: Any
@@ -35,7 +36,7 @@ class NonlinearProgram:
     cost: Any
 
     def solved(self, first: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        """What IPOPT finds from first values by name, and what it says of that."""
+        """Solve by IPOPT from initial values by name; return the solution and the solver's statistics."""
         program = {"x": self.x, "f": self.cost, "g": self.residual}
         solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
         low, high = (self._vector(self._limits(side)) for side in (0, 1))
@@ -44,7 +45,7 @@ class NonlinearProgram:
         return found, solver.stats()
 
     def split(self, vector: Any) -> dict[str, Array]:
-        """Values of the unknowns by name, each of its shape."""
+        """Return the values of the unknowns by name, each in its shape."""
         flat, found, begin = np.asarray(vector).ravel(), {}, 0
         for name, each in self.unknowns.items():
             found[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
@@ -53,12 +54,12 @@ class NonlinearProgram:
 
     @cached_property
     def x(self) -> Any:
-        """All unknowns, one after the other."""
+        """Vector of all unknowns."""
         return self.ca.veccat(*self.unknowns.values())
 
     @cached_property
     def residual(self) -> Any:
-        """All constraints."""
+        """Vector of all constraints."""
         return self.ca.veccat(*(expression for expression, _, _ in self.constraints))
 
     def _limits(self, side: int) -> dict[str, Any]:

@@ -1,7 +1,8 @@
-"""Optimal control by discrete mechanics: the equations of the steps are the constraints of a nonlinear program.
+"""Optimal control by discrete mechanics (DMOC): the step equations are the constraints of a nonlinear program.
 
-Unknown are the states (q, p) between steps, the stages and inputs of each step, and, where it is free, the duration.
-What is found is a motion of the variational integrator, step for step: momenta that no input touches are kept.
+Unknowns are the states (q, p) between steps, the stages and inputs of each step and, if free, the duration. The
+solution is a trajectory of the variational integrator, step for step: momentum maps on which no input acts are
+conserved.
 """
 
 from __future__ import annotations
@@ -56,34 +57,35 @@ def optimal_control(
     guess: Mapping[str, Any] | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> ControlledMotion:
-    """The inputs, and the motion, of least cost among those that fulfil conditions at both ends and bounds between.
+    """Minimise a cost over inputs, subject to the dynamics, conditions at both ends and bounds between.
 
-    A nonlinear program with exact sparse Hessian is given to IPOPT (by CasADi, extra ``casadi``). Conditions are
+    A nonlinear program with exact sparse Hessian is solved by IPOPT (through CasADi, extra ``casadi``). Conditions are
     ``{formula: number}`` or ``{formula: (least, largest)}``, with ``None`` for no bound.
 
     Args:
-        system: with inputs.
-        method: whose steps are taken, an SVI, SCVI or Gauss method, or its name.
-        steps: how many, equally long.
-        duration: of the motion; two numbers if it is to be found between them.
-        start, end: conditions in coordinates, velocities, momenta (``p_`` and the coordinate), t and parameters. Those
-            of a system with constraints hold beside: give what these leave open.
+        system: system with inputs.
+        method: an SVI, SCVI or Gauss method, or its name.
+        steps: number of steps of equal size.
+        duration: duration of the trajectory; two numbers, least and largest, to optimise it.
+        start, end: conditions in coordinates, velocities, momenta (``p_`` and the coordinate), t and parameters, in
+            addition to the constraints of the system: fix what these leave free.
         cost: formula in coordinates, velocities, inputs, parameters and t, integrated by the method's quadrature.
-        end_cost: the same without inputs, with momenta, of the end, added to the integral.
-        bounds: by name of an input, everywhere; of formulas as for the cost, at the points of the quadrature.
-        degree: of inputs within a step, 0 (held) to 3.
-        t: the time at the start.
-        parameters: values by name, others keeping their defaults.
-        guess: a number, or values at equal times from start to end, by name of a coordinate, an input or "duration"; by
-            default between conditions, 0 and halfway. A :attr:`ControlledMotion.guess` is one, with other steps, too.
-        options: of ``casadi.nlpsol``, as ``{"ipopt.max_iter": 500}``.
+        end_cost: formula without inputs, also with momenta, evaluated at the end and added to the integral.
+        bounds: by name of an input, everywhere; for formulas as in the cost, at the points of the quadrature.
+        degree: degree of inputs within a step, 0 (constant) to 3.
+        t: initial time.
+        parameters: values by name, others keep their defaults.
+        guess: initial guess by name of a coordinate, an input or "duration": a number, or values at equidistant times;
+            by default interpolated between conditions, 0 and the mean. A :attr:`ControlledMotion.guess` fits any number
+            of steps.
+        options: options of ``casadi.nlpsol``, as ``{"ipopt.max_iter": 500}``.
 
     Raises:
-        ControlError: if IPOPT finds none; its ``motion`` is the last that was tried.
+        ControlError: if IPOPT finds no solution; its ``motion`` is the last iterate.
         ExpressionError: for a formula outside the grammar.
-        MethodError: for systems without inputs, methods without a quadrature along a curve.
+        MethodError: for systems without inputs, and methods without a quadrature along a curve.
         MissingLibraryError: without CasADi.
-        StateError: for names that there are not, or bounds that are none.
+        StateError: for unknown names, or invalid bounds.
 
     Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, ESAIM: COCV 17 (2011) 322; C. M. Campos, S. Ober-Bloebaum,
     E. Trelat, Discrete and Continuous Dynamical Systems 35 (2015) 4193.
@@ -122,7 +124,7 @@ def _check_controllable(system: MechanicalSystem) -> None:
 
 
 def _checked_duration(given: float | tuple[float, float]) -> tuple[float, float]:
-    """The shortest and the longest."""
+    """Return the least and the largest duration."""
     shortest, longest = interval("duration", given)
     if not 0 < shortest <= longest < np.inf:
         raise StateError(f"a duration is a positive number, or two from the shortest to the longest, not {given}")

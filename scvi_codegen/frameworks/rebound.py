@@ -1,4 +1,4 @@
-"""Bodies that attract each other, from REBOUND and to it."""
+"""Conversion of gravitating bodies from and to REBOUND."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ __all__ = ["GravitatingBodies", "from_rebound", "to_rebound"]
 
 AXES = "xyz"
 NEWTON = ("basic", "compensated")
-"""What REBOUND calls plain attraction, summed over pairs."""
+"""REBOUND's names of pairwise gravity by direct summation."""
 AGREES = 1e-11
-"""Relative, of an attraction at places drawn at random."""
+"""Relative tolerance of the comparison of a Lagrangian with Newton's at random states."""
 
 Array = NDArray[np.float64]
 
 
 class GravitatingBodies(NamedTuple):
-    """What :func:`from_rebound` gives.
+    """Result of :func:`from_rebound`.
 
     Attributes:
-        system: of n bodies in 3n Cartesian coordinates x0, y0, z0, x1, ..; parameters G, m0, m1, ..
+        system: n bodies in 3n Cartesian coordinates x0, y0, z0, x1, ..; parameters G, m0, m1, ..
         q, velocity: (3n,) in the frame and the units of the simulation.
-        t: the time there.
-        units: names of the units of length, mass and time, empty where the simulation names none.
+        t: time of the simulation.
+        units: names of the units of length, mass and time, empty if the simulation names none.
     """
 
     system: LagrangianSystem
@@ -45,13 +45,13 @@ class GravitatingBodies(NamedTuple):
 
 
 def from_rebound(simulation: Any) -> GravitatingBodies:
-    """The bodies of a ``rebound.Simulation`` as a system of Newton's attraction, with their state.
+    """Return the bodies of a ``rebound.Simulation`` as a system of Newtonian gravity, with their state.
 
-    The value of G is the simulation's; numbers are taken as they are, in its inertial frame and its units. Names, radii
-    and the choice of an integrator are left behind.
+    G is the simulation's; numbers are unchanged, in its inertial frame and units. Names, radii and the choice of an
+    integrator are dropped.
 
     Raises:
-        SystemDefinitionError: for what is not attraction between masses: bodies without mass, softening, other forces,
+        SystemDefinitionError: for anything but gravity between masses: massless bodies, softening, additional forces,
             boundaries, collisions, variational particles.
     """
     imported("rebound", "rebound")
@@ -78,16 +78,16 @@ def from_rebound(simulation: Any) -> GravitatingBodies:
 
 @takes(SystemDefinitionError, system=of("a LagrangianSystem", LagrangianSystem))
 def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t: float = 0.0) -> Any:
-    """A ``rebound.Simulation`` of bodies that attract each other by Newton's law.
+    """Return a ``rebound.Simulation`` of bodies that attract each other by Newton's law.
 
-    G and the masses are read from the Lagrangian, at the values of its parameters (``system.with_parameters``),
-    whatever they are called there, to round-off. The simulation has IAS15, REBOUND's default, and no names of units:
-    they are the system's.
+    G and the masses are determined from the Lagrangian numerically, to round-off, for the values of its parameters
+    (``system.with_parameters``), whatever their names. The simulation uses IAS15, REBOUND's default, and no named
+    units: they are the system's.
 
     Args:
-        system: in Cartesian coordinates, body after body, of three axes, or two.
-        q, velocity: (3n,) or (2n,) of the bodies.
-        t: the time.
+        system: system in Cartesian coordinates, body after body, of three axes, or two.
+        q, velocity: (3n,) or (2n,) state of the bodies.
+        t: time.
 
     Raises:
         SystemDefinitionError: for any other system.
@@ -106,7 +106,7 @@ def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t
 
 
 def _check_plain(simulation: Any) -> None:
-    """SystemDefinitionError for what no Lagrangian of attraction between masses has."""
+    """Raise SystemDefinitionError for features other than gravity between masses."""
     particles = simulation.particles[: simulation.N]
     massless = [i for i, particle in enumerate(particles) if not particle.m > 0.0]
     oddities = {
@@ -125,7 +125,7 @@ def _check_plain(simulation: Any) -> None:
 
 
 def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
-    """(n, 3) of a flat state; the third axis of two is 0."""
+    """Return (n, 3) of a flat state; the third component of two-dimensional bodies is 0."""
     array = real_array(value, name)
     if array.shape != (bodies * axes,):
         raise StateError(f"{name} must have {bodies * axes} entries, {axes} a body, not the shape {array.shape}")
@@ -133,9 +133,9 @@ def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
 
 
 def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
-    """Axes of a body, G and the masses; SystemDefinitionError for a Lagrangian that is not theirs.
+    """Return the number of axes of a body, G and the masses; raise SystemDefinitionError for other Lagrangians.
 
-    They are what L is at some places with unit velocities and at rest, and hold if L is of that form at others, too.
+    They are fitted to L at random positions with unit velocities and at rest, and tested at other random states.
     """
     known = {*system.coordinates, *system.velocities, *system.constants}
     forced = system.forces or system.inputs or system.constraints
@@ -154,7 +154,7 @@ def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
 
 
 def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array]:
-    """G and the masses; a G of 0 where L has another form."""
+    """Return G and the masses; G = 0 if L has another form."""
     places, motions = np.random.default_rng(1).normal(size=(2, 4, m))
     rest = np.zeros(m)
     masses = np.array([2.0 * (formula(places[0], v) - formula(places[0], rest)) for v in np.eye(m)[::axes]])
@@ -169,6 +169,6 @@ def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tupl
 
 
 def _inverse_distances(places: Array, masses: Array) -> float:
-    """The sum over pairs of m m' / r."""
+    """Return the sum over pairs of m m' / r."""
     pairs = combinations(range(len(masses)), 2)
     return sum(float(masses[i] * masses[j] / np.linalg.norm(places[i] - places[j])) for i, j in pairs)

@@ -1,4 +1,4 @@
-"""A flow for PyTorch: compiled C with derivatives forward and back, of second order, too, and of batches."""
+"""Flow map for PyTorch: compiled C with JVP, VJP, second derivatives and batches."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ __all__ = ["TorchFlow", "torch_flow"]
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper))
 def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> TorchFlow:
-    """So many steps of a stepper as a differentiable function of PyTorch.
+    """Return a fixed number of steps of a stepper as a differentiable function of PyTorch.
 
-    It is compiled C, on processors and in binary64 (``dtype=torch.float64``): ``backward``, ``torch.func.grad``,
-    ``vjp``, ``jvp``, ``jacrev``, ``jacfwd``, ``hessian`` and ``vmap`` apply. Derivatives are exact, those of the
-    computed map; second ones, too, but for those forward of forward.
+    It is compiled C, on CPUs and in binary64 (``dtype=torch.float64``): ``backward``, ``torch.func.grad``, ``vjp``,
+    ``jvp``, ``jacrev``, ``jacfwd``, ``hessian`` and ``vmap`` apply. Derivatives are those of the computed map, exact up
+    to round-off, including second derivatives except forward over forward.
 
     Args:
-        stepper: system and method.
-        steps: how many.
-        every: keep every so-many-th state and the initial one; by default that at the end alone.
+        stepper: compiled stepper.
+        steps: number of steps.
+        every: save the initial state and every ``every``-th one; by default only the final state.
 
     Raises:
-        MethodError: in transformed time, and where a monitor chooses the steps.
+        MethodError: in transformed time, and for steps of a time-rescaling function.
         MissingLibraryError: without PyTorch (extra ``torch``).
-        StateError: for steps that are no multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``every``.
     """
     flow = TorchFlow.checked(stepper, steps, every)
     imported("torch", "torch")
@@ -39,25 +39,25 @@ def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Tor
 
 
 class TorchFlow(FlowOfRows, ArrayFlow):
-    """The states of a motion, as a function that PyTorch differentiates."""
+    """States of a trajectory as a function that PyTorch differentiates."""
 
     @property
     def _arrays(self) -> Arrays:
-        """See :attr:`ArrayFlow._arrays`."""
+        """Tensor operations of PyTorch."""
         return _Tensors()
 
     def _along(self, x: Any) -> Any:
-        """See :meth:`ArrayFlow._along`."""
+        """Return the saved states; see :meth:`ArrayFlow._along`."""
         from scvi_codegen.frameworks.torch_functions import StatesAlong
 
         return StatesAlong.apply(x, self)
 
 
 class _Tensors:
-    """Tensors of PyTorch."""
+    """Tensor operations of PyTorch."""
 
     def binary64(self, value: Any, name: str) -> Any:
-        """See :meth:`Arrays.binary64`."""
+        """Return a tensor in double precision; see :meth:`Arrays.binary64`."""
         import torch
 
         tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
@@ -70,11 +70,11 @@ class _Tensors:
         return tensor.to(torch.float64)
 
     def expanded(self, array: Any, shape: tuple[int, ...]) -> Any:
-        """See :meth:`Arrays.expanded`."""
+        """Return the tensor broadcast to a shape; see :meth:`Arrays.expanded`."""
         return array.expand(shape)
 
     def joined(self, parts: Sequence[Any]) -> Any:
-        """See :meth:`Arrays.joined`."""
+        """Concatenate along the last axis; see :meth:`Arrays.joined`."""
         import torch
 
         return torch.cat(list(parts), dim=-1)

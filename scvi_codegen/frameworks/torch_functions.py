@@ -1,8 +1,8 @@
-"""The flow of PyTorch: four functions in C, and the rules by which PyTorch differentiates and maps them.
+"""PyTorch functions of the flow: four C functions, and their rules of differentiation and batching.
 
-``StatesAlong`` has the values; ``Push``, linear in its second argument, is the derivative applied to changes, ``Pull``
-its transpose applied to slopes, ``Bend``, linear in slopes and in changes, how ``Pull`` changes with the start. Changes
-and slopes have an axis of their own, of those that share a trajectory.
+``StatesAlong`` computes the states; ``Push``, linear in its second argument, is the JVP, ``Pull`` the VJP, and
+``Bend``, linear in cotangents and in tangents, the derivative of ``Pull`` with respect to the start (Hessian-vector
+product). Tangents and cotangents have an axis of their own for those that share a trajectory.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NO_MEMORY = 6
 def _call(
     binding: Any, name: str, flow: FlowOfRows, counts: Sequence[int], x: Any, given: Sequence[Any], shape: Any
 ) -> Any:
-    """What a C function finds for all rows of x."""
+    """Return the results of a C function for all rows of x."""
     found = torch.empty(shape, dtype=torch.float64)
     arrays = [each.detach().contiguous() for each in (x, *given)]
     report, rows = binding.new("report *"), x[..., 0].numel()
@@ -44,42 +44,42 @@ def _summed(parts: Sequence[Any]) -> Any:
     return sum(parts[1:], parts[0]) if parts else None
 
 
-class StatesAlong(torch.autograd.Function):  # type: ignore[misc]  # torch is not there for mypy
-    """(.., n, 2m) states from (.., given) numbers (q, p, parameters, t, h)."""
+class StatesAlong(torch.autograd.Function):  # type: ignore[misc]  # mypy does not see torch
+    """States (.., n, 2m) from (.., k) numbers (q, p, parameters, t, h)."""
 
     @staticmethod
     def forward(x: Any, flow: FlowOfRows) -> Any:
-        """The values."""
+        """Return the states."""
         shape = (*x.shape[:-1], flow.kept, 2 * flow.stepper.dimension)
         return _call(flow.library, "flow_rows", flow, (STATES, 0), x, (x,), shape)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """What derivatives need."""
+        """Save the tensors that derivatives need."""
         x, ctx.flow = inputs
         ctx.save_for_backward(x)
         ctx.save_for_forward(x)
 
     @staticmethod
     def backward(ctx: Any, slopes: Any) -> Any:
-        """Slopes by x from slopes by states."""
+        """Return the cotangent of x for a cotangent of the states."""
         (x,) = ctx.saved_tensors
         return Pull.apply(x, slopes.unsqueeze(-3), ctx.flow).squeeze(-2), None
 
     @staticmethod
     def jvp(ctx: Any, change: Any, _: Any) -> Any:
-        """Changes of states from changes of x."""
+        """Return the tangent of the states for a tangent of x."""
         (x,) = ctx.saved_tensors
         return Push.apply(x, change.unsqueeze(-2), ctx.flow).squeeze(-3)
 
     @staticmethod
     def vmap(info: Any, axes: Any, x: Any, flow: FlowOfRows) -> Any:
-        """Of a batch of starts."""
+        """Return the states of a batch."""
         return StatesAlong.apply(x.movedim(axes[0], 0), flow), 0
 
 
 def _mapped(function: Callable[[], Any]) -> Any:
-    """Each with a trajectory of its own, or all that share one beside each other."""
+    """Return a batching rule: each element has its own trajectory, or all share one and are stacked."""
 
     def vmap(info: Any, axes: Any, x: Any, *rest: Any) -> Any:
         *given, flow = rest
@@ -101,7 +101,7 @@ def _mapped(function: Callable[[], Any]) -> Any:
 
 
 class _Linear(torch.autograd.Function):  # type: ignore[misc]
-    """Of a trajectory and what goes along it."""
+    """Function of a trajectory that is linear in tangents or cotangents along it."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
@@ -111,7 +111,7 @@ class _Linear(torch.autograd.Function):  # type: ignore[misc]
 
 
 class Push(_Linear):
-    """(.., count, n, 2m) changes of states from (.., count, given) changes."""
+    """JVP: tangents (.., count, n, 2m) of the states from tangents (.., count, k) of x."""
 
     vmap = _mapped(lambda: Push)
 
@@ -137,7 +137,7 @@ class Push(_Linear):
 
 
 class Pull(_Linear):
-    """(.., count, given) slopes by what is given, from (.., count, n, 2m) slopes by states."""
+    """VJP: cotangents (.., count, k) of x from cotangents (.., count, n, 2m) of the states."""
 
     vmap = _mapped(lambda: Pull)
 
@@ -164,7 +164,7 @@ class Pull(_Linear):
 
 
 class Bend(_Linear):
-    """(.., count, given) changes of slopes by what is given, from slopes by states and changes of what is given."""
+    """Derivative (.., count, k) of the VJP from cotangents of the states and tangents of x."""
 
     vmap = _mapped(lambda: Bend)
 
@@ -175,7 +175,7 @@ class Bend(_Linear):
 
     @staticmethod
     def backward(ctx: Any, back: Any) -> Any:
-        """By changes it is its own transpose: second derivatives are symmetric."""
+        """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
         x, slopes, _ = ctx.saved_tensors
         if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
             raise MethodError("a flow has no third derivatives, and no second ones forward of forward")

@@ -1,1 +1,1 @@
-"""Pictures of motions: where they go, what they conserve, and how they move. The room that knows matplotlib."""
+"""Plots of trajectories: paths, conserved quantities and animations. The only package that imports matplotlib."""

@@ -1,4 +1,4 @@
-"""Motions that move: an animation for a notebook, or a file that shows it."""
+"""Animations of trajectories, for a notebook or a file."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ __all__ = ["FILMS", "Film", "animate"]
 FILMS = (".gif", ".html", ".mp4")
 FRAMES_PER_SECOND = 25
 TRAIL = 0.15
-"""Part of the film that a trail lasts."""
+"""Duration of a trail relative to the film."""
 TRAIL_POINTS = 400
 MARGIN = 0.06
 SIZE = 4.8
-"""Inches."""
+"""Width and height of the figure in inches."""
 
 
 @takes(trajectory=MOTION, path=PATH, seconds=REAL, positions=FUNCTION)
@@ -42,22 +42,22 @@ def animate(
     seconds: float = 8.0,
     positions: Callable[[Array], Array] | None = None,
 ) -> Film:
-    """An animation of a trajectory: bodies, pendulums, chains, or a point in the plane of its coordinates.
+    """Animate a trajectory: bodies, pendulums, chains, or a point in the plane of its coordinates.
 
-    Bodies are found by the names of their coordinates (x, y or sun_x, sun_y, ..), pendulums by their energy at rest,
-    with rods as long as parameters called l, or l1, l2, .., say. Other numbered coordinates are a chain.
+    Bodies are recognised by coordinate names (x, y or sun_x, sun_y, ..), pendulums by their potential energy, with rod
+    lengths from parameters named l, or l1, l2, .., for example. Other numbered coordinates are a chain.
 
     Args:
-        trajectory: what moves; its states at equal times are the frames, as many as fit.
-        path: a file .gif, .html or .mp4 (with ffmpeg); ``None`` for none.
-        seconds: how long the animation lasts.
-        positions: (n, k, 2) or (n, k, 3) places of k points from q (n, m), in place of what is found.
+        trajectory: trajectory to animate; its states at equidistant times are the frames.
+        path: file .gif, .html or .mp4 (with ffmpeg); ``None`` to write none.
+        seconds: duration of the animation.
+        positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
 
     Returns:
-        The film, which a notebook shows.
+        The film, which a notebook displays.
 
     Raises:
-        StateError: for another suffix, a length that is not positive, or positions of a wrong shape.
+        StateError: for another suffix, a duration that is not positive, or positions of a wrong shape.
         PlotError: without matplotlib, or without ffmpeg for .mp4.
     """
     if path is not None:
@@ -72,12 +72,12 @@ def animate(
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """An animation, drawn when it is shown or saved.
+    """Animation, drawn when it is displayed or saved.
 
     Attributes:
-        trajectory: what moves.
+        trajectory: animated trajectory.
         shape: how a state is drawn.
-        seconds: how long it lasts.
+        seconds: duration.
     """
 
     trajectory: DrawnMotion
@@ -86,14 +86,14 @@ class Film:
 
     @cached_property
     def frames(self) -> Any:
-        """(k,) numbers of the states shown."""
+        """Indices (k,) of the states shown."""
         times = np.abs(self.trajectory.t - self.trajectory.t[0])
         count = min(len(times), max(1, round(self.seconds * FRAMES_PER_SECOND)))
         return np.searchsorted(times, np.linspace(0.0, times[-1], count) * (1.0 + 1e-12), side="right") - 1
 
     @cached_property
     def animation(self) -> FuncAnimation:
-        """Matplotlib's, for what is not here."""
+        """Animation of matplotlib, for further options."""
         from matplotlib.animation import FuncAnimation
         from matplotlib.figure import Figure
 
@@ -102,12 +102,12 @@ class Film:
             scene = _Scene(figure, self.trajectory, self.shape)
             scene.show(0)
             figure.draw_without_rendering()
-            figure.set_layout_engine("none")  # it stays where it is, and need not be found for every frame
+            figure.set_layout_engine("none")  # the layout is fixed; recomputing it for every frame is slow
             interval = 1000.0 * self.seconds / len(self.frames)
             return FuncAnimation(figure, scene.show, frames=self.frames, interval=interval, blit=False)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a file .gif, .html or .mp4, whole or not at all; errors as of :func:`animate`."""
+        """Write a file .gif, .html or .mp4 atomically; raises as :func:`animate`."""
         check_plot_path(path, FILMS)
         from matplotlib.animation import writers
 
@@ -127,7 +127,7 @@ class Film:
 
 
 class _Scene:
-    """Axes with points, a line through them, and trails, set to a state at a time."""
+    """Axes with points, a line through them, and trails, which show one state at a time."""
 
     def __init__(self, figure: Any, motion: DrawnMotion, shape: MovingPoints) -> None:
         self.motion, self.shape = motion, shape
@@ -161,7 +161,7 @@ class _Scene:
             self.axes.set_aspect("equal")
 
     def show(self, frame: int) -> list[Any]:
-        """The state of that number, and the trails that lead to it."""
+        """Show the state of a frame, and its trails."""
         first = max(0, frame - round(TRAIL * len(self.places)))
         rows = np.arange(first, frame + 1)[:: max(1, (frame - first) // TRAIL_POINTS)]
         for k, trail in zip(self.shape.trails, self.trails, strict=True):
@@ -174,7 +174,7 @@ class _Scene:
 
 
 def _set(line: Any, points: Array) -> None:
-    """Have a line go through (n, 2) or (n, 3) points."""
+    """Set the points (n, 2) or (n, 3) of a line."""
     if points.shape[1] == 3:
         line.set_data_3d(*points.T)
     else:

@@ -1,4 +1,4 @@
-"""What arrays do: a line of places in space and time, a plane of them at the end, bodies where they began and ended."""
+"""Plots of arrays of indexed systems: an image over index and time, a final image, or bodies in space."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 __all__ = ["plot_arrays"]
 
 IN_SPACE = (2, 3)
-"""Components of places in space."""
+"""Lengths of the last axis of arrays of positions in space."""
 
 
 class ArrayMotion(Protocol):
-    """What is drawn: times, and states by the name of their array."""
+    """Trajectory to draw: times, and states by name of their array."""
 
     @property
     def t(self) -> NDArray[np.float64]: ...
@@ -48,18 +48,19 @@ def plot_arrays(
     array: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an array of a run over sums over indices.
+    """Draw an array of a trajectory of an indexed system.
 
-    One of one axis, ``q[N]``, as a picture of places and time; of ``r[N, 2]`` or ``r[N, 3]``, places in space, the
-    first and the last in its first two components; any other of two axes, ``u[NX, NY]``, at the end.
+    An array with one index, ``q[N]``, is an image over index and time; ``r[N, 2]`` or ``r[N, 3]`` are the first and
+    last positions in space, in their first two components; any other array with two indices, ``u[NX, NY]``, is an image
+    of the final state.
 
     Args:
-        trajectory: of :meth:`IndexedStepper.integrate`.
+        trajectory: result of :meth:`IndexedStepper.integrate`.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
-        array: its name; by default the first.
+        array: name of the array; by default the first.
 
     Raises:
-        StateError: for an array that is not there, or of more axes, and where a run was observed.
+        StateError: for an unknown array or one with more indices, and for a run with ``observe``.
         PlotError: without matplotlib.
     """
     name = next(iter(trajectory.q)) if array is None else array
@@ -85,7 +86,7 @@ def plot_arrays(
 
 
 def _draw_picture(drawn: Axes, values: NDArray[np.float64], name: str, extent: Any) -> None:
-    """Colours about 0, as large above as below."""
+    """Draw an image with a colour scale that is symmetric about 0."""
     largest = float(np.abs(values).max()) or 1.0
     image = drawn.imshow(
         values, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-largest, vmax=largest

@@ -1,4 +1,4 @@
-"""Where pictures are drawn: axes given or new, in one style, and files that are written whole."""
+"""Figures, axes and files of plots, in one style."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STYLE = {
 
 
 def check_plot_path(path: str | os.PathLike[str], suffixes: tuple[str, ...] = PICTURES) -> None:
-    """Raise now what writing a picture would raise after a long run.
+    """Check before a long run that a picture can be written.
 
     Raises:
         StateError: for a suffix that is none of ``suffixes``.
@@ -54,7 +54,7 @@ def _check_matplotlib() -> None:
 
 
 def style() -> Any:
-    """The context in which pictures are drawn and written."""
+    """Return the context in which pictures are drawn and written."""
     _check_matplotlib()
     import matplotlib as mpl
 
@@ -62,7 +62,7 @@ def style() -> Any:
 
 
 def new_figure(path: str | os.PathLike[str] | None, size: tuple[float, float]) -> Figure:
-    """Of ``size`` inches; one that pyplot knows, and a notebook shows, unless it goes to a file."""
+    """Return a figure of ``size`` inches; without a path pyplot manages it and notebooks display it."""
     if path is None:
         from matplotlib import pyplot
 
@@ -77,7 +77,7 @@ def new_figure(path: str | os.PathLike[str] | None, size: tuple[float, float]) -
 def panel(
     path: str | os.PathLike[str] | None, ax: Axes | None, size: tuple[float, float] = (5.6, 4.4)
 ) -> Iterator[Axes]:
-    """Axes to draw on, those given or new ones; what is drawn goes to ``path`` if there is one."""
+    """Yield the axes to draw on, ``ax`` or new ones; write the picture to ``path`` if there is one."""
     if path is not None:
         check_plot_path(path)
     with style():
@@ -88,7 +88,7 @@ def panel(
 
 
 def save(figure: Any, path: str | os.PathLike[str]) -> None:
-    """A figure into a file, whole or not at all, with equal bytes for equal figures."""
+    """Write a figure to a file atomically; equal figures give equal bytes."""
     kind = Path(path).suffix.lower().removeprefix(".")
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
 
@@ -99,10 +99,10 @@ def save(figure: Any, path: str | os.PathLike[str]) -> None:
 
 
 def color(number: int) -> str:
-    """Of curve ``number``."""
+    """Return the colour of curve ``number``."""
     return COLORS[number % len(COLORS)]
 
 
 def plain(text: str) -> str:
-    """Text of which nothing is taken for a formula."""
+    """Return text with characters escaped that matplotlib would read as a formula."""
     return text.replace("$", r"\$")

@@ -1,4 +1,4 @@
-"""What a motion should keep, and how well it does: energy and momentum maps over time."""
+"""Plots of conserved quantities over time: energy error and momentum maps."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def plot_energy(
     *,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the energy error ``|H - H_0| / |H_0|`` over time (not divided where H_0 = 0), a colour a trajectory.
+    """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
     Args:
-        trajectories: one or several, of sums over indices, too.
+        trajectories: one or several trajectories, also of indexed systems.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
 
     Raises:
@@ -48,10 +48,10 @@ def plot_energy(
 def plot_momentum_maps(
     trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:
-    """Draw how much each momentum map has changed over time, relative to the largest size of its terms.
+    """Draw the change of each momentum map over time, relative to the largest size of its terms.
 
     Args:
-        trajectory: of a system with symmetries.
+        trajectory: trajectory of a system with symmetries.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
 
     Raises:
@@ -70,7 +70,7 @@ def plot_momentum_maps(
 
 
 def draw_energy_error(axes: Axes, motion: EnergyHistory) -> None:
-    """The curve of a single motion, with its title."""
+    """Draw the energy error of one trajectory, with the title."""
     error, scaled = _energy_error(motion)
     _draw_error(axes, motion.t, error, 0)
     axes.set(xlabel="t", title="relative energy error" if scaled else "energy error")
@@ -83,7 +83,7 @@ def _energy_error(motion: EnergyHistory) -> tuple[Array, bool]:
 
 
 def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | None = None) -> None:
-    """The largest of each bin, on a logarithmic axis that holds what was drawn before too."""
+    """Draw the largest error in each bin, on a logarithmic axis that also fits the curves drawn before."""
     times, largest = largest_in_bins(t, error)
     axes.plot(times, largest, color=color(number), linewidth=0.9, label=label)
     axes.set_yscale("log")
@@ -96,7 +96,7 @@ def _draw_error(axes: Axes, t: Array, error: Array, number: int, label: str | No
 
 
 def largest_in_bins(t: Array, error: Array) -> tuple[Array, Array]:
-    """(k,) times and the largest error from each to the next; zeros, which a log axis cannot show, become NaN."""
+    """Return (k,) times and the largest error from each to the next; zeros become NaN for a log axis."""
     size = max(1, len(t) // BINS)
     starts = np.arange(0, len(t), size)
     largest: Any = np.maximum.reduceat(error, starts)

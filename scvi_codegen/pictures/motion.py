@@ -1,4 +1,4 @@
-"""What pictures ask of a trajectory; :class:`scvi_codegen.Trajectory` and runs read from files answer it."""
+"""Interface of trajectories that can be plotted: :class:`scvi_codegen.Trajectory` and runs read from files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 class EnergyHistory(Protocol):
-    """Times, and an energy at each: of a :class:`DrawnMotion`, and of sums over indices."""
+    """Times and energies: of a :class:`DrawnMotion` or an indexed system."""
 
     @property
     def t(self) -> Array: ...  # noqa: D102
@@ -41,7 +41,7 @@ class EnergyHistory(Protocol):
 
 
 class Mover(Protocol):
-    """What a motion was computed by."""
+    """Stepper of a trajectory, as far as plots need it."""
 
     @property
     def interface(self) -> Interface:
@@ -49,14 +49,14 @@ class Mover(Protocol):
 
     @property
     def events(self) -> Sequence[Any]:
-        """Functions whose zero crossings are found."""
+        """Event functions whose zero crossings were located."""
 
     def energy(self, q: Array, p: Array, t: Any, parameters: Any) -> Any:
-        """(n,) energies of (n, m) states."""
+        """Return (n,) energies of (n, m) states."""
 
 
 class DrawnMotion(Protocol):
-    """States along a run: t (n,), q (n, m), p (n, m), with step size h and parameters."""
+    """States of a trajectory: t (n,), q (n, m), p (n, m), with step size h and parameters."""
 
     @property
     def t(self) -> Array: ...  # noqa: D102
@@ -77,7 +77,7 @@ class DrawnMotion(Protocol):
 
 
 Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
-"""One, or several of the same system."""
+"""One trajectory, or several of the same system."""
 
 MOTION = Kind("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
 
@@ -94,10 +94,10 @@ HISTORIES = _one_or_several(Kind(MOTION.words, lambda value: hasattr(value, "t")
 
 
 def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
-    """One or several motions as several.
+    """Return one or several trajectories as a sequence.
 
     Raises:
-        StateError: without any.
+        StateError: if there is none.
     """
     found = motions if isinstance(motions, Sequence) else [motions]
     if not found:
@@ -106,7 +106,7 @@ def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:
-    """(n,) values of a coordinate or momentum of states with q and p (n, m).
+    """Return (n,) values of a coordinate or momentum of states with q and p (n, m).
 
     Raises:
         StateError: for another name.

@@ -1,4 +1,4 @@
-"""A trajectory at a glance: where it goes, and how well it keeps its energy."""
+"""Overview of a trajectory: its path and its energy error."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["plot_trajectory"]
 
 @takes(trajectory=MOTION, path=PATH)
 def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
-    """Draw the motion on the left, the relative energy error over time on the right.
+    """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 
     Args:
-        trajectory: what to draw.
-        path: a file for the picture, .png or .svg, written whole or not at all; equal trajectories give equal bytes.
+        trajectory: trajectory to draw.
+        path: file for the picture, .png or .svg, written atomically; equal trajectories give equal bytes.
 
     Returns:
         The axes, from left to right.

@@ -1,4 +1,4 @@
-"""Where a motion goes: orbits of bodies, the plane of two coordinates, the phase plane, many coordinates over time."""
+"""Plots of paths: orbits of bodies, planes of two coordinates, phase planes, many coordinates over time."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MOST_CURVES = 6
 
 @takes(trajectory=MOTION, path=PATH, ax=CANVAS)
 def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw where a trajectory goes: orbits, a plane of coordinates, the phase plane of one, or all over time.
+    """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
 
     Args:
-        trajectory: what to draw.
-        path: a file for the picture, .png or .svg; ``None`` for none.
-        ax: where to draw; ``None`` for new axes.
+        trajectory: trajectory to draw.
+        path: file for the picture, .png or .svg; ``None`` to write none.
+        ax: axes to draw on; ``None`` for new ones.
 
     Returns:
         The axes.
@@ -55,9 +55,9 @@ def plot_phase(
     """Draw a phase portrait, a colour a trajectory.
 
     Args:
-        trajectories: one or several of the same system.
+        trajectories: one or several trajectories of the same system.
         path, ax: as of :func:`plot_motion`.
-        axes: two names of coordinates or momenta; the first coordinate and its momentum unless given.
+        axes: two names of coordinates or momenta; by default the first coordinate and its momentum.
 
     Raises:
         StateError, PlotError: as :func:`plot_motion`; StateError also for an unknown name.
@@ -74,7 +74,7 @@ def plot_phase(
 
 
 def path_panels(motion: DrawnMotion) -> int:
-    """How many panels say where it goes: two for what moves in space, or has a few coordinates."""
+    """Return the number of panels of a path: two for motion in space and for three to six coordinates."""
     coordinates = motion.stepper.interface.coordinates
     found = bodies(coordinates)
     spatial = found and len(found[0].columns) == 3
@@ -82,7 +82,7 @@ def path_panels(motion: DrawnMotion) -> int:
 
 
 def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
-    """Draw into as many panels as there are.
+    """Draw the path into the panels.
 
     One coordinate is drawn in the phase plane, bodies by their orbits, a few coordinates in their first planes, many
     coordinates as one image over time.
@@ -125,7 +125,7 @@ def _draw_orbits(axes: Axes, motion: DrawnMotion, found: Sequence[Body], plane: 
 
 
 def _draw_curve(axes: Axes, x: Array, y: Array, color: str, label: str | None = None) -> None:
-    """A curve through the states, a ring at the first, a dot at the last; points instead where a curve would tangle."""
+    """Draw a curve with a ring at the first and a dot at the last state; points if steps are large."""
     every = max(1, len(x) // MOST_POINTS)
     x_drawn, y_drawn = x[::every], y[::every]
     if _is_coarse(x_drawn, y_drawn):
@@ -137,7 +137,7 @@ def _draw_curve(axes: Axes, x: Array, y: Array, color: str, label: str | None = 
 
 
 def _is_coarse(x: Array, y: Array) -> bool:
-    """Whether a step is long compared with the extent of the curve."""
+    """Return True if steps are large relative to the extent of the curve."""
     if len(x) < 200:
         return False
     size = max(_extent(x), _extent(y))
@@ -149,7 +149,7 @@ def _extent(values: Array) -> float:
 
 
 def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
-    """Many coordinates: one row each, colour for the value."""
+    """Draw many coordinates as an image: one row each, colour for the value."""
     every = max(1, len(motion.t) // 2000)
     values = motion.q[::every].T
     bound = float(np.abs(values).max()) or 1.0

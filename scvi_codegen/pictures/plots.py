@@ -1,4 +1,4 @@
-"""``trajectory.plot``: called, all at a glance; its methods, one picture each."""
+"""The attribute ``trajectory.plot``: a callable for the overview, with a method for each kind of plot."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ class Plots:
     trajectory: DrawnMotion = field(repr=False)
 
     def __call__(self, path: Path = None) -> tuple[Axes, ...]:
-        """Where it goes and how well it keeps its energy, as :func:`scvi_codegen.plot_trajectory`."""
+        """Draw path and energy error, as :func:`scvi_codegen.plot_trajectory`."""
         return plot_trajectory(self.trajectory, path)
 
     def motion(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
-        """Where it goes, as :func:`scvi_codegen.plot_motion`."""
+        """Draw the path, as :func:`scvi_codegen.plot_motion`."""
         return plot_motion(self.trajectory, path, ax=ax)
 
     def phase(self, path: Path = None, *, axes: tuple[str, str] | None = None, ax: Axes | None = None) -> Axes:
-        """A phase portrait, as :func:`scvi_codegen.plot_phase`."""
+        """Draw a phase portrait, as :func:`scvi_codegen.plot_phase`."""
         return plot_phase(self.trajectory, path, axes=axes, ax=ax)
 
     def energy(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
-        """The energy error over time, as :func:`scvi_codegen.plot_energy`."""
+        """Draw the energy error over time, as :func:`scvi_codegen.plot_energy`."""
         return plot_energy(self.trajectory, path, ax=ax)
 
     def momentum_maps(self, path: Path = None, *, ax: Axes | None = None) -> Axes:
-        """What symmetries conserve, as :func:`scvi_codegen.plot_momentum_maps`."""
+        """Draw the errors of momentum maps, as :func:`scvi_codegen.plot_momentum_maps`."""
         return plot_momentum_maps(self.trajectory, path, ax=ax)
 
     def section(self, path: Path = None, *, axes: tuple[str, str], event: int = 0, ax: Axes | None = None) -> Axes:
-        """A Poincare section, as :func:`scvi_codegen.plot_section`."""
+        """Draw a Poincare section, as :func:`scvi_codegen.plot_section`."""
         return plot_section(self.trajectory, path, axes=axes, event=event, ax=ax)

@@ -1,4 +1,4 @@
-"""What a fit leaves of the measurements."""
+"""Plot of the residuals of a fit."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualPlot:
-    """``fit.plot()``: measured less computed values over time, a colour a quantity, a band of two deviations each.
+    """Plot ``fit.plot()``: measured minus computed values over time, with bands of two standard deviations.
 
     Attributes:
         t: (n,) times.
-        residuals: (n, c), not numbers where nothing was measured.
+        residuals: (n, c), NaN where nothing was measured.
         deviations: (c,) standard deviations of the noise.
-        names: of the quantities.
+        names: names of the quantities.
     """
 
     t: Array
@@ -36,7 +36,7 @@ class ResidualPlot:
     names: tuple[str, ...]
 
     def __call__(self, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
-        """On the axes ``ax`` or on new ones, into a .png or .svg if a path is given."""
+        """Draw on the axes ``ax`` or on new ones; write a .png or .svg if a path is passed."""
         with panel(path, ax) as drawn:
             curves = zip(self.names, self.residuals.T, self.deviations, strict=True)
             for number, (name, column, deviation) in enumerate(curves):

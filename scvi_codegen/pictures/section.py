@@ -1,4 +1,4 @@
-"""Poincare sections: where motions cross a surface."""
+"""Poincare sections: points where trajectories cross a surface."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def plot_section(
     """Draw a Poincare section, a colour a trajectory.
 
     Args:
-        trajectories: one or several of the same system, integrated with ``events``.
-        path: a file for the picture, .png or .svg; ``None`` for none.
-        axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian calls it).
-        event: which of the events cuts, by its number.
-        ax: where to draw; ``None`` for new axes.
+        trajectories: one or several trajectories of the same system, integrated with ``events``.
+        path: file for the picture, .png or .svg; ``None`` to write none.
+        axes: two names of coordinates or momenta (``p_`` before the coordinate, or as the Hamiltonian names it).
+        event: index of the event that defines the surface.
+        ax: axes to draw on; ``None`` for new ones.
 
     Raises:
         StateError: for an unknown name, or without such an event.
@@ -55,7 +55,7 @@ def plot_section(
 
 
 def _at_crossings(motion: DrawnMotion, name: str, event: int) -> Array:
-    """(k,) values of a coordinate or momentum at the crossings of an event."""
+    """Return (k,) values of a coordinate or momentum at the crossings of an event."""
     if not -len(motion.events) <= event < len(motion.events):
         raise StateError(
             f"there is no event {event} in a trajectory with {len(motion.events)}: integrate(..., events=...)"

@@ -1,4 +1,4 @@
-"""What moves, found from coordinates and energies: bodies, pendulums hung on each other, chains, points."""
+"""Recognition of shapes to animate, from coordinates and energies: bodies, chained pendulums, chains, points."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ __all__ = ["MovingPoints", "shape_of"]
 
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
-"""Parameters that are lengths of rods, alone or with a number behind."""
+"""Names of parameters that are rod lengths, alone or followed by a number."""
 MOST_RODS = 6
 GENERIC = 0.3, 0.17
-"""First angle, and difference between angles, of a state at which nothing is equal by chance."""
+"""First angle, and difference between angles, of a state without accidental symmetry."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MovingPoints:
-    """How to draw a state.
+    """Points, lines and labels that represent a state.
 
     Attributes:
-        points: (n, k, d) places of k points in the plane or in space, from q and p (n, m).
-        joined: whether a line goes through the points of a state.
-        trails: points whose way is drawn.
-        labels: of the axes, d of them; what they mean where a name would not say.
-        names: of the points, or none.
-        equal: whether all axes have one scale.
+        points: function from q and p (n, m) to (n, k, d) positions of k points in the plane or in space.
+        joined: draw a line through the points of a state.
+        trails: indices of the points whose paths are drawn.
+        labels: labels of the d axes.
+        names: names of the points, or none.
+        equal: use one scale for all axes.
     """
 
     points: Callable[[Array, Array], Array]
@@ -45,14 +45,14 @@ class MovingPoints:
 
 
 def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = None) -> MovingPoints:
-    """The shape of a system: bodies by their names, pendulums by their energy, else a point or a chain.
+    """Return the shape of a system: bodies by coordinate names, pendulums by energy, else a point or a chain.
 
     Args:
-        motion: whose coordinates are looked at.
-        positions: (n, k, 2) or (n, k, 3) places of k points from q (n, m), in place of what is found.
+        motion: trajectory whose coordinates are examined.
+        positions: function from q (n, m) to (n, k, 2) or (n, k, 3) positions of k points, instead of those recognised.
 
     Raises:
-        StateError: if ``positions`` gives another shape.
+        StateError: if ``positions`` returns another shape.
     """
     coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
     if positions is not None:
@@ -92,7 +92,7 @@ def _given(motion: DrawnMotion, positions: Callable[[Array], Array]) -> MovingPo
 
 
 def _pendulum(lengths: Array, sign: float) -> MovingPoints:
-    """Rods of these lengths, each hung (sign 1) or put (-1) on the end of the one before, the first on the origin."""
+    """Return a chain of rods, each hanging from (sign 1) or standing on (-1) the end of the previous one."""
 
     def points(q: Array, p: Array) -> Array:
         rods = np.stack([lengths * np.sin(q), -sign * lengths * np.cos(q)], axis=2)
@@ -103,10 +103,10 @@ def _pendulum(lengths: Array, sign: float) -> MovingPoints:
 
 
 def _hanging(motion: DrawnMotion) -> float | None:
-    """1 if the coordinates are the angles of pendulums that hang at 0, -1 if these stand there, ``None`` if neither.
+    """Return 1 if the coordinates are angles of pendulums that hang at 0, -1 if they stand there, else ``None``.
 
-    They are if the energy at rest is that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and if each is
-    moved by the next: the energy of two momenta is not the sum of that of each.
+    The potential energy must be that of weights, sum a_i (1 - cos q_i) with all a_i of one sign, and neighbours must be
+    coupled: the kinetic energy of two momenta must not be the sum of that of each.
     """
     numbers, m = _numbers(motion.stepper.interface.coordinates), motion.q.shape[1]
     if m > MOST_RODS or (m > 1 and numbers is None):
@@ -133,7 +133,7 @@ def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
 
 
 def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
-    """The numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` if they are not called so."""
+    """Return the numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` for other names."""
     found = [NUMBERED.fullmatch(name) for name in names]
     if not all(found) or len({match[1] for match in found if match}) > 1:
         return None
@@ -141,7 +141,7 @@ def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
 
 
 def _lengths(motion: DrawnMotion) -> Array:
-    """(m,) lengths of rods, by the names of parameters; 1 where there is none."""
+    """Return (m,) rod lengths, from parameters by name; 1 if there is none."""
     interface, m = motion.stepper.interface, motion.q.shape[1]
     values = dict(zip(interface.parameters, motion.parameters, strict=True))
     numbers = _numbers(interface.coordinates) or (0,) * m

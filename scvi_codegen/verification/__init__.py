@@ -1,12 +1,12 @@
-"""The certificate of an integrator: what it promises, measured of it as it was built.
+"""Certificates of integrators: measurement of every guaranteed property of the code as built.
 
-Three independent paths meet. The *compiled* step is held against the paper's equations solved in 60 digits
-(:mod:`scvi_codegen.exact.step`) and, for its structure, against finite differences of itself. *Those digits* are held
-against the exact motion, which comes from the formula of L or H alone (:mod:`scvi_codegen.exact.motion`), and against
-other methods that must be the same map. A fault of the printing, the tables, a kernel or a solver shows on the first
-path; one of the derivation, which both would share, on the second.
+Three independent computations are compared. The *compiled* step is compared with the paper's equations solved in 60
+digits (:mod:`scvi_codegen.exact.step`) and, for its structure, with finite differences of itself. *These digits* are
+compared with the exact motion, computed from the formula of L or H alone (:mod:`scvi_codegen.exact.motion`), and with
+other methods that are the same map. An error in the printed C, the tables, a kernel or a solver shows in the first
+comparison; an error in the derivation, which both sides share, in the second.
 
-All is measured at states and parameters a little off those given: nothing hides behind a symmetry, or a mass of 1.
+States and parameters are perturbed slightly, so that no symmetry and no mass of 1 hides an error.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ __all__ = ["Certificate", "Check", "Outcome", "verify"]
 Array = NDArray[np.float64]
 
 SEEDS = range(20)
+"""Seeds of the random states that are tried if no state is passed."""
 LONGEST, HALVINGS, PART = 1.0, 40, 0.1
+"""Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
 @takes(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
@@ -63,26 +65,29 @@ def verify(
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
-    """Measure what the integrator of ``system`` by ``method`` promises; inputs as between breakpoints, cubics of time.
+    """Measure the guaranteed properties of the integrator of ``system`` by ``method`` and return a certificate.
+
+    Inputs are cubic polynomials in time, as between breakpoints.
 
     Args:
-        system, method: what is integrated and how; a method may be its name, ``"svi:8"``.
-        q, p: (m,) a state to measure at, both or neither; by default one that is found by trying.
-        h: a step, in transformed time of tau; by default one that moves this state by about a tenth of its size.
+        system: mechanical system.
+        method: method, or its name, as ``"svi:8"``.
+        q, p: (m,) state at which to measure, both or neither; by default a random state at which steps succeed.
+        h: step size, in transformed time of tau; by default one that changes this state by about a tenth of its size.
         t: time.
-        stepper: the integrator as built, for example from ``load_package``; by default compiled now. Of one with a
-            monitor (:func:`~scvi_codegen.compile_stepper`) the steps that it chooses are measured, too.
-        tolerance: measure runs of steps that choose their length for this relative error of a step, too; 0: round-off.
-        solver, flags: as of ``compile_stepper``.
+        stepper: stepper under test, for example from ``load_package``; by default compiled now. For a stepper with a
+            time-rescaling function (:func:`~scvi_codegen.compile_stepper`) its adaptive steps are measured, too.
+        tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
+        solver, flags: as for ``compile_stepper``.
 
     Returns:
-        The certificate. Promises are the method's (order, symmetry, symplecticity) and the system's (momentum maps);
-        one that cannot be measured says why.
+        The certificate. The properties follow from the method (order, symmetry, symplecticity) and the system (momentum
+        maps). A property that cannot be measured has the reason in its remark.
 
     Raises:
         BuildError: without a C compiler.
-        MethodError: if the method does not take the system, or has no such solver.
-        StateError: if only one of q and p is given, or no state is found.
+        MethodError: if the method does not apply to the system, or has no such solver.
+        StateError: if only one of q and p is passed, or no state is found.
     """
     began = time.perf_counter()
     method = as_method(method, system)
@@ -134,7 +139,7 @@ def _in_own_time(system: MechanicalSystem) -> MechanicalSystem:
 def _newton(
     system: MechanicalSystem, method: Method, stepper: Stepper, solver: str, flags: tuple[str, ...]
 ) -> Stepper | None:
-    """Newton's solver alone, where the artefact has it; the artefact itself where that is all it has."""
+    """Return a stepper that uses Newton's method alone, to compare with; ``None`` for an explicit or other solver."""
     if solver == "newton":
         return stepper
     if solver != "auto" or not method.implicit:
@@ -156,7 +161,7 @@ def _given(
 
 
 def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float) -> State:
-    """A state of size 1 at which steps succeed and the energy is finite."""
+    """Return a random state of size 1 at which steps succeed and the energy is finite."""
     for seed in SEEDS:
         generator = np.random.default_rng(seed)
         q, v = generator.uniform(0.2, 1.0, (2, system.dimension))
@@ -173,7 +178,7 @@ def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float
 
 
 def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
-    """A step that moves q and p by at most a tenth of their size."""
+    """Return a step size that changes q and p by at most a tenth of their size."""
     h = LONGEST
     for _ in range(HALVINGS):
         try:

@@ -1,4 +1,4 @@
-"""What a certificate says: one check a promise, with the number measured and the bound it is held to."""
+"""Certificate: one check for each guaranteed property, with the measured number and its bound."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 
 
 class Outcome(StrEnum):
-    """What became of a promise."""
+    """Result of a check."""
 
     KEPT = "kept"
     BROKEN = "BROKEN"
@@ -42,15 +42,15 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """One promise, and what was measured.
+    """Guaranteed property and its measurement.
 
     Attributes:
-        name: a word or two.
-        promise: the sentence that is to hold, or what the number of an information is.
-        outcome: kept, broken, not measured, or an information without a promise.
-        measured: the number, or ``None``.
-        bound: what it is held to, or ``None``.
-        remark: where and how it was measured; why it was not.
+        name: short name.
+        promise: statement of the property; for an information, what its number means.
+        outcome: property holds, is violated, or was not measured; or an information without a property.
+        measured: measured number, or ``None``.
+        bound: bound on that number, or ``None``.
+        remark: where and how it was measured, or why it was not.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Check:
 
 
 class Finding(NamedTuple):
-    """A number, and what it is held to: at most the bound, or at least."""
+    """Measured number and its upper bound, or lower bound if ``at_least``."""
 
     measured: float
     bound: float
@@ -78,16 +78,16 @@ class Finding(NamedTuple):
 
     @property
     def kept(self) -> bool:
-        """Whether it is on the right side; a NaN never is."""
+        """True if the number satisfies the bound; a NaN never does."""
         return self.measured >= self.bound if self.at_least else self.measured <= self.bound
 
 
 class BrokenError(Exception):
-    """A promise that fails without a number."""
+    """Violation of a property that is not expressed by a number."""
 
 
 def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> Iterator[Check]:
-    """The check of a promise; nothing where it does not apply, and the reason where it cannot be measured."""
+    """Yield the check of a property; nothing if it does not apply, the reason if it cannot be measured."""
     outcome, remark, finding = Outcome.NOT_MEASURED, "", None
     try:
         with waiting_for(f"measuring {name}"):
@@ -110,24 +110,24 @@ def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> I
 
 
 def information(name: str, what: str, measured: float | None, remark: str = "") -> Check:
-    """A number that no promise is about."""
+    """Return a measured number without a bound."""
     return Check(name=name, promise=what, outcome=Outcome.INFORMATION, measured=measured, remark=remark)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
-    """What an integrator promises, and what was measured of it as it was built.
+    """Guaranteed properties of an integrator, and their measurement on the code as built.
 
     Attributes:
         title: system and method.
         system, method: their names.
-        version: of the generator.
-        checksum: SHA-256 of header and source, as in ``sha256sum`` of both files one after the other.
-        flags: of the C compiler.
-        q, p, t, h: the state and the step it was asked for.
+        version: version of the generator.
+        checksum: SHA-256 of header and source, as ``sha256sum`` of both files concatenated.
+        flags: flags of the C compiler.
+        q, p, t, h: state and step size of the measurement.
         parameters: default values by name.
-        checks: in the order of measurement.
-        seconds: that it took.
+        checks: checks in the order of measurement.
+        seconds: duration of the measurement.
     """
 
     title: str
@@ -146,17 +146,17 @@ class Certificate:
 
     @property
     def passed(self) -> bool:
-        """Whether no promise is broken; those not measured are listed in :attr:`not_measured`."""
+        """True if no property is violated; properties not measured are in :attr:`not_measured`."""
         return not self.broken
 
     @property
     def broken(self) -> tuple[Check, ...]:
-        """The promises that do not hold."""
+        """Checks of violated properties."""
         return self._with(Outcome.BROKEN)
 
     @property
     def not_measured(self) -> tuple[Check, ...]:
-        """The promises of which nothing is known, each with its reason."""
+        """Checks of properties that could not be measured; the remark is the reason."""
         return self._with(Outcome.NOT_MEASURED)
 
     def _with(self, outcome: Outcome) -> tuple[Check, ...]:
@@ -164,14 +164,14 @@ class Certificate:
 
     @property
     def verdict(self) -> str:
-        """Whether promises are kept, and how many."""
+        """Summary: whether properties are violated, and the number of checks by outcome."""
         counts = Counter(check.outcome for check in self.checks)
         verdict = "every promise measured is kept" if self.passed else "PROMISES ARE BROKEN"
         numbers = ", ".join(f"{counts[outcome]} {outcome.value}" for outcome in Outcome if counts[outcome])
         return f"{verdict}: {numbers}"
 
     def to_text(self) -> str:
-        """A line a check, and the verdict."""
+        """Return a line for each check, and the verdict."""
         head = [self.title, f"C source sha256 {self.checksum}", f"flags {' '.join(self.flags)}; step {self.h:g}", ""]
         return "\n".join([*head, *map(str, self.checks), "", f"{self.verdict}; {self.seconds:.1f} s"]) + "\n"
 
@@ -185,16 +185,16 @@ class Certificate:
         return card(self.title, facts, grid(map(_row, self.checks), head=head))
 
     def to_json(self) -> str:
-        """All of it, for programs; numbers that are not finite are strings."""
+        """Return all attributes as JSON; numbers that are not finite are strings."""
         return json.dumps({"passed": self.passed, **_finite(asdict(self))}, indent=1, allow_nan=False) + "\n"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the JSON, whole or not at all."""
+        """Write the JSON to a file atomically."""
         write_atomically(path, partial(_write, self.to_json()))
 
 
 def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **said: Any) -> Certificate:
-    """The certificate of C files by name, for a state, with what else is said in it."""
+    """Return the certificate of C files by name for a state; ``said`` are the other attributes."""
     return Certificate(
         version=_installed_version(),
         checksum=hashlib.sha256("".join(files.values()).encode()).hexdigest(),
@@ -205,7 +205,7 @@ def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], 
 
 
 def _installed_version() -> str:
-    """Of this package."""
+    """Return the installed version of this package."""
     try:
         return importlib.metadata.version("scvi-codegen")
     except importlib.metadata.PackageNotFoundError:
@@ -213,7 +213,7 @@ def _installed_version() -> str:
 
 
 def _row(check: Check) -> tuple[Html, ...]:
-    """Of the table in a notebook; what is broken stands out."""
+    """Return a row of the table in a notebook; violations are bold."""
     outcome = plain(check.outcome.value)
     if check.outcome is Outcome.BROKEN:
         outcome = Html(f"<strong>{outcome}</strong>")

@@ -1,4 +1,4 @@
-"""The derivative of a compiled step in transformed time, by all it starts from, also of the time it takes."""
+"""Checks of the derivatives of a compiled step in transformed time, dt = g dtau, including those of its duration."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["clock_derivative_checks"]
 Array = NDArray[np.float64]
 
 ROUGHNESS = 1e-12
-"""Of areas: what is left by the rounding of a derivative that is exact."""
+"""Bound on the defect of J^T Omega J = Omega: round-off of an analytic derivative."""
 
 
 def clock_derivative_checks(pace: Pace) -> Iterator[Check]:
-    """Along one direction in which nothing stands still, the energy among it, as far as there are derivatives."""
+    """Yield the checks along one direction in which all arguments change, among them the energy."""
     promise = "a step of tau and its time change by all they start from as the equations do (differences in 60 digits)"
     yield from checked("derivatives in tau", promise, partial(_derivative, pace))
     promise = "the energy on whose level steps are taken changes with the start as its formula does (60 digits)"
@@ -39,7 +39,7 @@ def clock_derivative_checks(pace: Pace) -> Iterator[Check]:
 
 
 def _derivative(pace: Pace) -> Finding:
-    """The change of the end and of its time, the energy given and changed like all else."""
+    """Compare the directional derivative of the end state and of its time with differences of the exact step."""
     state, direction = _first(pace), _direction(pace)
     told, scales = pace.stepper.told, np.append(pace.subject.scales(state), state.h)
     found = _carried(pace, direction, back=False)[told]
@@ -50,7 +50,7 @@ def _derivative(pace: Pace) -> Finding:
 
 
 def _level(pace: Pace) -> Finding:
-    """Of the energy of the state, beside the largest term of its change."""
+    """Compare the directional derivative of the energy of the state with differences; relative to its largest term."""
     state, direction, m = _first(pace), _direction(pace), len(_first(pace).q)
     values = np.array(list(pace.at_level(state).values()))
     terms = pace.stepper.level(state.q, state.p, values) * direction
@@ -65,7 +65,7 @@ def _level(pace: Pace) -> Finding:
 
 
 def _transpose(pace: Pace) -> Finding:
-    """(J v, w) - (v, J^T w), w weighing all parts of the end alike."""
+    """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
     v = _direction(pace)
     w = np.cos(2.0 + np.arange(len(v))) / np.abs(v)
     forward, back = (_carried(pace, vector, back=which) for vector, which in ((v, False), (w, True)))
@@ -74,7 +74,7 @@ def _transpose(pace: Pace) -> Finding:
 
 
 def _symplecticity(pace: Pace) -> Finding:
-    """In units of the areas of pairs of coordinates."""
+    """Return the defect of J^T Omega J = Omega, in units of the areas of pairs of coordinates."""
     state = _first(pace)
     parameters, scales, m = pace.at_level(state), pace.subject.scales(state), len(state.q)
     J = pace.stepper.jacobian(state.q, state.p, state.h, state.t, parameters) * scales / scales[:, np.newaxis]
@@ -90,7 +90,7 @@ def _first(pace: Pace) -> State:
 
 
 def _direction(pace: Pace) -> Array:
-    """Of (q, p, parameters, energy, t, h), each in parts of its size."""
+    """Return a direction of (q, p, parameters, energy, t, h), scaled with the size of each."""
     state = _first(pace)
     values = np.array(list(pace.at_level(state).values()))
     sizes = np.concatenate([pace.subject.scales(state), np.where(values, values, 1.0), [state.h, state.h]])
@@ -99,7 +99,7 @@ def _direction(pace: Pace) -> Array:
 
 
 def _carried(pace: Pace, vector: Array, *, back: bool) -> Array:
-    """What the compiled derivative at the energy of the state, or its transpose, makes of a vector."""
+    """Return J v of the compiled derivative J at the energy of the state, or J^T v."""
     state = _first(pace)
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
     vectors = np.zeros((2, 1, len(vector)))
@@ -117,7 +117,7 @@ def _given(pace: Pace) -> Array:
 
 
 def _end(pace: Pace, change: Array) -> Array:
-    """(2m + 1,) where a step leads and when, from what is given, changed, in 60 digits."""
+    """Return (2m + 1,) the end state of a step and its time, from perturbed arguments, in 60 digits."""
     m, moved = len(_first(pace).q), (_given(pace) + change).tolist()
     step = compiled_equations(pace.transformed, pace.subject.method).with_parameters(moved[2 * m : -2])
     q, p, h = moved[:m], moved[m : 2 * m], moved[-1]

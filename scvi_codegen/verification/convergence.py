@@ -1,7 +1,7 @@
-"""How fast a step approaches the exact motion: in h, and with the degree. In 60 digits, below all rounding.
+"""Checks of convergence to the exact motion, in h and in the degree, in 60-digit arithmetic, above all round-off.
 
-The compiled step is that of 60 digits up to rounding, which is a check of its own; what is measured here is whether
-those digits are the right ones. The exact motion is computed from the formula alone.
+The compiled step equals the step in 60 digits up to round-off, which :mod:`~scvi_codegen.verification.stepping` checks;
+here the latter is compared with the exact motion, which is computed from the formula of L or H alone.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from scvi_codegen.verification.subject import State, Subject
 __all__ = ["convergence_checks"]
 
 GOAL = mp.mpf(10) ** -17
-"""Error at which the order is measured: below the rounding of doubles, so that no fault of that size hides."""
+"""Error at which the order is measured: below the round-off of doubles, so that errors of that size show."""
 FLOOR = mp.mpf(10) ** -38
-"""Errors below are not told from none."""
+"""Error below which a step counts as exact."""
 SMALLEST = 1e-9
-"""Part of the step below which none is tried: an error that is not small there is one of order 0."""
+"""Smallest step size tried, relative to h: an error that is not small there is of order 0."""
 MOST_TRIALS, MOST_HALVINGS = 12, 5
 SLACK = 0.2
+"""Difference allowed between measured and claimed order."""
 LEAST_ORDER = 0.8
-"""Of methods that claim no order: they converge to the motion all the same."""
+"""Smallest order of methods that claim none: they converge all the same."""
 FALL = 0.25
-"""Factor by which two degrees more shrink the error at least."""
+"""Largest ratio of the errors of methods whose degrees differ by two."""
 
 EXPECTED: Mapping[str, Callable[[int], tuple[int, bool, bool]]] = {
     "gauss": lambda s: (2 * s, True, True),
@@ -40,7 +41,7 @@ EXPECTED: Mapping[str, Callable[[int], tuple[int, bool, bool]]] = {
     "chebyshev-gauss": lambda s: (s + s % 2, s == 1, True),
     "chebyshev-lobatto": lambda s: (s + s % 2, False, True),
 }
-"""Order, whether symplectic (in phase space), whether symmetric: what is known of the families (paper, Table 4)."""
+"""Order, symplecticity (in phase space) and symmetry of Runge-Kutta methods with s stages (paper, Table 4)."""
 
 RULES: Mapping[str, Callable[[int], int]] = {
     "gauss-legendre": lambda n: 2 * n,
@@ -50,11 +51,11 @@ RULES: Mapping[str, Callable[[int], int]] = {
     "clenshaw-curtis": lambda n: n + n % 2,
     "fejer": lambda n: n + n % 2,
 }
-"""Order of the quadratures."""
+"""Order of quadrature rules with n points."""
 
 
 def convergence_checks(subject: Subject) -> Iterator[Check]:
-    """All of this room."""
+    """Yield all checks of this module."""
     method = subject.method
     promise = "order, symplecticity and symmetry are those known of the family"
     yield from checked("claims", promise, partial(_claims, method))
@@ -65,7 +66,7 @@ def convergence_checks(subject: Subject) -> Iterator[Check]:
 
 
 def _claims(method: Method) -> Finding | None:
-    """The properties that the method computes from its coefficients are those of its family."""
+    """Compare the properties that the method computes from its coefficients with the known ones."""
     expected, own = _expected(method), (method.order, method.symplectic, method.symmetric)
     if expected is None:
         return None
@@ -100,7 +101,7 @@ def _order(subject: Subject) -> Finding | None:
 
 
 def _measured_order(subject: Subject) -> tuple[float | None, float]:
-    """From the errors of a step and of half of it, both below rounding; with the larger of them."""
+    """Return the order from the errors of h and h/2, and the larger error; ``None`` for an exact step."""
     state, power = subject.states[0], (subject.method.order or 1) + 1
     h = mp.mpf(state.h)
     error = _error(subject, subject.method, state, h)
@@ -128,7 +129,7 @@ def _measured_order(subject: Subject) -> tuple[float | None, float]:
 
 
 def _error(subject: Subject, method: Method, state: State, h: Number) -> Number:
-    """Of one step of length h, relative to the sizes of q and of p."""
+    """Return the error of one step of size h, relative to the sizes of q and of p."""
     start = subject.motion.met(state.q, state.p, state.t)
     found = subject.derived(method)(*start, h, state.t)
     q, p = subject.motion.flow(*start, h, state.t)
@@ -154,7 +155,7 @@ def _rate_in_degree(subject: Subject) -> Finding | None:
 
 
 def _errors_of(subject: Subject, pair: tuple[Method, Method]) -> tuple[Number, list[Number]]:
-    """Errors of one step of both, with a step that both solve."""
+    """Return the errors of one step of both methods, and a step size at which both succeed."""
     state = subject.states[0]
     h = mp.mpf(state.h)
     for _ in range(MOST_HALVINGS):
@@ -166,7 +167,7 @@ def _errors_of(subject: Subject, pair: tuple[Method, Method]) -> tuple[Number, l
 
 
 def _of_size(what: Mapping[str, Any], key: str, size: int) -> Method | None:
-    """The method of another degree, with as many points more or less."""
+    """Return the method of another degree, with the same number of additional quadrature points."""
     if size < 1:
         return None
     changed = {**what, key: size}

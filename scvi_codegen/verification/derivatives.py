@@ -1,4 +1,4 @@
-"""The derivative of the compiled step by all it starts from, its transpose, and second derivatives."""
+"""Checks of the derivatives of a compiled step: Jacobian, its transpose, and second derivatives."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ __all__ = ["derivative_checks"]
 Array = NDArray[np.float64]
 
 BOUND = 1e-10
-"""Of the change of the end in parts of its size; of the products compared, to their largest terms."""
+"""Bound on relative differences of directional derivatives, and of products relative to their largest terms."""
 WIDTH = mp.mpf(10) ** -15
+"""Relative perturbation of the arguments for differences in 60 digits."""
 MOST_BENT = 4
-"""Coordinates of systems whose second derivatives are derived and compiled for this: of more it takes long."""
+"""Largest number of coordinates for which second derivatives are compiled; it takes long for more."""
 
 
 def derivative_checks(subject: Subject) -> Iterator[Check]:
-    """Along one direction in which nothing stands still: a slope that is wrong shows there."""
+    """Yield the checks along one direction in which all arguments change."""
     promise = "a step changes by its start, parameters, time and h as its equations do (differences in 60 digits)"
     yield from checked("derivatives", promise, partial(_derivative, subject))
     yield from checked("adjoint", "the transposed derivative is that", partial(_transpose, subject))
@@ -37,7 +38,7 @@ def derivative_checks(subject: Subject) -> Iterator[Check]:
 
 
 def _derivative(subject: Subject) -> Finding | None:
-    """The change of the end along the direction."""
+    """Compare the directional derivative of the end state with differences of the exact step."""
     if not _differentiable(subject):
         return None
     state = subject.states[0]
@@ -51,7 +52,7 @@ def _derivative(subject: Subject) -> Finding | None:
 
 
 def _transpose(subject: Subject) -> Finding | None:
-    """(J v, w) - (v, J^T w), w weighing all parts of the end alike."""
+    """Return the defect (J v, w) - (v, J^T w), where w weighs all components of the end alike."""
     if not _differentiable(subject):
         return None
     state = subject.states[0]
@@ -68,13 +69,13 @@ def _transpose(subject: Subject) -> Finding | None:
 
 
 def _steppers(subject: Subject) -> list[Stepper]:
-    """The artefact; and Newton's solver beside it, by whose factors changes are carried where sweeps fail."""
+    """Return the stepper under test and the one with Newton's method alone, which factorises the Jacobian."""
     others = [subject.newton] if subject.newton and subject.newton is not subject.stepper else []
     return [subject.stepper, *others]
 
 
 def _differentiable(subject: Subject) -> bool:
-    """Whether the artefact has derivatives; those of generated folders have none."""
+    """Return True if the stepper has derivatives; those of generated folders have none."""
     try:
         return subject.stepper.given > 0
     except MethodError:
@@ -82,7 +83,7 @@ def _differentiable(subject: Subject) -> bool:
 
 
 def _second(subject: Subject) -> Finding | None:
-    """How the end bends along two directions at once."""
+    """Compare the second derivative along two directions with differences of the exact step."""
     if not _bends(subject):
         return None
     state = subject.states[0]
@@ -94,7 +95,7 @@ def _second(subject: Subject) -> Finding | None:
 
 
 def _symmetry(subject: Subject) -> Finding | None:
-    """Of all entries, each beside the largest of its row and column, in sizes of what is given."""
+    """Return the largest asymmetry of the Hessian relative to its largest entry, in scaled arguments."""
     if not _bends(subject):
         return None
     state = subject.states[0]
@@ -104,7 +105,7 @@ def _symmetry(subject: Subject) -> Finding | None:
 
 
 def _bends(subject: Subject) -> bool:
-    """Whether the artefact has second derivatives, of few coordinates."""
+    """Return True if the stepper has second derivatives and few coordinates."""
     if not _differentiable(subject) or subject.system.dimension > MOST_BENT:
         return False
     try:
@@ -115,14 +116,14 @@ def _bends(subject: Subject) -> bool:
 
 
 def _weights(subject: Subject, state: State) -> Array:
-    """(2m,) of the function of the end, all parts of which count alike."""
+    """Return (2m,) weights of a scalar function of the end state, to which all components contribute alike."""
     scales = subject.scales(state)
     weights: Array = (1.3 + np.cos(2.0 + np.arange(len(scales)))) / scales
     return weights
 
 
 def _hessian(subject: Subject, state: State) -> Array:
-    """(given, given) of the weighted sum of the end, compiled."""
+    """Return the compiled Hessian (n, n) of the weighted sum of the end state, n the number of arguments."""
     stepper, parameters = subject.stepper, np.array(list(subject.parameters.values()))
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
     size = stepper.given
@@ -135,7 +136,7 @@ def _hessian(subject: Subject, state: State) -> Array:
 
 
 def _bent_by_differences(subject: Subject, state: State, u: Array, v: Array) -> float:
-    """The second derivative of the same along two directions, of the equations in 60 digits."""
+    """Return the second derivative of the weighted sum along u and v, by differences in 60 digits."""
     weights = [mp.mpf(weight) for weight in _weights(subject, state)]
     total = mp.zero
     for sign, other in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -144,7 +145,7 @@ def _bent_by_differences(subject: Subject, state: State, u: Array, v: Array) -> 
 
 
 def _direction(subject: Subject, state: State, phase: float = 1.0) -> Array:
-    """Of (q, p, parameters, t, h), each in parts of its size."""
+    """Return a direction of (q, p, parameters, t, h), scaled with the size of each."""
     values = np.array(list(subject.parameters.values()))
     sizes = np.concatenate([subject.scales(state), np.where(values, values, 1.0), [state.h, state.h]])
     direction: Array = sizes * (1.5 + np.sin(phase + 1.7 * np.arange(len(sizes))))
@@ -152,7 +153,7 @@ def _direction(subject: Subject, state: State, phase: float = 1.0) -> Array:
 
 
 def _carried(subject: Subject, stepper: Stepper, state: State, vector: Array, *, back: bool) -> Array:
-    """What the compiled derivative, or its transpose, makes of a vector."""
+    """Return J v of the compiled Jacobian J, or J^T v."""
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
     vectors = np.zeros((2, 1, len(vector)))
     vectors[int(back)] = vector
@@ -162,14 +163,14 @@ def _carried(subject: Subject, stepper: Stepper, state: State, vector: Array, *,
 
 
 def _by_differences(subject: Subject, state: State, direction: Array) -> Array:
-    """Of the equations in 60 digits."""
+    """Return the directional derivative of the end state, by differences in 60 digits."""
     ends = [_end(subject, state, direction * (sign * WIDTH)) for sign in (1, -1)]
     slope: Array = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
     return slope
 
 
 def _end(subject: Subject, state: State, change: Array) -> Array:
-    """(2m,) where the step leads from what is given, changed, in 60 digits."""
+    """Return (2m,) the end state of a step from perturbed arguments, in 60 digits."""
     step, m = subject.derived(), len(state.q)
     given = np.array([mp.mpf(x) for x in (*state.z, *subject.parameters.values(), state.t, state.h)], dtype=object)
     moved = (given + change).tolist()

@@ -1,9 +1,9 @@
-"""What a run remembers for its next step: how much of the way to the solution the guess from former steps saves.
+"""Check of the predictor: the initial guess of the stages, extrapolated from previous steps.
 
-One iteration, of sweeps or of Newton's solver, is made from the straight line, and from what former steps left; what
-remains of the way shows how good each guess was. The stages of one step tell the curve to an order of h more than a
-line does, those of two to more yet, so that at a short step the guess is far better than the line. A wrong table, or
-stages that are not those of the step before, still lead to the solution, only later: no state shows them.
+One iteration is made from the straight line and one from the predictor; the errors that remain are compared. The stages
+of one step predict the curve to a higher order in h than a straight line, those of two steps to a higher order still,
+so that at a small step size the predictor is far better. An error in its tables does not change the solution, only the
+number of iterations, so that no state would show it.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from scvi_codegen.verification.subject import EPSILON, State, Subject
 __all__ = ["guess_checks"]
 
 ONE_ITERATION = SolverOptions(tolerance=1e300)
+"""Solver options that accept any update, so that a step makes one iteration."""
 HALVINGS = 12
 SEEN = 1e4 * EPSILON
-"""What one iteration from the straight line must leave, in parts of the state, to measure a guess beside it."""
+"""Least error that one iteration from the straight line must leave, relative to the state, for a comparison."""
 STEPS = (1, 3, 4)
-"""Before the step that is guessed: from the third on, the two before are both known, and near each other."""
+"""Numbers of steps before the predicted one; from the third on, two previous steps are available."""
 GAINED = 0.25
-"""What a guess may leave in parts of what the line does; at short steps it is a hundredth and less."""
+"""Largest ratio of the errors left by the predictor and by the line; at small h it is 0.01 and less."""
 
 
 def guess_checks(subject: Subject) -> Iterator[Check]:
-    """All of this room, of what iterates; one stage, or curves of degree 1, say no more than the line does."""
+    """Yield the check for implicit methods; one stage, or curves of degree 1, predict no more than a line."""
     method = subject.method
     if method.implicit and method.exactness.curve != 1 and len(discretise(subject.system, method).blocks) > 1:
         promise = "from former steps an iteration leaves less to do than from a straight line, at a short step"
@@ -51,7 +52,7 @@ def _guesses(subject: Subject) -> Finding | None:
 
 
 def _worst(subject: Subject, stepper: Stepper) -> tuple[float, float] | None:
-    """What is left from former steps, in parts of what the line leaves, at the shortest h at which that is seen."""
+    """Return the largest ratio of the errors left by predictor and line, and the smallest h at which it shows."""
     for k in reversed(range(HALVINGS)):
         h = subject.states[0].h / 2**k
         with suppress(StepFailedError):
@@ -62,7 +63,7 @@ def _worst(subject: Subject, stepper: Stepper) -> tuple[float, float] | None:
 
 
 def _left(subject: Subject, stepper: Stepper, h: float, steps: int) -> tuple[float, float]:
-    """After so many steps of h what one iteration leaves, in parts of the state: from the line, from former steps."""
+    """Return the errors left by one iteration after ``steps`` steps, relative to the state: from line and predictor."""
     first, parameters = subject.states[0], subject.parameters
     run = stepper.start(first.q, first.p, h=h, t=first.t, parameters=parameters)
     run.advance(steps)

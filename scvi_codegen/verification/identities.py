@@ -1,4 +1,4 @@
-"""Methods that must be one and the same map, by paths through the generator that differ; solved in 60 digits."""
+"""Identities between methods: the same map by different paths through the generator, solved in 60 digits."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from scvi_codegen.verification.subject import Subject
 __all__ = ["identity_checks"]
 
 EQUAL, ROUNDED = 1e-30, 1e-13
-"""Of equations in 60 digits; of equations whose tables are rounded together to 52 bits."""
+"""Bounds: for equations in 60 digits; for equations whose tables are rounded to 53 bits."""
 OTHER_FORM = "position form is phase-space form for constant mass"
 LARGEST_TWIN = 6
-"""Coordinates up to which Legendre's transform is taken symbolically."""
+"""Largest number of coordinates for which the Legendre transform is done symbolically."""
 
 POINTS: dict[str, Callable[[int], Quadrature]] = {
     "gauss": gauss_legendre,
@@ -53,12 +53,12 @@ POINTS: dict[str, Callable[[int], Quadrature]] = {
     "chebyshev-gauss": fejer,
     "chebyshev-lobatto": clenshaw_curtis,
 }
-"""The quadrature on whose points a family of tableaux collocates."""
+"""Quadrature rule whose points are the abscissae of a collocation tableau."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Twin:
-    """Another way to the same map."""
+    """Method that is the same map by another path."""
 
     name: str
     method: Method
@@ -66,7 +66,7 @@ class _Twin:
 
 
 def identity_checks(subject: Subject) -> Iterator[Check]:
-    """Those that apply to the method and the system."""
+    """Yield the identities that apply to the method and the system."""
     promise = "the same step by another path"
     for twin in _twins(subject.method, forms_of(subject.moved).separable):
         measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
@@ -86,7 +86,7 @@ def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound:
 
 @singledispatch
 def _twins(method: Method, separable: bool) -> Iterator[_Twin]:
-    """Methods that take the same step, where the system is separable or not; of a method that has none here, none."""
+    """Yield methods with the same step for separable or other systems; nothing for a method without such identities."""
     return iter(())
 
 
@@ -157,7 +157,7 @@ def _other(form: str) -> str:
 
 
 def _legendre_twin(subject: Subject) -> Finding | None:
-    """The step of the Hamiltonian of a Lagrangian, or the other way round."""
+    """Compare with the step of the Legendre transform: H from L, or L from H."""
     system, method = subject.moved, subject.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
     shot = isinstance(method, SCVI) and bool(system.forces)
@@ -170,7 +170,7 @@ def _legendre_twin(subject: Subject) -> Finding | None:
 
 
 def _oscillator(method: Method) -> Finding | None:
-    """Of curves fitted to a frequency, whatever the system; with the quadrature that is made for them."""
+    """Check that curves fitted to a frequency, with their own quadrature, are exact on the harmonic oscillator."""
     if not isinstance(method, SVI) or method.frequency is None:
         return None
     if method.quadrature != method.curves.default_rule(method.degree):
@@ -182,7 +182,7 @@ def _oscillator(method: Method) -> Finding | None:
 
 
 def _euler(subject: Subject) -> Finding | None:
-    """Explicit Euler written out: order 1 and nothing else would also be kept by the implicit one."""
+    """Compare explicit Euler with its formula; order 1 alone would also hold for implicit Euler."""
     what = subject.method.specification()
     if what["method"] != "explicit-euler":
         return None

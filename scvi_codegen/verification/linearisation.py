@@ -1,4 +1,4 @@
-"""The derivative of a step by finite differences, and how much rounding may change the step's end."""
+"""Jacobian of a step by finite differences, and the propagation of round-off through it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Array = NDArray[np.float64]
 Map = Callable[[Array], Array]
 
 WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
-"""Central differences of order six."""
+"""Weights of central differences of order six."""
 WIDTHS = (0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4)
-"""In parts of the scales; of two neighbours those that differ least are taken."""
+"""Widths of the differences, relative to the scales; the result is from the two neighbours that agree best."""
 
 
 @dataclass(frozen=True, slots=True)
 class Linearised:
-    """A derivative in units of the scales.
+    """Jacobian of a step in units of the scales.
 
     Attributes:
         matrix: (2m, 2m), dimensionless.
-        uncertainty: of its entries: how much two widths of the differences disagree.
+        uncertainty: error estimate of its entries: the disagreement of two widths.
         scales: (2m,) sizes of q and of p, m times each.
     """
 
@@ -36,13 +36,13 @@ class Linearised:
     scales: Array
 
     def carried(self, change: Array) -> Array:
-        """(2m,) what changes of the arguments, of any signs, make of the end."""
+        """Return (2m,) bounds on the change of the end for changes of the arguments of any sign."""
         spread: Array = self.scales * (np.abs(self.matrix) @ (np.abs(change) / self.scales))
         return spread
 
 
 def linearised(step: Map, state: Array, scales: Array) -> Linearised | None:
-    """The derivative of ``step`` at ``state``; ``None`` where it cannot be evaluated around it."""
+    """Return the Jacobian of ``step`` at ``state``; ``None`` if steps fail in the neighbourhood."""
     best: Linearised | None = None
     before: Array | None = None
     for width in WIDTHS:

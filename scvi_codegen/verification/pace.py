@@ -1,4 +1,4 @@
-"""What runs promise beyond their single steps, where time is transformed, or where steps choose their length."""
+"""Checks of runs with a time transformation or with adaptive step size, beyond those of their single steps."""
 
 from __future__ import annotations
 
@@ -26,31 +26,33 @@ __all__ = ["Pace", "of_one_pace", "pace_checks"]
 Array = NDArray[np.float64]
 
 SHORTER = 8
-"""By so much is the step at which time is measured shorter than the subject's: its error is near rounding."""
+"""Ratio of the test's step size to the one at which times are measured, where the error is near round-off."""
 AS_NEAR = 100.0
-"""A step errs in t by its error in tau and by that of the quadrature, of the same order: by so much more at most."""
+"""Largest ratio of the error in t to that in tau: the quadrature of dt = g dtau has an error of the same order."""
 THERE_AND_BACK, SPAN = 20, 40
-"""Steps of tau, and in steps of the subject how far steps of their own length go."""
+"""Steps of tau there and back; length of adaptive runs in steps of the fixed size."""
 CUT = (2, 0.6)
-"""A time to end at: two steps and a part of the third."""
+"""Target time in steps: two whole steps and part of a third."""
 LOOKED_AT = 7
+"""Number of steps of a run that are checked."""
 LONGER = 4
-"""Steps of a monitor than those of the subject."""
+"""Ratio of the step size of a run with a time-rescaling function to the fixed step size."""
 NEARER = 2.5
+"""Least ratio by which halving tau reduces the deviation of the step sizes from tau g."""
 SOLVED_TO = 1 / 256
-"""Of the tolerance, or to round-off: what sweeps leave of the equations of steps that choose their length."""
+"""Residual of the stage equations of adaptive steps relative to the tolerance."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Runs under test, beside the steps of one length that they are made of.
+    """Runs with variable step sizes, and the fixed steps to compare with.
 
     Attributes:
-        subject: those steps; in transformed time of a system in whose time tau nothing is special.
-        stepper: of the runs: in transformed time, with a monitor, or one whose steps choose their length.
-        system: what moves, in its own time.
-        transformed: the same in that of the stepper, or in its own.
-        tolerance: of steps that choose their length, 0 for round-off.
+        subject: fixed steps; for a time transformation those of the transformed system as an ordinary system in tau.
+        stepper: stepper of the runs: with a time transformation, a time-rescaling function or adaptive step size.
+        system: system in time t.
+        transformed: system in the time of the stepper.
+        tolerance: relative local error of adaptive steps; 0 for round-off.
     """
 
     subject: Subject
@@ -61,59 +63,59 @@ class Pace:
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Without the energy of transformed time, which is that of each state."""
+        """Parameters without the energy of the time transformation, which depends on the state."""
         own = {parameter.name for parameter in self.system.parameters}
         return {name: value for name, value in self.subject.parameters.items() if name in own}
 
     def at_level(self, state: State) -> dict[str, float]:
-        """With it."""
+        """Return the parameters with the energy of a state."""
         level = self.stepper.energy(state.q, state.p, state.t, self.parameters)
         return {**self.parameters, self.stepper.interface.energy_parameter: level}
 
     @property
     def tau(self) -> float:
-        """Of a monitor: long enough for the error of steps to be more than rounding, which other steps would repeat."""
+        """Step size with a time-rescaling function: so large that errors exceed round-off."""
         return LONGER * self.subject.states[0].h
 
     @property
     def unsolved(self) -> float:
-        """Relative to the state: what is left of the equations of a step beyond rounding."""
+        """Residual of the stage equations beyond round-off, relative to the state."""
         return SOLVED_TO * (self.tolerance or 0.0)
 
     @cached_property
     def motion(self) -> ExactMotion:
-        """The exact motion in t."""
+        """Exact motion in t."""
         return exact_motion(self.system.with_parameters(**self.parameters))
 
     @cached_property
     def motion_in_tau(self) -> ExactMotion:
-        """The exact motion of the subject, at the energy of its first state."""
+        """Exact motion in tau, at the energy of the first state."""
         return exact_motion(self.subject.system.with_parameters(**self.at_level(self.subject.states[0])))
 
     def run(self, **how: Any) -> Trajectory:
-        """From the first state of the subject."""
+        """Integrate from the first state of the subject."""
         first = self.subject.states[0]
         return self.stepper.integrate(first.q, first.p, t=first.t, parameters=self.parameters, **how)
 
     def distance(self, motion: ExactMotion, start: State, span: Any, end: Array) -> float:
-        """Of a state from where the exact motion leads, in sizes of positions and of momenta."""
+        """Return the distance of a state from the exact motion, in units of the sizes of q and p."""
         there = np.concatenate(motion.flow(start.q, start.p, span, start.t))
         return float(np.max(np.abs(there - numbers(end)).astype(float) / self.subject.scales(start)))
 
     def rounding(self, state: State) -> float:
-        """The largest rounding error of a step, in the same sizes."""
+        """Return the largest rounding error of a step, in the same units."""
         return float(np.max(self.subject.rounding(state) / self.subject.scales(state)))
 
 
 def of_one_pace(system: MechanicalSystem, energy: float) -> MechanicalSystem:
-    """Transformed time as the time of a system that knows of no other, at this energy; other systems as they are."""
+    """Return the transformed system at an energy as an ordinary system in tau; other systems unchanged."""
     if system.clock is None:
         return system
     return replace(system, clock=None).with_parameters(**{system.clock.energy.name: energy})
 
 
 def pace_checks(pace: Pace) -> Iterator[Check]:
-    """All of this room."""
+    """Yield all checks of this module."""
     for name, promise, measure in _clock(pace) if pace.stepper.interface.energy_parameter else _lengths(pace):
         yield from checked(name, promise, partial(measure, pace))
 
@@ -171,7 +173,7 @@ def _shorter(pace: Pace) -> State:
 
 
 def _as_near(pace: Pace, start: State, steps: int, q: Array, p: Array, span: Any) -> Finding:
-    """The state after ``span`` of t against what so many steps of tau err by."""
+    """Compare the state after a time ``span`` with the exact motion; the bound is the error of the steps in tau."""
     first = np.concatenate(pace.subject.stepper.step(start.q, start.p, start.h, start.t, pace.at_level(start)))
     error = pace.distance(pace.motion_in_tau, start, mp.mpf(start.h), first)
     bound = steps * (AS_NEAR * error + ROUNDINGS * pace.rounding(start))
@@ -197,7 +199,7 @@ def _chosen(pace: Pace, part: float = 1.0) -> Trajectory:
 
 
 def _steps_of(pace: Pace) -> Iterator[tuple[State, Array]]:
-    """Some steps of a run, the first and the last ones among them: where they begin, with their length, and end."""
+    """Yield some steps of a run, including the first and the last: start with step size, and end."""
     run = _chosen(pace)
     for k in np.unique(np.linspace(0, len(run) - 2, LOOKED_AT).astype(int)):
         start = State(run.q[k], run.p[k], float(run.t[k]), float(run.t[k + 1] - run.t[k]))
@@ -219,7 +221,7 @@ def _by_the_monitor(pace: Pace) -> Finding:
 
 
 def _apart_from_the_monitor(pace: Pace, run: Trajectory, tau: float) -> float:
-    """The largest part by which whole steps differ from tau g, the mean of both ends."""
+    """Return the largest relative deviation of the steps from tau (g_k + g_{k+1}) / 2."""
     system = pace.motion.system
     monitor = monitor_function(system, pace.stepper.interface.monitor, in_time=True)
     symbols = (*system.coordinates, *system.auxiliaries, system.time, *system.parameters)
@@ -232,7 +234,7 @@ def _apart_from_the_monitor(pace: Pace, run: Trajectory, tau: float) -> float:
 
 
 def _turned(pace: Pace) -> Finding:
-    """The same run, with what it knows of its pace."""
+    """Return the defect of a run restarted backward from its own saved step density."""
     first, end = pace.subject.states[0], float(_chosen(pace).t[-2])
     run = pace.stepper.start(first.q, first.p, h=pace.tau, t=first.t, t_end=end, parameters=pace.parameters)
     run.record()

@@ -1,11 +1,11 @@
-"""What rounding adds up to: sums that lose nothing, low parts that count, walks that do not drift.
+"""Checks of round-off: compensated sums, low words of the state, and random-walk growth of errors (Brouwer's law).
 
-A step of fixed length changes a state by less than rounding lets a double show; runs therefore carry along what was cut
-off (compensated sums). With them errors walk at random (Brouwer's law), without them, or with coefficients of 53 bits,
-they drift. The first two checks are deterministic: steps so short that the carry is all of them, and a carry so long
-that to forget it anywhere shows. The third is Student's t of what many runs make of an invariant, with sweeps that go
-on until nothing changes. By default they stop when what is left is less than a rounding; it has a sign, and what it
-adds up to is measured by itself.
+A step changes the state by less than doubles resolve; runs therefore carry compensation terms (compensated summation).
+With them errors grow as a random walk, without them, or with coefficients of 53 bits, linearly. The first two checks
+are deterministic: steps so small that their whole increment is in the compensation, and a compensation so large that
+losing it shows. The third is Student's t of the change of invariants over many runs, with fixed-point iterations
+that continue until nothing changes. By default the iterations stop when the residual is below one rounding; the
+residual has a sign, and the drift that it causes is measured by itself.
 """
 
 from __future__ import annotations
@@ -38,29 +38,30 @@ ROUNDINGS = 16.0
 SHORT = 2.0**-40
 SHORT_STEPS = 64
 LOST = 1e-6
-"""Of 64 such steps, relative; a sum that loses what a double cannot hold errs by 1e-3, one that keeps it by 1e-15."""
+"""Bound on the relative error of 64 steps of h 2^-40; without compensation it is 1e-3, with it 1e-15."""
 LONG_CARRY = 1e-6
-"""Part of the state, in place of some 1e-17."""
+"""Compensation relative to the state in tests, instead of about 1e-17."""
 FORGOTTEN = 1e-3
-"""Part of its effect that may be lost; what sweeps leave to second order in h is a tenth of that."""
+"""Part of the effect of the compensation that may be lost; the term of second order in h is a tenth of it."""
 SHORTER = 1 / 64
-"""Part of h: points of a sweep may lack the carry, of second order in h, until its last pass."""
+"""Factor of h: until the last iteration the stages may lack the compensation, a term of second order in h."""
 CARRIED_STEPS = 3
 LANES = 3
 RUNS, SPREAD = 64, 0.02
 WORK, FEWEST_STEPS, MOST_STEPS = 2**14, 2**9, 2**13
-"""Steps times coordinates of each run."""
+"""Numbers of coordinates times steps, and bounds of the number of steps, of each run."""
 STUDENT = 7.0
-"""Of 63 degrees of freedom: sound code exceeds it once in a billion times."""
+"""Bound on Student's t with 63 degrees of freedom; correct code exceeds it once in 10^9 cases."""
 TO_REST = SolverOptions(tolerance=2.0**-68)
+"""Solver options that iterate until nothing changes."""
 LEFT = 0.25
-"""Part of the tolerance, a rounding, that sweeps may leave, see ``templates/support/contraction.h``."""
+"""Residual of the fixed-point iteration, in units of rounding; see ``templates/support/contraction.h``."""
 NO_TRUNCATION = 2.0**-56
-"""Relative change of the energy in one exact step, below which what changes it is rounding."""
+"""Relative energy change of one exact step below which round-off dominates."""
 
 
 def roundoff_checks(subject: Subject) -> Iterator[Check]:
-    """All of this room."""
+    """Yield all checks of this module."""
     for name, promise, measure in (
         ("sums", f"{SHORT_STEPS} steps of h 2^-40 add up to one as long as all", _sums),
         ("low parts", "what rounding cut off a state enters the next step", _low_parts),
@@ -73,12 +74,12 @@ def roundoff_checks(subject: Subject) -> Iterator[Check]:
 
 
 def _compensated(subject: Subject) -> bool:
-    """Whether momenta are sums: those that a Legendre transform gives at each end, or two that cancel, are not."""
+    """Return True if momenta are compensated sums, not results of a Legendre transform at each end."""
     return subject.method.symplectic or subject.method.specification().get("form") == "phase-space"
 
 
 def _carries(subject: Subject) -> bool:
-    """Whether the artefact has sweeps or leapfrog steps, to which carries are handed."""
+    """Return True if the method has fixed-point iterations or leapfrog steps, which use the compensation."""
     forms = forms_of(subject.moved)
     leaps = bool(subject.method.fractions) and (forms.separable or forms.split)
     return leaps or subject.stepper.interface.has_fallback
@@ -92,7 +93,7 @@ def _steppers(subject: Subject) -> tuple[Stepper, ...]:
 def _advanced(
     subject: Subject, stepper: Stepper, state: State, steps: int, carry: Array | None = None
 ) -> tuple[Array, Array]:
-    """(2m,) the state after a run that began with a carry, and (2m,) its carry."""
+    """Return (2m,) the final state of a run started with compensation terms, and (2m,) its compensation terms."""
     run = stepper.start(state.q, state.p, h=state.h, t=state.t, parameters=subject.parameters)
     if carry is not None:
         run.resume_at(0, (state.t, 0.0), (carry[: len(state.q)], carry[len(state.q) :]))
@@ -122,7 +123,7 @@ def _long_carry(state: State, scales: Array) -> Array:
 
 
 def _low_parts(subject: Subject) -> Finding | None:
-    """The same state, a part of it as carry or not, must go the same way; Newton's iteration forgets it by design."""
+    """Compare runs from one state split differently into high and low word; Newton's method ignores the low word."""
     if not (_carries(subject) and _compensated(subject)):
         return None
     state, m = subject.states[0], len(subject.given.q)
@@ -138,7 +139,7 @@ def _low_parts(subject: Subject) -> Finding | None:
 
 
 def _ensemble(subject: Subject) -> Finding | None:
-    """Of lanes that differ, long steps and such that are all carry."""
+    """Compare SIMD lanes with different states with single runs, for ordinary and very small steps."""
     if subject.stepper.ensemble is None:
         return None
     first, worst = subject.states[0], 0.0
@@ -164,7 +165,7 @@ def _beside(state: State, scales: Array, lane: int) -> State:
 
 
 def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> Iterator[tuple[Array, Array]]:
-    """As :func:`_advanced`, of each lane: the states that it stores."""
+    """Yield final state and compensation terms of each lane, as :func:`_advanced`."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
     work = Ensemble(subject.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=subject.parameters)
@@ -183,16 +184,16 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
 
 @dataclass(frozen=True, slots=True)
 class _Invariant:
-    """What exact steps conserve, as a function of (n, m) states and of time: (n,) values and their sizes."""
+    """Conserved quantity as a function of (n, m) states and time: (n,) values and their sizes."""
 
     name: str
     values: Callable[[Array, Array, float], tuple[Array, Array]]
 
 
 def _invariants(subject: Subject) -> list[_Invariant]:
-    """The momentum maps that the method keeps, and the energy where it errs by less than rounding in a step.
+    """Return the momentum maps that the method conserves, and the energy if its error per step is below round-off.
 
-    Where coefficients have low parts or there are none: other sweeps round the increments, which may drift.
+    Empty unless coefficients have low words or there are none: otherwise increments are rounded, which may cause drift.
     """
     stepper, parameters, method = subject.stepper, subject.parameters, subject.method
     exact_sums = _carries(subject) and forms_of(subject.moved).separable and not isinstance(method, SCVI)
@@ -228,7 +229,7 @@ def _keeps_energy(subject: Subject) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Walk:
-    """What many runs from states near each other make of an invariant: mean and spread of its relative changes."""
+    """Mean and standard deviation of the relative changes of an invariant over runs from neighbouring states."""
 
     name: str
     steps: int
@@ -243,17 +244,17 @@ class _Walk:
 
     @property
     def sure(self) -> float:
-        """Of the mean what is no chance, in roundings a step."""
+        """Significant part of the mean, in roundings per step."""
         return max(abs(self.mean) - STUDENT * self.spread / math.sqrt(self.runs), 0.0) / (EPSILON * self.steps)
 
     @property
     def remark(self) -> str:
-        """What was measured, where."""
+        """Description of the measurement."""
         return f"{self.name}, {RUNS} runs of {self.steps} steps"
 
 
 def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Iterator[_Walk]:
-    """Of each invariant."""
+    """Yield the statistics of each invariant."""
     invariants = _invariants(subject)
     if not invariants:
         return
@@ -272,7 +273,7 @@ def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Arr
 
 
 def _runs(subject: Subject, options: SolverOptions | None, q: Array, p: Array, steps: int) -> tuple[Array, Array]:
-    """The ends of runs, one by one."""
+    """Return the final states of runs, one by one."""
     ends = []
     given: dict[str, Any] = {"h": subject.given.h, "t": subject.given.t, "parameters": subject.parameters}
     for start in zip(q, p, strict=True):
@@ -283,7 +284,7 @@ def _runs(subject: Subject, options: SolverOptions | None, q: Array, p: Array, s
 
 
 def _judged(walks: Iterator[_Walk]) -> Finding | None:
-    """The largest t."""
+    """Return the largest Student's t."""
     return max((Finding(walk.student, STUDENT, walk.remark) for walk in walks), default=None)
 
 

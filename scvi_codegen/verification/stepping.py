@@ -1,4 +1,4 @@
-"""Whether the compiled step solves the equations of its method: against 60 digits, and by finite differences."""
+"""Checks of the compiled step against the stage equations of the method, in 60 digits and by finite differences."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ __all__ = ["step_checks"]
 Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0
-"""Roundings, each of the size that the state itself has, that a step may add up."""
+"""Bound on the error of a step, in roundings of the size of the state."""
 ANY_UPDATE = SolverOptions(tolerance=1e300)
-"""Newton's iteration ends after its first update."""
+"""Solver options that end Newton's method after its first update."""
 SHORTEST_WAY = 1e6
-"""In units of rounding: what a first update must go, for its end to tell a wrong matrix from an exact one."""
+"""Least size of the first update in units of rounding, for it to distinguish a wrong matrix."""
 SMALLER, MOST_SWEEPS = 256, 10
-"""An iteration that contracts in proportion to h, somehow at h, takes 52 bits / 8 bits a sweep at h / 256; some more
-for the first and the last one."""
+"""Divisor of h, and bound on iterations at h/256.
+
+There an error factor proportional to h is at most 2^-8 per iteration: 53 bits take 7, plus a few."""
 MOST_TRIED = 30
+"""Largest limit on iterations that is tried to reach the fallback solver."""
 RUN_STEPS, LOOKED_AT = 12, (0, 1, 2, 5, 11)
-"""Of a run: the first steps have less to remember."""
+"""Length of the run, and the steps of it that are checked; the first ones have no full predictor history."""
 STATIONARY = 1e-25
 TRANSFORM = 1e-11
 SLOPES = 1e-6
@@ -42,7 +44,7 @@ SLOPE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
 
 
 def step_checks(subject: Subject) -> Iterator[Check]:
-    """All of this room."""
+    """Yield all checks of this module."""
     for name, promise, measure in (
         ("stage equations", "a step solves the paper's equations (60 digits)", _artefact),
         ("Newton's solver", "it solves the same equations", _newton),
@@ -80,7 +82,7 @@ def _solves(subject: Subject, stepper: Stepper) -> Finding:
 
 
 def _agree(subject: Subject) -> Finding | None:
-    """What can be said of large systems, too."""
+    """Compare the stepper under test with Newton's method; applies to large systems, too."""
     if subject.newton is None or subject.newton is subject.stepper:
         return None
     worst = 0.0
@@ -91,7 +93,7 @@ def _agree(subject: Subject) -> Finding | None:
 
 
 def _apart(subject: Subject, state: State, end: Array, expected: SolvedStep) -> float:
-    """Largest distance from the step in 60 digits in units of rounding."""
+    """Return the largest difference from the step in 60 digits, in units of rounding."""
     return float(np.max(np.abs(end - _joined(expected).astype(float)) / subject.rounding(state)))
 
 
@@ -100,7 +102,7 @@ def _joined(step: SolvedStep) -> Numbers:
 
 
 def _matrix(subject: Subject) -> Finding | None:
-    """The first update from the straight line, a way that an exact matrix and a wrong one go differently."""
+    """Compare the first Newton update from the straight line with the exact one, in units of rounding."""
     if subject.newton is None:
         return None
     end = _joined(subject.solved(0))
@@ -123,7 +125,7 @@ def _size(vector: Numbers, scales: Array) -> float:
 
 
 def _fallback(subject: Subject) -> Finding | None:
-    """Newton's iteration in the artefact itself, reached where so few sweeps do not converge."""
+    """Check Newton's method as fallback of the stepper under test, reached with a limit on the iterations."""
     if subject.newton is None or not subject.stepper.interface.has_fallback:
         return None
     for factor, start in itertools.product((1, 2, 4, 8, 16), subject.states):
@@ -141,7 +143,7 @@ def _fallback(subject: Subject) -> Finding | None:
 
 
 def _counted(subject: Subject, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
-    """Iterations of a step of the artefact, and its end."""
+    """Return the number of iterations of a step, and its end state."""
     run = subject.stepper.integrate(
         state.q, state.p, h=state.h, steps=1, t=state.t, parameters=subject.parameters, options=options
     )
@@ -158,7 +160,7 @@ def _contraction(subject: Subject) -> Finding:
 
 
 def _run(subject: Subject) -> Finding:
-    """A run remembers stages and carries rounding errors; each of its steps must be the step all the same."""
+    """Compare the steps of a run, with predictor and compensation, with single steps from the same states."""
     worst = max(_run_of(subject, stepper) for stepper in {subject.stepper, subject.newton or subject.stepper})
     return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also by Newton's solver alone")
 
@@ -174,7 +176,7 @@ def _run_of(subject: Subject, stepper: Stepper) -> float:
 
 
 def _action(subject: Subject) -> Finding | None:
-    """The action S by evaluation of L alone, its slopes by differences: dS = p1 dq1 - p0 dq0 at the solution."""
+    """Check dS = p1 dq1 - p0 dq0 at the solution: S from L alone, its derivatives by finite differences."""
     if subject.system.forces or subject.system.damping != 0:
         return None
     state, equations, solved = subject.states[0], subject.derived(), subject.solved(0)
@@ -207,7 +209,7 @@ def _relative(found: Array, expected: Numbers) -> float:
 
 
 def _discrete(subject: Subject) -> Finding | None:
-    """The discrete Lagrangian and its slopes, compiled, by central differences."""
+    """Compare the compiled discrete Legendre transforms with central differences of the discrete Lagrangian."""
     stepper, state = subject.stepper, subject.states[0]
     if not stepper.interface.has_action:
         return None
@@ -224,7 +226,7 @@ def _discrete(subject: Subject) -> Finding | None:
 
 
 def _slopes_of_action(subject: Subject, state: State, q1: Array) -> Array:
-    """(2m,) derivatives of the compiled L_d by q0 and q1; of several widths two that agree best."""
+    """Return (2m,) derivatives of the compiled L_d with respect to (q0, q1), from the widths that agree best."""
     m, both = len(state.q), np.concatenate([state.q, q1])
 
     def action(ends: Array) -> float:

@@ -1,4 +1,4 @@
-"""What the compiled map preserves: dq ^ dp, the way back, momentum maps; and how large its steps may be."""
+"""Checks of preserved structure: symplectic form, reversibility, momentum maps, constraints; largest usable step."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 
 ROUNDINGS = 16.0
 SPREAD = 10.0
-"""By how much the error of the derivative may exceed the disagreement of two widths of differences."""
+"""Safety factor of the error of the finite-difference Jacobian over the disagreement of two widths."""
 TOO_ROUGH = 1e-6
+"""Noise of the differences above which symplecticity is not judged."""
 STEPS, LOOKED_AT = 1000, 20
 MULTIPLIER_BOUND = 1e-10
 DOUBLINGS, BISECTIONS = 24, 10
@@ -33,7 +34,7 @@ TRIED = 3
 
 
 def structure_checks(subject: Subject) -> Iterator[Check]:
-    """All of this room that is promised."""
+    """Yield the checks that apply to method and system."""
     if is_symplectic(subject.method, subject.system):
         promise = "J^T Omega J = Omega, J by finite differences of the compiled step"
         yield from checked("symplecticity", promise, partial(_symplecticity, subject))
@@ -74,9 +75,9 @@ def _symplecticity(subject: Subject) -> Finding:
 
 
 def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
-    """(2m, 2m) sizes of J^T Omega J - Omega, and of their noise, each in units of the areas of its two coordinates.
+    """Return (2m, 2m) absolute values of J^T Omega J - Omega, and their noise, scaled by the areas of coordinate pairs.
 
-    Omega is shrunk by the damping of a step.
+    ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system.
     """
     m, J = len(around.scales) // 2, around.matrix
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(around.scales, around.scales)
@@ -88,7 +89,7 @@ def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
 
 
 def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, Array]:
-    """The same of areas along the constrained phase space, in units of those of its directions."""
+    """Return the defect and its noise on the constrained phase space, in units of the areas of its directions."""
     m, scale = len(around.scales) // 2, around.scales
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scale, scale)
     unit = np.median(scale[:m] * scale[m:])
@@ -99,7 +100,7 @@ def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, A
 
 
 def _constraints(subject: Subject) -> Finding:
-    """G and its rate at states along a run, in units of what rounding each number of the state changes them by."""
+    """Return the largest constraint residual and its rate along a run, in units of its rounding errors."""
     first, stepper, parameters = subject.states[0], subject.stepper, subject.held
     q, p = stepper.project(first.q, first.p, t=first.t, parameters=parameters)
     run = stepper.integrate(q, p, h=first.h, steps=STEPS, t=first.t, parameters=parameters)
@@ -109,13 +110,13 @@ def _constraints(subject: Subject) -> Finding:
         units = EPSILON * np.maximum(np.abs(state.z), subject.scales(state))
         slopes = np.abs(subject.constraint_slopes(state, units / EPSILON)).sum(axis=1) + _by_time(subject, state)
         values = np.abs(np.concatenate(stepper.constraint_values(state.q, state.p, state.t, parameters)))
-        said = slopes > 0.0  # a constraint of velocities says nothing of positions
+        said = slopes > 0.0  # a constraint on velocities has no position residual
         worst = max(worst, float(np.max(values[said] / (EPSILON * slopes[said]))))
     return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
 
 
 def _by_time(subject: Subject, state: State) -> Array:
-    """(2c,) what a rounding of the time of a state changes constraints and their rates by, in units of rounding."""
+    """Return (2c,) changes of constraints and of their rates by a rounding of time, in units of rounding."""
     moment = 1e-5 * (abs(state.t) + abs(state.h))
     values = [
         np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t + sign * moment, subject.held))
@@ -125,7 +126,7 @@ def _by_time(subject: Subject, state: State) -> Array:
 
 
 def _multipliers(subject: Subject) -> Finding:
-    """The acceleration that they give, by the formula alone, against that of the exact motion."""
+    """Compare the compiled Lagrange multipliers with those of the exact motion."""
     state, motion = subject.states[0], subject.motion
     q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
     v = motion.velocity(q, p, t)
@@ -146,13 +147,13 @@ def _reversal(subject: Subject) -> Finding:
 
 
 def _carried_back(subject: Subject, back: State, rounding: Array) -> Array:
-    """What the step back makes of the rounding errors of the step there."""
+    """Return the bound on the rounding errors of the forward step after the backward step."""
     around = subject.linearised(back)
     return rounding if around is None else around.carried(rounding)
 
 
 def _momentum(subject: Subject, k: int) -> Finding:
-    """The k-th momentum map along a run."""
+    """Measure the change of the k-th momentum map along a run."""
     given, stepper = subject.given, subject.stepper
     try:
         run = stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t, parameters=stepper.defaults)
@@ -164,7 +165,7 @@ def _momentum(subject: Subject, k: int) -> Finding:
 
 
 def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
-    """The change of the k-th momentum map along a run of such steps."""
+    """Return the largest relative change of the k-th momentum map along a run, with its random-walk bound."""
     steps = len(run) - 1
     bound = ROUNDINGS * EPSILON * float(np.sqrt(steps))
     error = float(np.abs(run.momentum_errors()[:, k]).max())
@@ -172,7 +173,7 @@ def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
 
 
 def largest_step(subject: Subject) -> Check:
-    """By bisection: the longest step for which the stage equations are solved, three times in a row."""
+    """Return the largest step size at which the stage equations are solved three times in a row, by bisection."""
     name, what = "largest step", f"stage equations are solved up to h, {TRIED} steps in a row"
     given = subject.states[0]
 

@@ -1,4 +1,4 @@
-"""What is verified: the artefact, Newton's solver beside it, and states with nothing special about them."""
+"""System under test: the stepper, a stepper with Newton's method alone, and generic states."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ Array = NDArray[np.float64]
 
 EPSILON = 2.0**-52
 WIDTH = 1e-5
-"""Of differences of constraints, in parts of a state."""
+"""Width of differences of constraints, relative to the state."""
 NUDGE, NUDGES = 0.05, 6
-"""Part of its size by which a state is moved off the given one; so often less, four times each, until a step works."""
+"""Perturbation of the initial state relative to its size; divided by 4 up to six times until a step succeeds."""
 PARAMETER_NUDGE = 0.05
 LATER = 5
-"""Steps from the first state to the second."""
+"""Number of steps from the first state to the second."""
 MOST_COORDINATES = 12
-"""Whose exact motion is computed: with 18, six bodies in space, it takes minutes."""
+"""Largest number of coordinates whose exact motion is computed; 18 take minutes."""
 SUCH_STEPS, LONG_SECONDS = 12, 10.0
-"""As many steps in 60 digits take as long as a certificate of many unknowns; from when on it is said beforehand."""
+"""Number of 60-digit steps that take as long as a certificate of a large system; duration that is announced."""
 LARGEST = 200
-"""Unknowns of a step whose equations are solved in 60 digits."""
+"""Largest number of unknowns of a step solved in 60 digits."""
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """(q, p) at t, and a step to take from there."""
+    """State (q, p) at time t, and the size h of the step to take from it."""
 
     q: Array
     p: Array
@@ -50,19 +50,20 @@ class State:
 
     @property
     def z(self) -> Array:
-        """(2m,) q and p."""
+        """Phase-space vector (q, p), (2m,)."""
         return np.concatenate([self.q, self.p])
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An integrator under test.
+    """Integrator under test.
 
     Attributes:
-        system, method: what it integrates and how.
-        stepper: as built.
-        newton: the same with Newton's solver alone, or ``None``.
-        given: the state and the step asked for.
+        system: mechanical system.
+        method: method of the stepper.
+        stepper: stepper as built.
+        newton: stepper with Newton's method alone, or ``None``.
+        given: state and step size of the certificate.
     """
 
     system: MechanicalSystem
@@ -73,7 +74,7 @@ class Subject:
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Values a little off the defaults, where they work: masses that are all 1 would hide which is which."""
+        """Values slightly off the defaults, if steps succeed: equal masses would hide interchanged ones."""
         moved = {
             name.name: value * (1 + PARAMETER_NUDGE * np.sin(k + 1.0)) if value else PARAMETER_NUDGE * np.cos(k + 1.0)
             for k, (name, value) in enumerate(self.system.constants.items())
@@ -86,13 +87,13 @@ class Subject:
 
     @property
     def held(self) -> dict[str, float]:
-        """:attr:`parameters` with inputs that stay what they are: for long runs, on which cubics would grow."""
+        """:attr:`parameters` with constant inputs, for long runs on which cubic inputs would grow."""
         rates = [f"{name}_{power}" for name in self.stepper.interface.inputs for power in "123"]
         return self.parameters | dict.fromkeys(rates, 0.0)
 
     @property
     def damping(self) -> float:
-        """The rate at :attr:`parameters`, 0 without one."""
+        """Damping rate at :attr:`parameters`; 0 without damping."""
         values = {parameter: self.parameters[parameter.name] for parameter in self.system.parameters}
         return float(self.system.damping.xreplace(values))
 
@@ -109,12 +110,12 @@ class Subject:
 
     @cached_property
     def moved(self) -> MechanicalSystem:
-        """The system with :attr:`parameters` as defaults."""
+        """System with :attr:`parameters` as defaults."""
         return self.system.with_parameters(**self.parameters)
 
     @cached_property
     def motion(self) -> ExactMotion:
-        """The exact motion of :attr:`moved`.
+        """Exact motion of :attr:`moved`.
 
         Raises:
             StateError: if it has too many coordinates.
@@ -127,7 +128,7 @@ class Subject:
 
     @cached_property
     def states(self) -> tuple[State, State]:
-        """Two states off the given one, without its symmetries: a step forward from the first, back from the second."""
+        """Two generic states: a step forward is taken from the first, a step backward from the second."""
         first = self._nudged()
         now = first
         for _ in range(LATER):
@@ -154,19 +155,19 @@ class Subject:
         return given
 
     def _met(self, q: Array, p: Array, t: float) -> tuple[Array, Array]:
-        """The state that meets the constraints, if there are any, next to (q, p)."""
+        """Return the projection of (q, p) onto the constraint manifold, if there are constraints."""
         if not self.system.constraints:
             return q, p
         return self.stepper.project(q, p, t=t, parameters=self.parameters)
 
     def tangents(self, state: State) -> Array:
-        """(2m, 2(m - c)) directions in units of :meth:`scales` along which constraints and their rates stay 0."""
+        """Return (2m, 2(m - c)) directions, in units of :meth:`scales`, tangent to the constrained phase space."""
         left = 2 * (len(state.q) - len(self.system.constraints))
         found: Array = np.linalg.svd(self.constraint_slopes(state, self.scales(state)))[2][-left:].T
         return found
 
     def constraint_slopes(self, state: State, units: Array) -> Array:
-        """(2c, 2m) derivatives of the constraints and of their rates by the state, in such units of it."""
+        """Return (2c, 2m) derivatives of constraints and their rates with respect to the state, in ``units``."""
         m, columns = len(state.q), []
         for unit in np.diag(WIDTH * units):
             ends = [state.z + sign * unit for sign in (1, -1)]
@@ -177,18 +178,19 @@ class Subject:
     def step(
         self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None
     ) -> tuple[Array, Array]:
-        """(q1, p1) of the compiled step. Raises as :meth:`Stepper.step`."""
+        """Return (q1, p1) of the compiled step; raises as :meth:`Stepper.step`."""
         stepper = stepper or self.stepper
         return stepper.step(state.q, state.p, state.h, state.t, self.parameters, options=options)
 
     def ends(self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None) -> Array:
-        """(2m,) the same in one."""
+        """Return the end of a step as one vector (2m,)."""
         return np.concatenate(self.step(state, stepper, options))
 
     def scales(self, state: State) -> Array:
-        """(2m,) size of q, then of p: of the state or, if that is less, of what a step changes.
+        """Return (2m,) the size of q and of p: of the state or, if larger, of its change in a step.
 
-        One size serves all coordinates; momenta have the size that a common velocity gives each, whatever its mass.
+        All coordinates have the same size. The size of a momentum is its change for a common change of the velocities,
+        whatever its mass.
         """
         m = len(state.q)
         try:
@@ -200,7 +202,7 @@ class Subject:
         return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, sizes[1])])
 
     def _momentum_sizes(self, state: State, size: float) -> Array:
-        """(m,) what each momentum changes by if its velocity does by their mean; ``size`` where none has any."""
+        """Return (m,) changes of the momenta for a change of velocity by its mean; ``size`` for those without."""
         m = len(state.q)
         try:
             v = self.stepper.velocity(state.q, state.p, state.t)
@@ -212,7 +214,7 @@ class Subject:
         return np.where(own > 0.0, own, size)
 
     def linearised(self, state: State) -> Linearised | None:
-        """The derivative of the step at a state, by differences."""
+        """Return the Jacobian of the step at a state, by finite differences."""
         m = len(state.q)
 
         def step(z: Array) -> Array:
@@ -221,7 +223,7 @@ class Subject:
         return linearised(step, state.z, self.scales(state))
 
     def rounding(self, state: State) -> Array:
-        """(2m,) what one rounding of each number that enters a step can change at its end."""
+        """Return (2m,) bounds on the change of the end by one rounding of each number that enters a step."""
         end, around = self.ends(state), self.linearised(state)
         carried = np.abs(state.z) if around is None else around.carried(state.z)
         moment = 1e-6 * state.h
@@ -233,10 +235,10 @@ class Subject:
         return total + np.finfo(float).tiny
 
     def derived(self, method: Method | None = None, system: MechanicalSystem | None = None) -> DerivedStep:
-        """The equations of the step in 60 digits; of another method or system where given.
+        """Return the equations of the step in 60 digits, optionally of another method or system.
 
         Raises:
-            StateError: if they are too many.
+            StateError: if there are too many unknowns.
         """
         found = derived_step(system or self.motion.system, method or self.method)
         if found.unknowns > LARGEST:
@@ -250,7 +252,7 @@ class Subject:
         return {}
 
     def solved(self, index: int) -> SolvedStep:
-        """The step from a state of :attr:`states` in 60 digits. Raises as :meth:`derived` and its solution do."""
+        """Return the step from a state of :attr:`states` in 60 digits; raises as :meth:`derived` and its solution."""
         if index not in self._solved:
             state, derived = self.states[index], self.derived()
             known = state.q, state.p, state.h, state.t
@@ -262,7 +264,7 @@ class Subject:
         return self._solved[index]
 
     def roundings(self) -> Iterator[tuple[int, State, Array]]:
-        """Each state with its number and the size of rounding there."""
+        """Yield each state with its index and rounding error."""
         for index, state in enumerate(self.states):
             yield index, state, self.rounding(state)
 

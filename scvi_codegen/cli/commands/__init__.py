@@ -1,1 +1,1 @@
-"""A file a command: its options, and what it prints."""
+"""Commands of ``scvi-codegen``, one module each: options, and the report that is printed."""

@@ -1,4 +1,4 @@
-"""``scvi-codegen bench``: this project and others in turn, at equal error."""
+"""Command ``scvi-codegen bench``: timings of this package and of other integrators at equal error."""
 
 from __future__ import annotations
 

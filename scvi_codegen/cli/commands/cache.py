@@ -1,4 +1,4 @@
-"""``scvi-codegen cache``: the compiled integrators that are kept."""
+"""Command ``scvi-codegen cache``: the cache of compiled integrators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scvi-codegen derive``: the equations of one step, or the page from L to C."""
+"""Command ``scvi-codegen derive``: the equations of one step, or the page from L to C."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
 
 
 def _formulas(of: StepEquations) -> dict[str, Any]:
-    """What ``--json`` says: formulas as text, of the equations what is to be 0, of the end the new values in order."""
+    """Return the document of ``--json``: formulas as text, equations as residuals, the new state in order."""
     return {
         "unknowns": [symbol.name for symbol in of.unknowns],
         "equations": [{"number": each.number, "residual": str(each.residual)} for each in of.equations],

@@ -1,4 +1,4 @@
-"""``scvi-codegen doctor``: what this machine has and lacks."""
+"""Command ``scvi-codegen doctor``: report what this machine has and lacks."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def doctor() -> None:
 
 
 def _lines(finding: Equipment) -> str:
-    """Status, name and what was found; below it what to do."""
+    """Return a line with status, name and description of a check, and indented lines with the remedy."""
     indent = " " * (STATUS_WIDTH + NAME_WIDTH + 2)
     first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.found}"
     return "\n".join([first, *(f"{indent}{line}" for line in finding.remedy.splitlines())])

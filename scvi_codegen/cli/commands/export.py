@@ -1,4 +1,4 @@
-"""``scvi-codegen export``: one file of a run in a folder."""
+"""Command ``scvi-codegen export``: write the states of a run in a folder to one file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scvi-codegen generate``: C, a Makefile and a Python package in a folder; or an FMU."""
+"""Command ``scvi-codegen generate``: C, a Makefile and a Python package in a folder; or an FMU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scvi-codegen methods``: the methods and their properties, or a tableau."""
+"""Command ``scvi-codegen methods``: list the methods and their properties, or print a tableau."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ EXAMPLES: dict[str, dict[str, int | list[float]]] = {
     "collocation": {"abscissae": [0.25, 0.75]},
     "composition": {"order": 8},
 }
+"""Arguments of the examples in the list; methods with stages that are absent here have ``EXAMPLE_STAGES``."""
 EXAMPLE_STAGES = 3
 LONGEST_EXACT = 32
-"""Characters of an entry that stands in a tableau; longer ones stand below it."""
+"""Largest number of characters of an entry inside a tableau; tables with longer entries list them below."""
 
 
 @click.command()
@@ -47,7 +48,7 @@ def methods(tableau: str | None) -> None:
 
 
 def _entries_of(name: str) -> Iterator[dict[str, Any]]:
-    """What is known of a method by an example of it, and by one of the form that the paper prints."""
+    """Yield the properties of an example of a method, and of the printed form of the paper if there is one."""
     variants: list[dict[str, Any]] = [{}, {"variational": False}] if "variational" in ARGUMENTS[name] else [{}]
     for variant in variants:
         method = method_from_specification({**_example(name).specification(), **variant})
@@ -63,7 +64,7 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
 
 
 def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
-    """A line for each method with its arguments, and the properties of an example."""
+    """Return a line for each method with its arguments, and the properties of an example."""
     rows, last = [("name", "arguments", "example", "order", "symplectic", "symmetric")], ""
     for entry in entries:
         name = f"{entry['name']}[:{entry['number']}]" if entry["number"] else entry["name"]
@@ -76,9 +77,9 @@ def methods_table(entries: Iterable[Mapping[str, Any]]) -> str:
 
 
 def tableau_text(name: str) -> str:
-    """Butcher tableau of a name such as ``gauss:3``, in radicals where these are known, else in 17 digits.
+    """Return the Butcher tableau of a name such as ``gauss:3``, in radicals if known and short, else in 17 digits.
 
-    Radicals that are too long for a tableau stand below that of 17 digits, an entry a line.
+    Long radicals are listed below the decimal tableau, one entry a line.
 
     Raises:
         MethodError: if there is no such tableau.
@@ -107,7 +108,7 @@ def tableau_text(name: str) -> str:
 
 
 def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterator[str]:
-    """A line for each."""
+    """Yield a line for each entry of a tableau."""
     yield from (f"c_{i} = {x}" for i, x in enumerate(c, 1))
     yield from (f"a_{i},{j} = {x}" for i, line in enumerate(A, 1) for j, x in enumerate(line, 1))
     yield from (f"b_{j} = {x}" for j, x in enumerate(b, 1))
@@ -123,7 +124,7 @@ def _yes_or_not(holds: bool) -> str:
 
 
 def _decimals(row: Any) -> Any:
-    """A number, or a row of them, in 17 digits."""
+    """Return a number, or a row of numbers, in 17 digits."""
     return [float(_decimal(x)) for x in row] if hasattr(row, "__len__") else float(_decimal(row))
 
 

@@ -1,4 +1,4 @@
-"""``scvi-codegen reproduce``: run experiments of the paper, write their files, say what was found."""
+"""Command ``scvi-codegen reproduce``: run experiments of the paper, write their files and print the verdicts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["reproduce"]
 
 EVERYTHING = "all"
 SHOWN_NAMES = 40
-"""Characters of the names beside the progress bar."""
+"""Largest number of characters of the names next to the progress bar."""
 
 
 @click.command()
@@ -73,13 +73,13 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
 
 @dataclass(kw_only=True)
 class Reproduction:
-    """What came of it.
+    """Result of a run of experiments.
 
     Attributes:
-        results: in the order they came.
-        failures: experiments that gave none.
-        files: written, the page of all results last.
-        interrupted: whether the user ended it.
+        results: results in the order of completion.
+        failures: experiments that raised an error.
+        files: files written; the page of all results last.
+        interrupted: True if Ctrl-C ended the run.
     """
 
     results: list[Result] = field(default_factory=list)
@@ -88,7 +88,7 @@ class Reproduction:
     interrupted: bool = False
 
     def summary(self) -> str:
-        """The verdicts counted, and what was written."""
+        """Return the number of results by verdict, and the files written."""
         counts = [
             counted(len(self.results), "result"),
             *(text for _, text in tally([result.verdict for result in self.results])),
@@ -97,7 +97,7 @@ class Reproduction:
         return f"{', '.join(counts)}\nwrote {counted(len(self.files), 'file')} to {' and '.join(folders)}"
 
     def numbers(self) -> dict[str, Any]:
-        """What ``--json`` says."""
+        """Return the document of ``--json``."""
         return {
             "results": [
                 {"name": each.name, "title": each.title, "verdict": each.verdict.value} for each in self.results
@@ -108,19 +108,19 @@ class Reproduction:
         }
 
     def failed(self) -> str:
-        """A line for each failure."""
+        """Return a line for each failure."""
         lines = [f"  {failure.name}: {failure.message}" for failure in self.failures]
         return "\n".join([f"{counted(len(lines), 'experiment')} failed to run", *lines])
 
 
 def experiments_titles(names: Sequence[str] = (EVERYTHING,), *, module: str = CATALOGUE) -> dict[str, str]:
-    """What each experiment that is to be run is, by its name."""
+    """Return the titles of the experiments to run, by name."""
     experiments = catalogue(module)
     return {name: experiments[name].title for name in _chosen(names, experiments)}
 
 
 def experiments_table(titles: Mapping[str, str]) -> str:
-    """A line for each."""
+    """Return a line for each experiment."""
     width = max(map(len, titles), default=0)
     return "\n".join(f"{name:{width}}  {title}" for name, title in titles.items())
 
@@ -134,9 +134,9 @@ def reproduce_experiments(
     module: str = CATALOGUE,
     say: Callable[[str], None] = click.echo,
 ) -> Reproduction:
-    """Run experiments and what they need; write files of each result when it is there, and the page at the end.
+    """Run experiments and those they depend on; write the files of each result, and the page at the end.
 
-    Each result is a line to ``say``. Ctrl-C ends it; what was written stays.
+    Each result is a line passed to ``say``. Ctrl-C ends the run; files written before remain.
 
     Raises:
         StateError: for an unknown name.
@@ -167,7 +167,7 @@ def _chosen(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list
 
 
 def _add(done: Reproduction, outcome: Result | Failure, folder: Path) -> str:
-    """Keep and write an outcome; what to say of it."""
+    """Store and write a result; return the line to print."""
     if isinstance(outcome, Failure):
         done.failures.append(outcome)
         return f"failed: {outcome.message}"
@@ -186,7 +186,7 @@ def _write_page(results: Sequence[Result], path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """``show`` names the running experiments, ``say`` prints a line and counts one as done."""
+    """Progress bar of experiments: ``show`` displays the running ones, ``say`` prints a line and counts one as done."""
 
     show: Callable[[Sequence[str]], None]
     say: Callable[[str], None]
@@ -194,7 +194,7 @@ class _Progress:
 
 @contextmanager
 def _progress(length: int, say: Callable[[str], None]) -> Iterator[_Progress]:
-    """A bar on stderr if that is a terminal, with the lines said above it."""
+    """Show a bar on stderr if that is a terminal, with the printed lines above it."""
     if not sys.stderr.isatty() or not length or is_quiet():
         yield _Progress(lambda names: None, say)
         return

@@ -1,4 +1,4 @@
-"""``scvi-codegen run``: integrate a model, or many, in memory or into a folder, and sum up what was conserved."""
+"""Command ``scvi-codegen run``: integrate a model or an ensemble, in memory or into a folder, and print a summary."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def run(
     threads: int | None,
     **choices: Any,
 ) -> None:
-    """What ``ABOUT`` says."""
+    """Integrate MODEL; the help text is ``ABOUT``."""
     recording = Recording(seconds=checkpoint, steps=checkpoint_steps, certificate=certificate)
     if resume is not None:
         check_resumed(click.get_current_context())
@@ -188,7 +188,7 @@ def run(
 
 
 def _check_confirmed(found: GlobalError | None) -> None:
-    """End with exit status 1 where a global error was asked for and is not confirmed."""
+    """End with exit status 1 if a global error bound was requested and is not confirmed."""
     if found is not None and not found.confirmed:
         unconfirmed = f"the global error {found.requested:g} is confirmed until t = {found.confirmed_until:g} only"
         tell(broken=unconfirmed)
@@ -198,7 +198,7 @@ def _check_confirmed(found: GlobalError | None) -> None:
 def _with_steps(
     model: Model, wanted: dict[str, float | None], solver: str, options: SolverOptions | None
 ) -> tuple[Model, GlobalError | None]:
-    """Return the model with the steps that one of the wanted errors determines, and what confirms them."""
+    """Return the model with the steps that one of the requested errors determines, and the estimated global error."""
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
         return controlled_model(model, tolerance), None
@@ -212,7 +212,7 @@ def _with_steps(
 def _sums_with_steps(
     model: IndexedModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
 ) -> tuple[IndexedModel, GlobalError | None]:
-    """Return as :func:`_with_steps`, for sums over indices."""
+    """Return the same as :func:`_with_steps` for indexed systems."""
     if wanted["tolerance"] is not None:
         return controlled_model(model, wanted["tolerance"]), None
     bound = model.error if wanted["error"] is None else wanted["error"]
@@ -222,7 +222,7 @@ def _sums_with_steps(
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
-    """Find out before a long run whether its results can be written."""
+    """Check before a long run that its files can be written."""
     if output is not None and not (ensemble is None and is_folder(output)):
         check_format(output, ensemble=ensemble is not None)
         check_writable(Path(output), "'-o'")
@@ -291,7 +291,7 @@ def _run_one(
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
-    """Say what came of a recorded run, and how to go on with it."""
+    """Print the summary of a run in a folder, and how to continue it."""
     tell(outcome.summary(), **recorded_numbers(outcome.recorded), failure=failure_text(outcome))
     if outcome.failure is not None:
         raise CommandFailure(f"{outcome.failure}\n{outcome.kept()}", FAILURE)

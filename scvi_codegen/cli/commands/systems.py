@@ -1,4 +1,4 @@
-"""``scvi-codegen systems``: the catalogue of systems, or one of them as a model file."""
+"""Command ``scvi-codegen systems``: list the catalogue, or print one system as a model file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def systems(name: str | None) -> None:
 
 
 def _entry(name: str) -> dict[str, Any]:
-    """A problem: its name, what it is, coordinates, and parameters with their values."""
+    """Return name, description, coordinates and parameter values of a system of the catalogue."""
     entry = problem(name)
     values = zip(map(str, entry.system.parameters), entry.system.defaults, strict=True)
     coordinates = [coordinate.name for coordinate in entry.system.coordinates]
@@ -45,7 +45,7 @@ def _entry(name: str) -> dict[str, Any]:
 
 
 def systems_table(entries: Sequence[Mapping[str, Any]]) -> str:
-    """A line for each problem: name, coordinates, what it is, parameters."""
+    """Return a line for each system: name, number of coordinates, description, parameters."""
     rows = [("name", "m", "description", "parameters")]
     for entry in entries:
         parameters = ", ".join(f"{name}={value:g}" for name, value in entry["parameters"].items())

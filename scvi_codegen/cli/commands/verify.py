@@ -1,4 +1,4 @@
-"""``scvi-codegen verify``: the certificate of a model, or of a generated folder as it stands."""
+"""Command ``scvi-codegen verify``: the certificate of a model, or of the C code in a generated folder."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
 
 
 def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
-    """The certificate of a model file, an entry of the catalogue or a generated folder.
+    """Return the certificate of a model file, a system of the catalogue or a generated folder.
 
     Raises:
         click.UsageError: for a folder with another method or solver than it was generated with.
@@ -117,7 +117,10 @@ def _certificate_of_sums(model: IndexedModel, stepper: IndexedStepper) -> Certif
 
 
 def _certificate_path(name: str) -> Path | None:
-    """Beside the artefact: in a generated folder, beside a model file; ``None`` for a name of the catalogue."""
+    """Return the default path of the certificate: in the generated folder, or next to the model file.
+
+    ``None`` for a system of the catalogue.
+    """
     path = Path(name)
     if path.is_dir():
         return path / CERTIFICATE_FILE

@@ -1,8 +1,8 @@
-"""The certificate of an integrator of sums over indices.
+"""Certificates of integrators of indexed systems.
 
-At small sizes, cut out of the given arrays, the loops are held against the system written out (:func:`expand_sums`):
-its equations in 60 digits, its exact motion, its compiled steps; none of these has loops. At the sizes given, rates are
-held against NumPy's, and what is conserved is followed along a run.
+At small sizes, cut out of the arrays, the loops are compared with the unrolled system (:func:`expand_sums`): its
+equations in 60 digits, its exact motion and its compiled steps, none of which has loops. At full size, the rates are
+compared with NumPy, and conserved quantities are measured along a run.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["verify_indexed"]
 
 SMALL_STEPS = 40
 ROUNDINGS = 16.0 * SMALL_STEPS
-"""What a step may add up to, over so many steps."""
+"""Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
 @takes(system=INDEXED, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
@@ -60,18 +60,21 @@ def verify_indexed(
     stepper: IndexedStepper | None = None,
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
-    """Measure what the integrator of sums over indices promises: at a few places of these arrays, then at all.
+    """Measure the guaranteed properties of the integrator of an indexed system and return a certificate.
+
+    Properties are measured on a few indices of the arrays first, then at full size.
 
     Args:
-        system, method: what is integrated and how.
-        q, p, velocity, h, t, parameters, tables: as of :meth:`IndexedStepper.integrate`; the state of a certificate is
-            that of the few places.
-        stepper: as built; by default compiled now.
-        flags: of the C compiler.
+        system: indexed system.
+        method: method, or its name.
+        q, p, velocity, h, t, parameters, tables: as of :meth:`IndexedStepper.integrate`; the state of the certificate
+            is that of the few indices.
+        stepper: stepper under test; by default compiled now.
+        flags: flags of the C compiler.
 
     Raises:
         BuildError: without a C compiler.
-        MethodError: for a method without sweeps, and with constraints.
+        MethodError: for a method without fixed-point iteration, and for constraints.
         StateError: for arrays that do not fit.
     """
     began = time.perf_counter()
@@ -113,7 +116,7 @@ def verify_indexed(
 
 
 def _subject(start: WholeStart) -> Subject:
-    """The loops at a few places, as an integrator of the system written out for them."""
+    """Return the loops on a few indices as an integrator of the unrolled system."""
     small = small_start(start.stepper.interface, start.arrays, start.p)
     given = small.given
     names = [parameter.name for parameter in start.system.parameters]
@@ -125,7 +128,7 @@ def _subject(start: WholeStart) -> Subject:
 
 
 def _beside(start: WholeStart, subject: Subject) -> Finding:
-    """The largest difference of states, in units of rounding of the first step."""
+    """Return the largest difference from the compiled unrolled system, in units of rounding of the first step."""
     first = subject.states[0]
     other = compile_stepper(subject.system, start.method, flags=start.stepper.flags)
     run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": subject.parameters}

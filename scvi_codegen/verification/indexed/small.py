@@ -1,4 +1,4 @@
-"""A few places cut out of given arrays, and the integrator there as one of named coordinates, for certificates."""
+"""Reduction of arrays to a few indices, and the integrator there as one of named coordinates, for certificates."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ __all__ = ["SmallStepper", "small_start"]
 Numbers = NDArray[np.float64]
 
 WINDOWS = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))
-"""Places of a size, rows of a table: the first that fit and make few coordinates; else more."""
+"""Numbers of indices of a size and of rows of a table; the first pair that is consistent and small is used."""
 FEW = 9
-"""Coordinates, of which 60 digits take seconds."""
+"""Largest number of coordinates; steps in 60 digits take seconds for it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SmallStart:
-    """Arrays of small sizes, as :meth:`IndexedStepper.start` takes them, and of momenta."""
+    """Arrays of small sizes and their momenta, as of :meth:`IndexedStepper.start`."""
 
     given: RunArrays
     p: dict[str, Numbers]
 
 
 def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
-    """A few places of the given arrays, where these are largest, and rows of tables with the places that occur in them.
+    """Cut out a few indices where the arrays are largest, and table rows with the indices that occur in them.
 
     Raises:
-        StateError: where no accesses stay within so few.
+        StateError: if no small cut is closed under the accesses of the system.
     """
     found = None
     for window, rows in WINDOWS:
@@ -61,7 +61,7 @@ def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, N
 def _kept(
     interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
 ) -> dict[str, NDArray[np.int64]]:
-    """The places that are kept of each size."""
+    """Return the indices to keep for each size."""
     tables = {table.axes[0].name for table in interface.tables}
     kept = {name: np.arange(min(given.sizes[name], rows)) for name in tables}
     for name in interface.sizes:
@@ -75,7 +75,7 @@ def _kept(
 
 
 def _columns(interface: IndexedInterface) -> Iterator[tuple[str, str, int, str]]:
-    """Table, its size, a column, and the size whose places stand there."""
+    """Yield table, row size and column of each table access, and the size that its indices refer to."""
     rows = {table.name: table.axes[0].name for table in interface.tables}
     for access, _ in interface.accesses:
         for place, axis in zip(access.places, access.array.axes, strict=True):
@@ -86,7 +86,7 @@ def _columns(interface: IndexedInterface) -> Iterator[tuple[str, str, int, str]]
 def _around(
     interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], size: str, window: int
 ) -> NDArray[np.int64]:
-    """Neighbours, around where the first array of that size is largest."""
+    """Return consecutive indices around the maximum of the first array of that size."""
     length, centre = given.sizes[size], 0
     for array in interface.coordinates:
         axes = [k for k, axis in enumerate(array.axes) if axis.name == size]
@@ -128,12 +128,12 @@ def _row_size(interface: IndexedInterface, table: str) -> str:
 
 
 class SmallStepper:
-    """The integrator of arrays at small sizes, with what a certificate asks of one of named coordinates.
+    """Integrator of arrays at small sizes with the interface of a stepper of named coordinates.
 
     Args:
-        stepper: of any size.
-        start: which sizes, fields and tables.
-        written: the system written out for them, whose parameters have the entries of fields among them.
+        stepper: stepper of any size.
+        start: sizes, fields and tables.
+        written: unrolled system, whose parameters include the entries of fields.
     """
 
     interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
@@ -153,7 +153,10 @@ class SmallStepper:
         parameters: Any = None,
         options: SolverOptions | None = None,
     ) -> SimpleNamespace:
-        """Every state, (steps + 1, m), and the iterations of each step. Raises as :meth:`IndexedStepper.integrate`."""
+        """Return every state, (steps + 1, m), and the iterations of each step.
+
+        Raises as :meth:`IndexedStepper.integrate`.
+        """
         run = self._run(q, p, h, t, parameters, options)
         states, counts, times = [self._flat(run)], [0], [run.t]
         for _ in range(steps):
@@ -174,22 +177,22 @@ class SmallStepper:
         parameters: Any = None,
         options: SolverOptions | None = None,
     ) -> tuple[Numbers, Numbers]:
-        """The state after one step. Raises as :meth:`IndexedStepper.integrate`."""
+        """Return the state after one step; raises as :meth:`IndexedStepper.integrate`."""
         run = self._run(q, p, h, t, parameters, options)
         run.advance(1)
         end = self._flat(run)
         return end[0], end[1]
 
     def velocity(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
-        """V of a state; StateError of a Hamiltonian."""
+        """Return the velocities (m,) of a state; raises StateError for a Hamiltonian."""
         return _joined(self._run(q, p, 1.0, t, parameters, None).velocity)
 
     def momentum(self, q: Numbers, v: Numbers, t: float = 0.0, parameters: Any = None) -> Numbers:
-        """P of positions and velocities."""
+        """Return the momenta (m,) of positions and velocities."""
         return v / _joined(self._run(q, v, 1.0, t, parameters, None).inverse_masses)
 
     def energy(self, q: Numbers, p: Numbers, t: float = 0.0, parameters: Any = None) -> float:
-        """Of a state."""
+        """Return the energy of a state."""
         return self._run(q, p, 1.0, t, parameters, None).energy
 
     def _run(
@@ -207,7 +210,7 @@ class SmallStepper:
         )
 
     def _values(self, parameters: Any) -> dict[str, Any]:
-        """Numbers and fields from the values of the system written out, by name or in order."""
+        """Return numbers and fields from the parameters of the unrolled system, by name or in order."""
         names = [parameter.name for parameter in self.written.parameters]
         given = self.defaults if parameters is None else parameters
         known = dict(given) if isinstance(given, Mapping) else dict(zip(names, given, strict=True))

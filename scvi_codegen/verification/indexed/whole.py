@@ -1,4 +1,4 @@
-"""What is measured at the sizes given: rates of the loops beside NumPy's, the way back, and what is conserved."""
+"""Checks of indexed systems at full size: rates against NumPy, reversibility and conserved quantities."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ Numbers = NDArray[np.float64]
 EPSILON = 2.0**-52
 ROUNDINGS = 64.0
 SHORT = 2.0**-60
-"""Of h: what is left of a step is the rates at its start, and all of it is what rounding cuts off."""
+"""Factor of h for steps whose increment is h times the rate at the start, wholly in the compensation terms."""
 NUDGE = 2.0**-30
-"""Relative change of each number by which is told what its rounding changes."""
+"""Relative change of the state by which the effect of rounding is estimated."""
 WORK, MOST_STEPS = 4_000_000, 1000
-"""Coordinates times steps of the run."""
+"""Number of coordinates times steps of the run, and its largest number of steps."""
 RESOLVED = EPSILON
-"""Step error below which what changes the energy is rounding."""
+"""Local error below which round-off dominates the change of the energy."""
 
 
 @dataclass(frozen=True, slots=True)
 class WholeStart:
-    """An integrator at given sizes, and where runs begin."""
+    """Integrator at full size, and the initial state of runs."""
 
     system: IndexedSystem
     method: Method
@@ -51,7 +51,7 @@ class WholeStart:
     t: float
 
     def array(self, name: str) -> Numbers:
-        """Of positions, momenta or parameters."""
+        """Return an array of positions, momenta, velocities or parameters by name."""
         momenta = {p.name: q.name for q, p in zip(self.system.coordinates, self.system.momenta, strict=False)}
         if name in momenta:
             return self.p[momenta[name]]
@@ -61,15 +61,15 @@ class WholeStart:
         return {**self.arrays.state, **self.arrays.fields}[name]
 
     def elements(self, loops: Sequence[Loop]) -> Elements:
-        """All values of the indices of loops."""
+        """Return all index values of loops."""
         return Elements(loops, self.arrays.sizes, self.arrays.places)
 
     def run(self, h: float | None = None) -> IndexedRun:
-        """From the beginning, with another step."""
+        """Start a run at the initial state, optionally with another step size."""
         return self.begin(self.arrays.state, self.p, self.h if h is None else h, self.t)
 
     def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> IndexedRun:
-        """From a state."""
+        """Start a run at a state."""
         names = [parameter.name for parameter in self.system.parameters]
         numbers = dict(zip(names, self.arrays.numbers, strict=True))
         return self.stepper.start(
@@ -78,7 +78,7 @@ class WholeStart:
 
 
 def whole_checks(start: WholeStart) -> Iterator[Check]:
-    """All of them; the long run is made once."""
+    """Yield all checks of this module; they share one long run."""
     sizes = ", ".join(f"{name} = {size}" for name, size in start.arrays.sizes.items()) or "its size"
     yield from checked("rates", f"at {sizes} loops give the rates that NumPy adds up", partial(_rates, start))
     yield from checked("energies", f"at {sizes} kinetic and potential energy are NumPy's", partial(_energies, start))
@@ -89,7 +89,7 @@ def whole_checks(start: WholeStart) -> Iterator[Check]:
 
 
 def _rates(start: WholeStart) -> Finding:
-    """(z1 - z0) / h of a very short step, with what rounding cut off z1."""
+    """Return the error of (z1 - z0) / h of a very small step, with compensation, in units of rounding."""
     run, worst = start.run(start.h * SHORT), 0.0
     run.advance(1)
     expected, nudged = _numpy_rates(start), _numpy_rates(_nudged(start))
@@ -105,7 +105,7 @@ def _rates(start: WholeStart) -> Finding:
 
 
 def _nudged(start: WholeStart) -> WholeStart:
-    """The same with every number of the state a little off."""
+    """Return the start with every number of the state perturbed."""
 
     def moved(state: Mapping[str, Numbers]) -> dict[str, Numbers]:
         return {name: x * (1 + NUDGE * np.cos(1.0 + np.arange(x.size)).reshape(x.shape)) for name, x in state.items()}
@@ -114,7 +114,7 @@ def _nudged(start: WholeStart) -> WholeStart:
 
 
 def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-    """dq/dt and dp/dt of every coordinate."""
+    """Return dq/dt and dp/dt of every coordinate, computed with NumPy."""
     system = start.system
     found = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
     for term, slopes in system.kernels:
@@ -155,14 +155,14 @@ def _energies(start: WholeStart) -> Finding:
 
 
 def _values(start: WholeStart, at: Elements, formula: Expr, slots: Sequence[tuple[Any, Access]]) -> Any:
-    """Of a formula, at every element."""
+    """Return the values of a formula at every element."""
     arrays = {access.array.name: start.array(access.array.name) for _, access in slots}
     numbers: dict[Expr, float] = dict(zip(start.system.parameters, start.arrays.numbers, strict=True))
     return at.values(formula, slots, arrays, {**numbers, start.system.time: start.t})
 
 
 def _reversal(start: WholeStart) -> Finding:
-    """In units of rounding of what is there: coordinates, and what moves them in a step."""
+    """Return the defect of a step forward and back, relative to the largest coordinate or increment."""
     run = start.run()
     run.advance(1)
     back = start.begin(run.q, run.p, -run.h, run.t)
@@ -177,7 +177,7 @@ def _reversal(start: WholeStart) -> Finding:
 
 
 def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
-    """Energy and momentum maps along as many steps as are cheap."""
+    """Yield the checks of energy and momentum maps along a run."""
     run = start.run()
     count = sum(values.size for values in start.p.values())
     steps = int(max(20, min(MOST_STEPS, WORK // count)))
@@ -208,7 +208,7 @@ def _fail(failure: StepFailedError) -> None:
 
 
 def _map_sizes(start: WholeStart) -> float:
-    """A size of the terms of momentum maps: all momenta, and these times positions."""
+    """Return a size of the terms of momentum maps: momenta, and momenta times positions."""
     p = np.concatenate([np.abs(values).reshape(-1) for values in start.p.values()])
     q = np.concatenate([np.abs(values).reshape(-1) for values in start.arrays.state.values()])
     moved = start.run()
