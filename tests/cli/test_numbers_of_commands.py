@@ -1,0 +1,117 @@
+"""Numbers in the JSON of ``derive``, ``methods``, ``systems`` and ``verify``, recomputed by other code."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+from click.testing import CliRunner
+from scipy.optimize import fsolve
+
+import scvi_codegen as sc
+from scvi_codegen.cli import main
+from scvi_codegen.methods import as_method
+
+
+def document(*words: str) -> dict[str, Any]:
+    found = CliRunner().invoke(main, [*words, "--json"])
+    assert found.exit_code == 0, found.output
+    return dict(json.loads(found.stdout))
+
+
+@pytest.mark.parametrize(
+    ("model", "method", "q", "p", "h"),
+    [
+        ("planar-pendulum", "svi:2", [0.75], [0.5], 0.375),
+        ("kepler", "sc:2", [0.5, 0.25], [-0.25, 1.5], 0.0625),
+        ("duffing", "scvi:3", [0.75], [-0.25], 0.25),
+    ],
+)
+def test_printed_equations_have_the_compiled_step_as_solution(model, method, q, p, h):
+    """SciPy solves the residuals of the JSON from its first guess; its end is that of the compiled step."""
+    system, numbers = sc.problem(model).system, document("derive", model, "--method", method)
+    velocity = sc.compile_stepper(system, method).velocity(q, p)
+    known = {"h": h, "t_k": 0.0, **numbers["entries"]}
+    known |= dict(zip(map(str, system.parameters), system.defaults, strict=True))
+    for i, coordinate in enumerate(system.coordinates):
+        known |= {f"{coordinate}_k": q[i], f"p_{coordinate}_k": p[i], f"{coordinate}_dot_k": velocity[i]}
+    if system.dimension == 1:
+        known |= {"q_k": q[0], "p_k": p[0], "q_dot_k": velocity[0]}
+    symbols = {name: sympy.Symbol(name) for name in (*known, *numbers["unknowns"])}
+
+    def value(text: str, unknowns: Any = ()) -> float:
+        values = known | dict(zip(numbers["unknowns"], unknowns, strict=False))
+        expression = sympy.sympify(text, locals=symbols)
+        return float(expression.subs({symbols[name]: x for name, x in values.items()}))
+
+    residuals = [sympy.sympify(each["residual"], locals=symbols) for each in numbers["equations"]]
+    residuals = [each.subs({symbols[name]: x for name, x in known.items()}) for each in residuals]
+    unknowns = [symbols[name] for name in numbers["unknowns"]]
+    function = sympy.lambdify([unknowns], residuals)
+    guess = [value(numbers["first_guess"][name]) for name in numbers["unknowns"]]
+    assert np.abs(function(guess)).max() > 1e-6  # the guess is not the solution
+    solution = fsolve(function, guess, xtol=1e-12)
+    run = sc.compile_stepper(system, method).integrate(q, p, h=h, steps=1)
+    end = [value(text, solution) for name in ("q", "p") for text in numbers["end"][name]]
+    assert end == pytest.approx([*run.q[-1], *run.p[-1]], abs=1e-11)
+
+
+def test_methods_have_their_orders_and_symmetries():
+    """Orders are measured on an oscillator by halved steps; symmetry by a step forth and back."""
+    start = {"q": [1.0], "p": [0.5]}
+    system = sc.problem("harmonic-oscillator").system
+    exact = np.array([np.cos(2.0) + 0.5 * np.sin(2.0)])
+    tried = 0
+    for method in document("methods")["methods"]:
+        if method["name"] == "collocation" or "printed" in method["example"]:
+            continue  # they need more than a name and a number
+        number = re.search(r"-(\d+)(-|$)", method["example"]) if method["number"] else None
+        chosen = as_method(f"{method['name']}:{number[1]}" if number else method["name"])
+        assert method["example"].startswith(method["name"])
+        assert (chosen.order, chosen.symplectic, chosen.symmetric) == (
+            method["order"],
+            method["symplectic"],
+            method["symmetric"],
+        )
+        try:
+            stepper = sc.compile_stepper(system, chosen, flags=("-O1",))
+        except sc.MethodError:
+            continue
+        if method["order"] is None or method["order"] > 8:
+            continue
+        counts = (2, 4) if method["order"] > 4 else (16, 32)
+        errors = [abs(stepper.integrate(**start, h=2.0 / n, steps=n).q[-1] - exact).max() for n in counts]
+        if errors[1] > 1e-13:
+            assert np.log2(errors[0] / errors[1]) > method["order"] - 0.6, method["example"]
+            tried += 1
+        there = stepper.integrate(**start, h=0.5, steps=1)
+        back = stepper.integrate(there.q[-1], there.p[-1], h=-0.5, steps=1)
+        if method["symmetric"]:
+            assert back.q[-1, 0] == pytest.approx(1.0, abs=1e-13), method["example"]
+    assert tried >= 4
+
+
+def test_systems_have_their_coordinates_and_parameters():
+    entries = document("systems")["systems"]
+    assert len(entries) > 10
+    for entry in entries:
+        system = sc.problem(entry["name"]).system
+        assert entry["coordinates"] == [str(q) for q in system.coordinates]
+        names = [str(name) for name in system.parameters]
+        assert entry["parameters"] == dict(zip(names, system.defaults, strict=True))
+        assert entry["description"]
+
+
+def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
+    numbers = document("verify", "planar-pendulum", "--method", "svi:2")
+    checks = {check["name"]: check for check in numbers["checks"] if check["bound"] is not None}
+    assert numbers["passed"] is True
+    assert len(checks) > 20
+    order = checks.pop("order")
+    assert 4.2 > order["measured"] > order["bound"]
+    assert all(0 <= check["measured"] <= check["bound"] for check in checks.values())
+    assert len({check["outcome"] for check in checks.values()}) == 1
