@@ -13,7 +13,9 @@ from click.testing import CliRunner
 from scipy.optimize import fsolve
 
 import scvi_codegen as sc
+from scvi_codegen.advice.known_digits import Known
 from scvi_codegen.cli import main
+from scvi_codegen.cli.running import final_state
 from scvi_codegen.methods import as_method
 
 
@@ -115,3 +117,10 @@ def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
     assert 4.2 > order["measured"] > order["bound"]
     assert all(0 <= check["measured"] <= check["bound"] for check in checks.values())
     assert len({check["outcome"] for check in checks.values()}) == 1
+
+
+def test_positions_and_momenta_are_printed_in_their_own_known_digits():
+    known = Known(q=np.array([1e-3, 1e-9]), p=np.array([1e-9, 1e-3]), tenfold=np.inf)
+    lines = list(final_state(["x", "y"], np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
+    digits = [[len(text) for text in re.findall(r"0\.(\d*[1-9])", line)] for line in lines[1:]]
+    assert digits[0][0] == digits[1][1] < digits[0][1] == digits[1][0]
