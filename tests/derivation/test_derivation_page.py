@@ -273,6 +273,12 @@ class TestPage:
         method = sc.Composition(8)
         assert f"{len(method.fractions)} leapfrog steps of sizes" in kepler_page(method)
 
+    def test_coordinates_are_counted(self):
+        one = derivation_html(swing(), sc.SVI(1))
+        assert re.search(r"of (\d+ coordinates?),", one)[1] == "2 coordinates"
+        one = derivation_html(sc.problem("planar-pendulum").system, sc.SVI(1))
+        assert re.search(r"of (\d+ coordinates?),", one)[1] == "1 coordinate"
+
     def test_names_are_escaped(self):
         system = sc.LagrangianSystem.from_text(name="<b> & */ q", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
         page = derivation_html(system, sc.SVI(1))

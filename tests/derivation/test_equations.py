@@ -11,6 +11,7 @@ from sympy import cos, sin, sqrt
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import MethodError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import (
     SCVI,
@@ -23,6 +24,7 @@ from scvi_codegen.methods import (
     SpectralCollocation,
     StoermerVerlet,
 )
+from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.models.systems import double_pendulum, duffing, kepler, planar_pendulum
 
 UNIT = {"m": 1, "l": 1, "g": 1}
@@ -217,3 +219,11 @@ def test_latex_has_one_index_and_one_exponent_at_a_letter_and_names_the_new_stat
 def test_a_weight_that_is_zero_is_shown_as_such():
     derived = derive(planar_pendulum(), SpectralCollocation(2, form="phase-space"))
     assert {entry.symbol.name: entry.exact for entry in derived.entries}["b_2"] == 0
+
+
+def test_singular_hamiltonians_have_no_printed_equations_where_velocities_are_needed():
+    """H = x y determines no velocities: a method in position form has no step to print."""
+    shear = HamiltonianSystem.from_text(name="shear", coordinates=["x"], momenta=["y"], hamiltonian="x*y")
+    assert not shear.is_regular
+    with pytest.raises(MethodError, match="singular"):
+        paper_equations(shear, Gauss(2, form="position"))

@@ -334,3 +334,10 @@ def test_the_whole_catalogue_lowers():
 def test_notes_say_whether_a_method_is_symmetric(method, symmetric):
     notes = lowered(problem("kepler").system, method).notes
     assert ("symmetric" in notes, "not symmetric" in notes) == (symmetric, not symmetric)
+    assert notes[0] == ("no order claimed" if method.order is None else f"order {method.order}")
+
+
+def test_the_notes_of_a_method_without_an_order_claim_none():
+    method = SCVI(3, variational=False)
+    assert method.order is None
+    assert lowered(problem("kepler").system, method).notes[0] == "no order claimed"
