@@ -68,6 +68,7 @@ _HOMES = {
         "StateError",
         "StepFailedError",
         "SystemDefinitionError",
+        "SystemDefinitionWarning",
     ),
     "methods": (
         "SCVI",

@@ -30,6 +30,7 @@ __all__ = [
     "StateError",
     "StepFailedError",
     "SystemDefinitionError",
+    "SystemDefinitionWarning",
     "closest",
     "warn",
 ]
@@ -100,6 +101,14 @@ class OrbitError(ScviCodegenError, ArithmeticError):
 
 class MethodWarning(UserWarning):
     """A method that can be built, with a property the user should know of."""
+
+
+class SystemDefinitionWarning(UserWarning):
+    """A definition that is probably a mistake: a parameter without effect, or a mass that its default makes negative.
+
+    The system can be compiled and run as it is written. Parameters that only events use are reported, too, since a
+    definition does not contain its events; add them to L to declare them used.
+    """
 
 
 class AccuracyWarning(UserWarning):

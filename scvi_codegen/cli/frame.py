@@ -27,6 +27,7 @@ from scvi_codegen.errors import (
     RecordingError,
     ScviCodegenError,
     StepFailedError,
+    SystemDefinitionWarning,
     closest,
 )
 from scvi_codegen.files.atomic import write_atomically
@@ -154,7 +155,7 @@ def _warnings_as_lines() -> Iterator[None]:
             click.echo(f"Warning: {message}", err=True)
 
     with warnings.catch_warnings():
-        for kind in (MethodWarning, AccuracyWarning):
+        for kind in (MethodWarning, AccuracyWarning, SystemDefinitionWarning):
             warnings.simplefilter("always", kind)
         warnings.showwarning = show
         yield

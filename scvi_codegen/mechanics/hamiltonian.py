@@ -27,6 +27,7 @@ from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import legendre_dual
+from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -119,7 +120,7 @@ class HamiltonianSystem(MechanicalSystem):
         def read(text: str) -> Expr:
             return parse_expression(text, symbols).xreplace(driven)
 
-        return cls(
+        system = cls(
             name=name,
             coordinates=variables,
             momenta=tuple(symbols[given] for given in names),
@@ -132,6 +133,8 @@ class HamiltonianSystem(MechanicalSystem):
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
+        warn_of_mistakes(system)
+        return system
 
     @classmethod
     @takes(
@@ -186,7 +189,7 @@ class HamiltonianSystem(MechanicalSystem):
             inputs=own,
         )
         driven = input_formulas(own, symbol(TIME))
-        return cls(
+        system = cls(
             name=name,
             coordinates=translation.coordinates,
             momenta=translation.momenta,
@@ -202,6 +205,8 @@ class HamiltonianSystem(MechanicalSystem):
             damping=translation.apply(rate, "damping").xreplace(driven),
             inputs=own,
         )
+        warn_of_mistakes(system)
+        return system
 
     @property
     def lagrangian(self) -> Expr:

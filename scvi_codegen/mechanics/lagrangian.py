@@ -19,6 +19,7 @@ from scvi_codegen.given.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, 
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
 
@@ -132,7 +133,7 @@ class LagrangianSystem(MechanicalSystem):
         def read(text: str) -> Expr:
             return parse_expression(text, symbols).xreplace(driven)
 
-        return cls(
+        system = cls(
             name=name,
             coordinates=variables,
             time=symbols[TIME],
@@ -144,6 +145,8 @@ class LagrangianSystem(MechanicalSystem):
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
+        warn_of_mistakes(system)
+        return system
 
     @classmethod
     @takes(
@@ -206,7 +209,7 @@ class LagrangianSystem(MechanicalSystem):
         def read(given: Expr, what: str = "Lagrangian") -> Expr:
             return translation.apply(given, what).xreplace(driven)
 
-        return cls(
+        system = cls(
             name=name,
             coordinates=translation.coordinates,
             time=symbol(TIME),
@@ -223,6 +226,8 @@ class LagrangianSystem(MechanicalSystem):
             constraints=constraints_of(bound, lambda given: read(given, "constraints")),
             inputs=own,
         )
+        warn_of_mistakes(system)
+        return system
 
     @classmethod
     @takes(SystemDefinitionError, method=LAGRANGES_METHOD)

@@ -61,16 +61,19 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.given.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.monitors import monitor_function
+from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import fitted
@@ -244,7 +247,11 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     if entry is None:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
-    system, monitor = _read_monitor(_read_system(document, entry), document)
+    with warnings.catch_warnings():  # a monitor, or constraints of a Hamiltonian, may use what its formula does not
+        warnings.simplefilter("ignore", SystemDefinitionWarning)
+        plain = _read_system(document, entry)
+    system, monitor = _read_monitor(plain, document)
+    warn_of_mistakes(system, () if monitor is None else (monitor_function(system, monitor, in_time=True),))
     state = _read_state(document["initial"], system)
     method = read_method(fitted(document["method"], system))
     inputs = _read_inputs(document.get("inputs", {}), folder)

@@ -31,6 +31,7 @@ from scvi_codegen.given.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
+from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
 
 __all__ = ["INDEXED", "IndexedSystem"]
 
@@ -164,7 +165,7 @@ class IndexedSystem:
         acting = [parse_force(*pair, arrays, everything, known, places) for pair in (forces or {}).items()]
         if dissipation is not None:
             acting.append(_friction(parse_indexed(dissipation, everything, known, places), velocities, arrays))
-        return cls(
+        system = cls(
             name=name,
             coordinates=arrays,
             momenta=conjugate,
@@ -179,6 +180,8 @@ class IndexedSystem:
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, places) for each in constraints),
         )
+        system._warn_of_mistakes()
+        return system
 
     @classmethod
     @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
@@ -314,6 +317,23 @@ class IndexedSystem:
     def _velocities(self) -> dict[str, Array]:
         """The array of coordinates by the name of its velocities."""
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
+
+    def _warn_of_mistakes(self) -> None:
+        """Warn of parameters and inputs that occur in no formula, and of negative masses (:mod:`scvi_codegen.mechanics.plausibility`)."""
+        terms = [*self.terms, *self.constraints]
+        formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
+        used = {symbol(access.array.name) for access, _ in self.accesses}.union(*(f.free_symbols for f in formulas))
+        scalars = {symbol(array.name): value for array, value in zip(self.fields, self.field_defaults, strict=True)}
+        values = scalars | dict(zip(self.parameters, self.defaults, strict=True))
+        warn_of_unused(self.name, self.function, values, self.inputs, used)
+        moving = {array.name: array for array in self.momenta} or self._velocities
+        for name in moving:
+            kinetic = [mass for term in self.terms for mass in masses_of(term, {name: moving[name]})]
+            if len(kinetic) == 1:  # masses of several loops are added where these meet
+                uniform = {slot: symbol(access.array.name) for slot, access in kinetic[0].slots}
+                warn_of_negative(
+                    self.name, {f"d2{self.function[0]}/d{name}2": kinetic[0].formula.xreplace(uniform)}, values
+                )
 
     def _check_names(self) -> None:
         names = ([each.name for each in group] for group in (self.coordinates, self.parameters, self.momenta))
