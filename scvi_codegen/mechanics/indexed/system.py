@@ -319,7 +319,7 @@ class IndexedSystem:
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
     def _warn_of_mistakes(self) -> None:
-        """Warn of parameters and inputs that occur in no formula, and of negative masses (:mod:`scvi_codegen.mechanics.plausibility`)."""
+        """Warn of parameters and inputs that occur in no formula, and of negative masses."""
         terms = [*self.terms, *self.constraints]
         formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]
         used = {symbol(access.array.name) for access, _ in self.accesses}.union(*(f.free_symbols for f in formulas))
