@@ -1,31 +1,31 @@
-"""The benchmark: this project and other integrators side by side, at equal error.
+"""Benchmark: this package and other integrators, compared at equal error.
 
-    cases         problems, eight initial states each, accelerations solved for by hand
-    references    where they end, in extended precision; independent of the project's steppers
-    ours          this project's steppers, at the steps it advises
+    cases         problems, eight initial states each, accelerations derived by hand
+    references    their final states in extended precision, independent of the package's steppers
+    ours          steppers of this package, at the step sizes that advise() recommends
     peers         REBOUND, CyRK, JiTCODE, SciPy and (in taylor) heyoka at several tolerances
-    measuring     all of them timed in turn, in one process
+    measuring     timing of all of them in turn, in one process
     racing        the above for one case, or for an ensemble of 64 trajectories
-    forced_cases  the same with friction and drives;  constrained_cases: with constraints, beside peers in angles
+    forced_cases  problems with friction and driving forces;  constrained_cases: with constraints (peers: in angles)
     curves        time at equal error, by interpolation
     report        table and JSON of these;  picture: the work-precision plot
-    adaptive      steps that choose their length, on adaptive_cases; step_lengths: their picture
+    adaptive      adaptive step size, on adaptive_cases; step_lengths: plot of the step sizes
     drift         the energy over ten million steps
     paper_tables  Tables 6 and 7 of the paper
-    compositions  SVI against explicit compositions
-    hand_written  generated C against hand-written C
-    start_up      from text to the first step
-    compile_times the same for larger systems (in compile_systems), by what takes the time
-    mechanisms    from SymPy's bodies and loads to a motion, beside lambdify and PyDy (in multibody)
-    held          bodies held by rods, beside MuJoCo (in held_bodies): energies and lengths at equal time
-    samples       what a sample of a controller costs, beside C called bare
-    sums          sums over indices at equal error, beside C by hand (lattices.c), SciPy and REBOUND; and how time grows
-    large_cases   what these are of;  shared_steps: their steps by several threads
-    long_sums     their energies over a hundred thousand steps;  cluster: a thousand bodies beside REBOUND
-    builds        the same text by several compilers, and for several processors
+    compositions  SVI and explicit composition methods
+    hand_written  generated C and hand-written C
+    start_up      time from text to the first step
+    compile_times the same for larger systems (in compile_systems), broken down
+    mechanisms    from SymPy's bodies and loads to a trajectory; lambdify and PyDy (in multibody)
+    held          constrained bodies; MuJoCo (in held_bodies): energies and lengths at equal time
+    samples       cost of a control step, and of the bare C function
+    sums          indexed systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
+    large_cases   the indexed systems;  shared_steps: their steps with several threads
+    long_sums     their energies over a hundred thousand steps;  cluster: a thousand bodies; REBOUND
+    builds        the same source with several compilers, and for several processors
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
-the best formulation we know of, which are named; no step or tolerance chosen with the answer known, but whole curves.
+the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from scvi_codegen.files.atomic import write_atomically
 __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"]
 
 SCHEMA = 2
-"""Version of the JSON."""
+"""Version of the JSON document."""
 
 SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     **{name: partial(run_case, name) for name in CASES},
@@ -92,17 +92,17 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "cluster": run_cluster,
     "builds": run_builds,
 }
-"""All that can be measured: name on the command line -> function that does it."""
+"""Sections of the benchmark: name on the command line -> function that measures it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """Everything measured.
+    """Results of a benchmark.
 
     Attributes:
-        machine: on what.
-        results: in the order measured.
-        interrupted: name of the section that Ctrl-C ended, or nothing.
+        machine: description of the machine.
+        results: results in the order of measurement.
+        interrupted: name of the section that Ctrl-C ended, or ``""``.
     """
 
     machine: Mapping[str, Any]
@@ -111,16 +111,16 @@ class Report:
 
     @property
     def cases(self) -> list[CaseResult]:
-        """The results that are curves."""
+        """Results that are work-precision curves."""
         return [result for result in self.results if isinstance(result, CaseResult)]
 
     def text(self) -> str:
-        """All tables."""
+        """Return all tables as text."""
         legend = [LEGEND] if self.cases else []
         return "\n\n".join([header_lines(self.machine), *(result.text() for result in self.results), *legend])
 
     def data(self) -> dict[str, Any]:
-        """The same, and all measurements, as data that ``json.dump`` takes."""
+        """Return all tables and measurements as data for ``json.dump``."""
         return {
             "schema": SCHEMA,
             "machine": dict(self.machine),
@@ -140,19 +140,19 @@ def benchmark(
     say: Say = lambda text: None,
     show: Say = lambda text: None,
 ) -> Report:
-    """Measure sections one after the other; one that fails says so, Ctrl-C ends it with what was measured.
+    """Measure sections in turn; a section that fails is reported, Ctrl-C ends the benchmark with its results so far.
 
     Args:
-        names: of the sections, by default all; ``kepler`` is ``kepler:0.2`` and ``kepler:0.5``.
-        plan: how to measure.
-        json_path, plot_path: files to write, the first after each section; beside the picture of adaptive cases
-            another, NAME-steps, of the length of a step along an orbit.
-        resume: keep the sections that ``json_path`` has, and did not fail, and add others to them.
-        say: told what is being done.
-        show: given the text of the report, a section as soon as it is measured.
+        names: names of sections, by default all; ``kepler`` means ``kepler:0.2`` and ``kepler:0.5``.
+        plan: settings of the measurement.
+        json_path: file to write, after each section.
+        plot_path: file of the plot; for adaptive cases a second one, NAME-steps, shows step sizes along an orbit.
+        resume: keep the sections of ``json_path`` that did not fail, and add others to them.
+        say: called with a description of each activity.
+        show: called with the text of the report, section by section.
 
     Raises:
-        StateError: for an unknown section; if ``json_path`` is no report of this version to resume.
+        StateError: for an unknown section; if ``json_path`` is not a report of this version.
     """
     sections = tuple(section for name in names for section in _sections(name))
     if plot_path is not None:
@@ -176,7 +176,7 @@ def benchmark(
 
 
 def _sections(name: str) -> tuple[str, ...]:
-    """The section of that name, or all that begin with it and a colon."""
+    """Return the section of that name, or all whose names begin with it and a colon."""
     found = (name,) if name in SECTIONS else tuple(each for each in SECTIONS if each.startswith(f"{name}:"))
     if not found:
         raise StateError(
@@ -190,7 +190,7 @@ FAILED = "failed: "
 
 
 def _known(json_path: str) -> dict[str, Result]:
-    """The sections that a report on the disk has, by name; none if there is no such file."""
+    """Return the sections of a report on disk by name; none if there is no such file."""
     path = Path(json_path)
     if not path.exists():
         return {}
@@ -211,7 +211,7 @@ def _write(report: Report, json_path: str) -> None:
 
 
 def _reports(names: Sequence[str], known: Mapping[str, Result], plan: Plan, say: Say, show: Say) -> Iterator[Report]:
-    """All that is known so far, after each section; its text is shown as it grows."""
+    """Yield the report after each section; its text is shown as it grows."""
     report = Report(machine=machine(), results=())
     show(header_lines(report.machine))
     for name in names:

@@ -1,8 +1,8 @@
-"""Problems with close encounters: steps that choose their length beside heyoka's and IAS15's, at equal error.
+"""Benchmark of adaptive step size on problems with close encounters; heyoka and IAS15 at equal error.
 
-References: of Kepler's problem by Kepler's equation in 40 digits; of the others by Gauss's method of 16 stages in
-extended precision, on the steps that this project's own integrator chose (which a method of twice the order resolves by
-far) and on halves of them; the difference is the accuracy that is kept.
+References: Kepler's equation in 40 digits for the Kepler problem; for others the Gauss method of 16 stages in extended
+precision, on the adaptive steps of this package (which a method of twice the order resolves by far) and on halves of
+them; the difference is their accuracy.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ __all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
 TOLERANCES = (None, 1e-15, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8)
 PEERS = ("heyoka", "rebound")
 FIXED = tuple(2.0 ** (k / 2) for k in range(-2, 9))
-"""Steps of one length, as multiples of the number of those that choose theirs."""
+"""Fixed steps, as multiples of the number of adaptive steps."""
 TRANSFORMED = (0.4, 0.3, 0.2, 0.15, 0.1)
-"""Steps of tau where dt is the frequency's dtau."""
+"""Step sizes of tau for dt = g dtau with the time-rescaling function "frequency"."""
 LAST = 10**15
 HALVINGS = 2
-"""Of all steps of a reference, where some step of a close encounter is too long for the method of twice the order."""
+"""Largest number of halvings of a reference's steps, if a step of a close encounter is too large for Gauss."""
 
 
 @unwarned()
 def run_adaptive(name: str, plan: Plan, say: Say) -> CaseResult:
-    """One trajectory after the other: this project in all its modes, heyoka, and IAS15 where bodies gravitate."""
+    """Measure this package in all its modes, heyoka, and for gravitating bodies IAS15."""
     chosen = adaptive_case(name)
     makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=True) for peer in PEERS if peer in plan.peers}
     return race(chosen, partial(_ours, chosen, quick=plan.quick), makers, plan, say, adaptive_reference)
@@ -82,7 +82,7 @@ def _tolerance(given: float | None) -> str:
 
 
 def _transformed(chosen: Case, momenta: Array, seconds: float) -> list[Contender]:
-    """Steps of one length in a time that runs as the motion does."""
+    """Return contenders with fixed steps in transformed time."""
     stepper = compile_stepper(reparametrise(chosen.system, "frequency"), SVI(8))
     settings: list[dict[str, Any]] = [{"h": h, "t_end": chosen.span} for h in TRANSFORMED]
     return [
@@ -114,7 +114,7 @@ def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array)
     run = stepper.start(q, p, **arguments)
 
     def integrate() -> Array:
-        """As heyoka's propagate_until: the last state alone is kept."""
+        """Integrate and return the final state alone, as heyoka's propagate_until."""
         run.run_to_goal()
         return run.q
 
@@ -136,7 +136,7 @@ def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> C
 
 
 def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
-    """Where a case ends: exactly, or in extended precision (minutes, then from the user's cache)."""
+    """Return the final states of a case: exact, or in extended precision (minutes, then cached on disk)."""
     velocity = chosen.velocity.astype(np.longdouble)
     if momenta is not None and chosen.masses is not None:
         velocity = momenta.astype(np.longdouble) / np.array(chosen.masses, dtype=np.longdouble)
@@ -144,7 +144,7 @@ def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:
 
 
 def kepler_ends(chosen: Case, velocity: Extended) -> Reference:
-    """By Kepler's equation and Lagrange's coefficients from exactly these doubles, in 40 digits."""
+    """Return exact final states from Kepler's equation and Lagrange coefficients in 40 digits."""
     ends = [_kepler_end(q, v, chosen.span) for q, v in zip(chosen.q, velocity.astype(float), strict=True)]
     high = np.array([[float(x) for x in end] for end in ends])
     low = np.array([[float(x - mp.mpf(float(x))) for x in end] for end in ends])
@@ -181,7 +181,7 @@ def _ends(chosen: Case, velocity: Extended) -> Reference:
 
 
 def _shortest(runs: Sequence[Array]) -> Extended:
-    """Steps for all runs together, from the times of each: as long as the shortest that one of them takes there."""
+    """Return common steps for all runs from the times of each: the smallest that any of them takes at that time."""
     times, end = [float(runs[0][0])], float(runs[0][-1])
     while times[-1] < end:
         places = [np.searchsorted(run[1:-1], times[-1], side="right") for run in runs]
@@ -190,7 +190,7 @@ def _shortest(runs: Sequence[Array]) -> Extended:
 
 
 def _with_two_steps(field: Field, start: Extended, steps: Extended) -> tuple[Extended, Extended]:
-    """The ends by these steps and by halves of them, or, where the longest cannot be solved, by shorter ones."""
+    """Return the final states with these steps and with halves of them, or with smaller ones if Gauss fails."""
     for parts in 2 ** np.arange(HALVINGS + 1):
         short = np.repeat(steps / parts, parts)
         try:

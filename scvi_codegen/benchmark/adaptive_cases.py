@@ -1,4 +1,4 @@
-"""Problems with close encounters, for steps that choose their length: eight initial states each."""
+"""Problems with close encounters for adaptive step size: eight initial states each."""
 
 from __future__ import annotations
 
@@ -31,24 +31,25 @@ __all__ = ["ADAPTIVE_CASES", "ECCENTRICITIES", "adaptive_case"]
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
 KEPLER_SPAN = 2000.0
 MERCURY = {"axis": 0.387098, "eccentricity": 0.205630, "mass": 1.66e-7, "inclination": math.radians(7.0)}
-"""In astronomical units and solar masses."""
+"""Orbit of Mercury, in astronomical units and solar masses."""
 COMET = {"axis": 10.0, "eccentricity": 0.97, "mass": 1e-15, "inclination": math.radians(20.0)}
 ORBITS = 2922.0, 12000.0
-"""Days: eight years with Mercury, a revolution of the comet."""
+"""Spans in days: eight years with Mercury, a revolution of the comet."""
 
 PYTHAGOREAN = (3.0, 4.0, 5.0), ((1.0, 3.0), (-2.0, -1.0), (1.0, -1.0))
-"""Burrau's problem: masses at rest in the corners opposite to sides of these lengths."""
+"""Burrau's problem: masses, and their positions at rest in the corners opposite to sides of these lengths."""
 FIGURE_EIGHT = (0.97000436, -0.24308753), (-0.93240737, -0.86473146)
-"""Chenciner & Montgomery, Annals of Mathematics 152 (2000): a body, and the velocity of the one in the middle."""
+"""Initial position and velocity (Chenciner & Montgomery, Annals of Mathematics 152, 2000): a body, and the velocity
+of the central one."""
 
 
 def adaptive_case(name: str) -> Case:
-    """One of :data:`ADAPTIVE_CASES`, built."""
+    """Return one of :data:`ADAPTIVE_CASES`."""
     return replace(ADAPTIVE_CASES[name](), name=f"adaptive:{name}")
 
 
 def _kepler_case(eccentricity: float) -> Case:
-    """From the far end of the axis, where the velocity is small."""
+    """Return the Kepler problem started at the apocentre, where the velocity is small."""
     speed = math.sqrt((1.0 - eccentricity) / (1.0 + eccentricity))
     return Case(
         name="kepler",
@@ -64,7 +65,7 @@ def _kepler_case(eccentricity: float) -> Case:
 
 
 def atwood(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """R'' = (m r th'^2 - g (M - m cos th)) / (M + m), th'' = -(2 r' th' + g sin th) / r."""
+    """Return r'' = (m r th'^2 - g (M - m cos th)) / (M + m), th'' = -(2 r' th' + g sin th) / r."""
     heavy, light, g = of["M"], of["m"], of["g"]
     pull = light * q[0] * (v[1] * v[1]) - g * (heavy - light * functions.cos(q[1]))
     return [pull / (heavy + light), -(2.0 * v[0] * v[1] + g * functions.sin(q[1])) / q[0]]
@@ -90,13 +91,13 @@ def _atwood_case() -> Case:
 
 
 def _double_pendulum_case() -> Case:
-    """Tumbling: both rods go over the top."""
+    """Return a tumbling double pendulum: both rods rotate over the top."""
     plain = case("double-pendulum")
     return replace(plain, q=scaled((2.2, 2.8), 0.01), velocity=scaled((0.5, 0.5), 0.01), span=20.0)
 
 
 def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[float], **others: Any) -> Case:
-    """Bodies in space that attract each other."""
+    """Return a case of bodies in space that attract each other."""
     gravity = others.pop("gravity", 1.0)
     names = [[f"{axis}{n}" for axis in "xyz"] for n in range(len(masses))]
     kinetic = [f"m_{n}*({' + '.join(f'{x}_dot**2' for x in body)})/2" for n, body in enumerate(names)]
@@ -135,7 +136,7 @@ def _figure_eight_case() -> Case:
 
 
 def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: float) -> Case:
-    """The outer solar system and a body on an ellipse around the sun, from perihelion or aphelion (part 1, -1)."""
+    """Return the outer solar system with a body on an ellipse, started at perihelion (part 1) or aphelion (-1)."""
     outer = problem("outer-solar-system")
     assert outer.velocity is not None
     values = dict(zip(map(str, outer.system.parameters), outer.system.defaults, strict=True))
@@ -165,4 +166,4 @@ ADAPTIVE_CASES: Mapping[str, Callable[[], Case]] = {
     "comet": partial(_solar_case, "comet", COMET, ORBITS[1], part=-1.0),
     "figure-eight": _figure_eight_case,
 }
-"""By the name after ``adaptive:``."""
+"""Functions that build a case, by the name after ``adaptive:``."""

@@ -1,4 +1,4 @@
-"""Steps of the same text by several compilers, and for several processors, in turn."""
+"""Benchmark of one C source with several compilers, and for several processors, in turn."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ LEVELS: Mapping[str, tuple[str, str]] = {
     "x86-64-v3": ("AVX2", "avx2"),
     "x86-64-v4": ("AVX-512", "avx512f"),
 }
-"""Of x86-64: what gcc and clang call it, its title, and the flag of processors that have it."""
+"""Levels of x86-64 as gcc and clang name them: title, and the processor flag required."""
 
 Step = Callable[[], object]
 
 
 def run_builds(plan: Plan, say: Say) -> ResultTable:
-    """Microseconds a step: minima of processor time, all builds in turn, round after round."""
+    """Measure microseconds per step: minima of processor time, all builds in turn, round after round."""
     steps = max(1, int(STEPS * plan.share))
     builds = _builds()
     rows: dict[str, dict[str, Any]] = {build: {"build": build} for build in builds}
@@ -58,7 +58,7 @@ def run_builds(plan: Plan, say: Say) -> ResultTable:
 
 
 def _builds() -> dict[str, tuple[str, tuple[str, ...]]]:
-    """Compiler and flags by title, of what is there."""
+    """Return compiler and flags by title, for the compilers that are installed."""
     found = {name: name for name in ("gcc", "clang") if shutil.which(name)}
     if importlib.util.find_spec("ziglang"):
         found["ziglang"] = f"{sys.executable} -m ziglang cc"
@@ -67,14 +67,14 @@ def _builds() -> dict[str, tuple[str, tuple[str, ...]]]:
         builds[f"{title}, this processor"] = (command, TUNED_FLAGS)
         for level in _levels():
             flags = tuple(f"-march={level}" if flag == "-march=native" else flag for flag in TUNED_FLAGS)
-            if title != "ziglang":  # a clang, which calls them by other names
+            if title != "ziglang":  # a clang with other names of processors
                 builds[f"{title}, {LEVELS[level][0]}"] = (command, flags)
         builds[f"{title}, portable"] = (command, PORTABLE_FLAGS)
     return builds
 
 
 def _levels() -> Iterator[str]:
-    """Those of x86-64 that this processor has."""
+    """Yield the levels of x86-64 that this processor supports."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return
     description = Path("/proc/cpuinfo")
@@ -83,7 +83,7 @@ def _levels() -> Iterator[str]:
 
 
 def _runner(name: str, degree: int, steps: int, command: str, flags: tuple[str, ...]) -> Step:
-    """Many steps by one build."""
+    """Return a function that performs many steps with one build."""
     chosen = problem(name)
     with _compiled_by(command):
         stepper = compile_stepper(chosen.system, SVI(degree), flags=flags)
@@ -105,7 +105,7 @@ def _compiled_by(command: str) -> Iterator[None]:
 
 
 def _fastest(runs: Mapping[str, Step], rounds: int) -> dict[str, float]:
-    """Seconds of each."""
+    """Return the smallest processor time of each, in seconds."""
     found = dict.fromkeys(runs, float("inf"))
     for _ in range(rounds):
         for build, run in runs.items():

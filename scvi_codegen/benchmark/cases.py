@@ -1,7 +1,7 @@
-"""What is measured: problems with eight initial states each, and their accelerations solved for by hand.
+"""Problems of the benchmark with eight initial states each, and their accelerations derived by hand.
 
-The accelerations are written once, for numbers of any kind: NumPy's extended precision (the references), heyoka's and
-SymEngine's expressions, traced text. They owe nothing to the derivation that the project's own steppers go through.
+The accelerations are written once, for numbers of any kind: NumPy's extended precision (for the references), heyoka's
+and SymEngine's expressions, traced text. They are independent of the derivation that this package performs.
 """
 
 from __future__ import annotations
@@ -36,20 +36,21 @@ __all__ = [
 Array = NDArray[np.float64]
 Vector = Sequence[Any]
 Rates = Callable[[Vector, Mapping[str, Any], Any], list[Any]]
-"""Derivative of a first-order state x, from (x, parameters, what has sin, cos, sqrt and, for what is driven, time)."""
+"""Derivative of a first-order state x, from (x, parameters, module with sin, cos, sqrt and, for driven systems,
+time)."""
 
 STATES = 8
-"""Initial states of a case: its error is the root of the mean square over them."""
+"""Number of initial states of a case; its error is the root mean square over them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Formulation:
-    """A first-order system x' = rates(x) for (q, v), or for (q, p).
+    """First-order system x' = rates(x) for (q, v), or for (q, p).
 
     Attributes:
-        name: how it was found, for the reader.
-        rates: the derivative of x.
-        momenta: whether the second half of x are momenta.
+        name: how it was derived.
+        rates: derivative of x.
+        momenta: True if the second half of x are momenta.
     """
 
     name: str
@@ -59,20 +60,20 @@ class Formulation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Case:
-    """One problem of the benchmark.
+    """Problem of the benchmark.
 
     Attributes:
-        name: on the command line.
-        system: the Lagrangian, with the parameters of this case.
-        formulations: hand-solved first-order systems; the first one is in (q, v).
-        q, velocity: (8, m) initial states, or some of them again and again.
-        span: length of time.
-        step: one that gives about ten digits, the catalogue's own where it has this problem.
-        fine: a step with which a Gauss method of 16 stages reaches 1e-18, for the reference.
-        bodies: masses (and the constant of gravity) if coordinates are Cartesian positions of gravitating bodies.
-        loops: text of ``rates(out, t, x, unused)`` in Python with loops, for Numba, where it is faster than many lines.
-        masses: (m,) constant masses of the coordinates where momenta differ from velocities by a rounding; ``None``
-            where p = dL/dv is exact at the initial states (unit masses, or rest).
+        name: name on the command line.
+        system: Lagrangian system, with the parameters of this case.
+        formulations: hand-derived first-order systems; the first one is in (q, v).
+        q, velocity: (8, m) initial states, possibly repeated.
+        span: duration.
+        step: step size that gives about ten digits; the catalogue's own for its problems.
+        fine: step size with which a Gauss method of 16 stages reaches 1e-18, for the reference.
+        bodies: masses and constant of gravity if coordinates are Cartesian positions of gravitating bodies.
+        loops: source of ``rates(out, t, x, unused)`` in Python with loops, for Numba, if faster than unrolled code.
+        masses: (m,) constant masses of the coordinates if momenta differ from velocities by a rounding; ``None`` if
+            p = dL/dv is exact at the initial states (unit masses, or rest).
     """
 
     name: str
@@ -89,12 +90,12 @@ class Case:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by name."""
+        """Parameter values by name."""
         return dict(zip((str(symbol) for symbol in self.system.parameters), self.system.defaults, strict=True))
 
     @property
     def dimension(self) -> int:
-        """Degrees of freedom m."""
+        """Number of degrees of freedom m."""
         return int(self.q.shape[1])
 
 
@@ -103,9 +104,9 @@ class Bodies:
     """Point masses that attract each other.
 
     Attributes:
-        masses: of the bodies; 0 for one that only follows.
-        gravity: Newton's constant in the units of the case.
-        fixed_centre: whether a mass at rest in the origin comes before the coordinates' own bodies.
+        masses: masses of the bodies; 0 for a test particle.
+        gravity: constant of gravity in the units of the case.
+        fixed_centre: True if a unit mass at rest in the origin precedes the bodies of the coordinates.
         axes: coordinates of each body, 2 or 3.
     """
 
@@ -116,7 +117,7 @@ class Bodies:
 
 
 def second_order(accelerations: Callable[[Vector, Vector, Mapping[str, Any], Any], list[Any]]) -> Rates:
-    """First-order rates of (q, v) from accelerations."""
+    """Return first-order rates of (q, v) from accelerations."""
 
     def rates(x: Vector, parameters: Mapping[str, Any], functions: Any) -> list[Any]:
         m = len(x) // 2
@@ -126,23 +127,23 @@ def second_order(accelerations: Callable[[Vector, Vector, Mapping[str, Any], Any
 
 
 def pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q'' = -(g / l) sin q."""
+    """Return q'' = -(g / l) sin q."""
     return [-(of["g"] / of["l"]) * functions.sin(q[0])]
 
 
 def duffing(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q'' = -alpha q - beta q^3, without drive."""
+    """Return q'' = -alpha q - beta q^3, without driving force."""
     return [-(of["alpha"] + of["beta"] * (q[0] * q[0])) * q[0]]
 
 
 def kepler(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q'' = -mu q / |q|^3."""
+    """Return q'' = -mu q / |q|^3."""
     pull = -of["mu"] * (q[0] * q[0] + q[1] * q[1]) ** -1.5
     return [pull * q[0], pull * q[1]]
 
 
 def gravitation(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Newton's law for bodies in space, each pair once."""
+    """Return the accelerations of bodies in space by Newton's law, each pair once."""
     masses = [value for name, value in of.items() if name.startswith("m_")]
     result: list[Any] = [0.0] * len(q)
     for one in range(len(masses)):
@@ -156,7 +157,7 @@ def gravitation(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> 
 
 
 def double_pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """The 2 x 2 mass matrix inverted by hand."""
+    """Return the accelerations, with the 2 x 2 mass matrix inverted by hand."""
     m1, m2, l1, l2, g = (of[name] for name in ("m1", "m2", "l1", "l2", "g"))
     sine, cosine = functions.sin(q[0] - q[1]), functions.cos(q[0] - q[1])
     first = -m2 * l2 * (v[1] * v[1]) * sine - (m1 + m2) * g * functions.sin(q[0])
@@ -169,17 +170,17 @@ def double_pendulum(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any)
 
 
 def relativistic(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q'' = -(k / m) q (1 - v^2/c^2)^(3/2)."""
+    """Return q'' = -(k / m) q (1 - v^2/c^2)^(3/2)."""
     return [-(of["k"] / of["m"]) * q[0] * (1.0 - v[0] * v[0] / (of["c"] * of["c"])) ** 1.5]
 
 
 def relativistic_in_momenta(x: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q' = p / sqrt(m^2 + p^2/c^2), p' = -k q."""
+    """Return q' = p / sqrt(m^2 + p^2/c^2), p' = -k q."""
     return [x[1] * (of["m"] * of["m"] + x[1] * x[1] / (of["c"] * of["c"])) ** -0.5, -of["k"] * x[0]]
 
 
 def chain(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Unit masses between fixed ends, on springs of force d + beta d^3 (alpha = 0)."""
+    """Return the accelerations of unit masses between fixed ends, on springs of force d + beta d^3 (alpha = 0)."""
     stretches = [q[0], *(right - left for left, right in pairwise(q)), -q[-1]]
     forces = [(1.0 + of["beta"] * (d * d)) * d for d in stretches]
     return [right - left for left, right in pairwise(forces)]
@@ -198,20 +199,20 @@ def rates(out, t, x, unused):
 
 
 def henon_heiles(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """X'' = -x - 2 coupling x y, y'' = -y - coupling (x^2 - y^2)."""
+    """Return x'' = -x - 2 coupling x y, y'' = -y - coupling (x^2 - y^2)."""
     x, y = q
     return [-x - 2.0 * of["coupling"] * (x * y), -y - of["coupling"] * (x * x - y * y)]
 
 
 def scaled(state: Sequence[float], spread: float) -> Array:
-    """(8, m) states proportional to one, within +- spread of it, at incommensurable places."""
+    """Return (8, m) states proportional to one, with factors 1 +- spread from the golden-ratio sequence."""
     golden = (math.sqrt(5.0) - 1.0) / 2.0
     factors = 1.0 + spread * (2.0 * np.modf(golden * np.arange(1, STATES + 1))[0] - 1.0)
     return np.outer(factors, np.asarray(state, dtype=float))
 
 
 def rotated(vector: Sequence[float], axes: int) -> Array:
-    """(8, m) states: each body's vector under eight rotations and reflections, the same in every run."""
+    """Return (8, m) states: each body's vector under eight random orthogonal matrices, reproducible."""
     random = np.random.default_rng(1)
     parts = np.asarray(vector, dtype=float).reshape(-1, axes)
     matrices = [np.linalg.qr(random.standard_normal((axes, axes)))[0] for _ in range(STATES)]
@@ -219,7 +220,7 @@ def rotated(vector: Sequence[float], axes: int) -> Array:
 
 
 def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Case:
-    """A problem of the catalogue with its own state (or another one), spread by 5 %."""
+    """Return a problem of the catalogue with its own state (or another one), spread by 5 %."""
     entry = problem(name)
     own = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
     q, velocity = changes.pop("q", entry.q), changes.pop("velocity", entry.velocity)
@@ -248,7 +249,7 @@ def _duffing_case() -> Case:
 
 
 def _henon_heiles_case() -> Case:
-    """At energy 0.055, where the motion is regular."""
+    """Return the problem at energy 0.055, where motion is regular."""
     return _small_case(
         "henon-heiles",
         _hand_solved(henon_heiles),
@@ -329,14 +330,14 @@ CASES: Mapping[str, Callable[[], Case]] = {
     "fput-chain:64": partial(_chain_case, 64, step=2.0, fine=3.0),
     "fput-chain:256": partial(_chain_case, 256, step=2.0, fine=2.0),
 }
-"""The cases of the table: name on the command line -> function that builds one."""
+"""Cases of the table: name on the command line -> function that builds one."""
 
 
 def case(name: str) -> Case:
     """Build a case.
 
     Raises:
-        SystemDefinitionError: if there is none of that name.
+        SystemDefinitionError: for an unknown name.
     """
     if name not in CASES:
         raise SystemDefinitionError(f"no case is called '{name}'{closest(name, CASES)} Known: {', '.join(CASES)}")

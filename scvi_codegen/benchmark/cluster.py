@@ -1,4 +1,4 @@
-"""A thousand bodies that all attract each other, beside REBOUND's leapfrog and IAS15: time at equal error."""
+"""Benchmark of a thousand gravitating bodies; REBOUND's leapfrog and IAS15 at equal error."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from scvi_codegen.runtime.accuracy import unwarned
 __all__ = ["run_cluster"]
 
 State = tuple[Array, Array]
-"""Positions and velocities at the end."""
+"""Final positions and velocities."""
 
 COUNT, QUICK_COUNT, SPAN = 1000, 20, 0.5
 LEAPS = (16, 64, 256, 1024)
 OURS_BY = {"svi:2": (16, 32), "svi:4": (4, 8, 16), "svi:8": (2, 4, 8, 16), "composition:8": (4, 8, 16)}
-"""Steps of each method."""
+"""Numbers of steps of each method."""
 
 
 @unwarned()
 def run_cluster(plan: Plan, say: Say) -> ResultTable:
-    """Every contender at several steps, each once more if that is quick."""
+    """Measure every contender at several numbers of steps, each twice."""
     each = bodies(QUICK_COUNT if plan.quick else COUNT, SPAN)
     reference, doubt = reference_of(each)
     energy = _energies(each)

@@ -1,4 +1,4 @@
-"""Systems from two to some thousand coordinates, as the text a user writes: what compiling is measured with."""
+"""Systems from two to some thousand coordinates as text, for measuring compile times."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ AXES = "xyz"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
-    """A Lagrangian as text, and a state to begin in.
+    """Lagrangian as text, and an initial state.
 
     Attributes:
-        name: what the system is called.
-        coordinates: their names; all momenta begin at 0.
-        lagrangian: the formula.
+        name: name of the system.
+        coordinates: names of the coordinates; all initial momenta are 0.
+        lagrangian: formula.
         start: (m,) positions at which it is defined.
-        parameters: default value by name.
+        parameters: default values by name.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Written:
 
 
 def kepler() -> Written:
-    """The planar Kepler problem."""
+    """Return the planar Kepler problem."""
     return Written(
         name="Kepler",
         coordinates=("q1", "q2"),
@@ -44,7 +44,7 @@ def kepler() -> Written:
 
 
 def links(n: int) -> Written:
-    """A pendulum of n unit masses, one below the other."""
+    """Return a pendulum of n unit masses in a chain."""
     masses = [[n - max(i, j) for j in range(n)] for i in range(n)]
     kinetic = (f"{masses[i][j]}*cos(q{i} - q{j})*q{i}_dot*q{j}_dot/2" for i in range(n) for j in range(n))
     return Written(
@@ -57,7 +57,7 @@ def links(n: int) -> Written:
 
 
 def chain(n: int) -> Written:
-    """A chain of n unit masses between walls, springs with a quartic part between them (FPUT, beta)."""
+    """Return a chain of n unit masses between walls with quartic springs (FPUT, beta)."""
     names = tuple(f"q{i}" for i in range(1, n + 1))
     stretched = [f"({b} - {a})" for a, b in pairwise(("0", *names, "0"))]
     return Written(
@@ -70,7 +70,7 @@ def chain(n: int) -> Written:
 
 
 def bodies(n: int) -> Written:
-    """Bodies in space under their gravity."""
+    """Return n gravitating bodies in space."""
     names = [f"b{i}" for i in range(n)]
     return Written(
         name=f"{n} bodies",
@@ -87,7 +87,7 @@ def bodies(n: int) -> Written:
 
 
 def lennard_jones(n: int) -> Written:
-    """Atoms in space."""
+    """Return n atoms in space."""
     names = [f"a{i}" for i in range(n)]
     pairs = (
         f"4*epsilon*((sigma/{_distance(a, b)})**6 - (sigma/{_distance(a, b)})**12)" for a, b in combinations(names, 2)
@@ -102,7 +102,7 @@ def lennard_jones(n: int) -> Written:
 
 
 def cloth(n: int) -> Written:
-    """Unit masses in space, n by n, with springs of length 1 along the threads, hung into gravity."""
+    """Return n by n unit masses in space, with springs of length 1 along the threads, under gravity."""
     names = [f"p{i}_{j}" for i in range(n) for j in range(n)]
     threads = [(i * n + j, i * n + j + 1) for i in range(n) for j in range(n - 1)]
     threads += [(i * n + j, (i + 1) * n + j) for i in range(n - 1) for j in range(n)]
@@ -117,7 +117,7 @@ def cloth(n: int) -> Written:
 
 
 def post_newtonian(n: int) -> Written:
-    """Point masses with the first relativistic corrections (Einstein, Infeld, Hoffmann)."""
+    """Return point masses with first post-Newtonian corrections (Einstein, Infeld, Hoffmann)."""
     names = [f"b{i}" for i in range(n)]
     kinetic = [f"m_{a}*({_square(a)}/2 + {_square(a)}**2/(8*c2))" for a in names]
     squared = (
@@ -150,7 +150,7 @@ def _cartesian(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _square(a: str) -> str:
-    """The square of a speed."""
+    """Return the square of a speed."""
     return "(" + " + ".join(f"{a}_{x}_dot**2" for x in AXES) + ")"
 
 
@@ -159,7 +159,7 @@ def _distance(a: str, b: str) -> str:
 
 
 def _grid(n: int) -> tuple[float, ...]:
-    """Places in space, at least 1.2 apart, not quite regular."""
+    """Return positions in space, at least 1.2 apart, slightly irregular."""
     side = int(np.ceil(n ** (1 / 3)))
     places = np.array([(i, j, k) for i in range(side) for j in range(side) for k in range(side)][:n])
     return tuple(float(x) for x in (1.3 * places + 0.04 * np.sin(1.0 + 5.0 * np.arange(3 * n).reshape(n, 3))).ravel())

@@ -1,4 +1,4 @@
-"""From text to the first step, for systems of two to some thousand coordinates, each in a fresh process."""
+"""Benchmark of the time from text to the first step, for two to some thousand coordinates, in fresh processes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ print(json.dumps([done - began, marks[1] - marks[0], marks[2] - marks[1], python
 
 
 def run_compile_times(plan: Plan, say: Say) -> ResultTable:
-    """One run a system, each with an empty cache."""
+    """Measure one run per system, each with an empty cache."""
     rows = []
     for name, (write, method) in COMPILED.items():
         if plan.quick and name not in QUICK:

@@ -1,8 +1,8 @@
-"""SVI against explicit compositions: Stoermer-Verlet (order 2) and Kahan-Li, Sofroniou-Spaletta (orders 8 and 10).
+"""Benchmark of SVI and explicit compositions: Stoermer-Verlet (order 2), Kahan-Li and Sofroniou-Spaletta (8 and 10).
 
-Every method runs with shorter and shorter steps, over a tenth of the span of each case (in longer spans round-off alone
-exceeds the smallest error asked for), until the error is small enough or the run too long. What a method does not reach
-is extrapolated by its order and marked.
+Every method runs with smaller and smaller steps, over a tenth of the span of each case (in longer spans round-off alone
+exceeds the smallest error asked for), until the error is small enough or the run takes too long. Errors that a method
+does not reach are extrapolated by its order and marked.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ ERRORS = (1e-4, 1e-8, 1e-12)
 METHODS = (SVI(4), SVI(8), StoermerVerlet(), Composition(8), Composition(10))
 SHARE = 0.1
 LONGEST, COARSEST = 0.5, 8.0
-"""Seconds for a trajectory beyond which no shorter step is tried; the first step, in units of the step of the case."""
+"""Seconds per trajectory beyond which no smaller step is tried; the first step, in units of the step of the case."""
 
 FINER = math.sqrt(0.5)
 MOST_RUNGS = 60
 RESOLVED = 1e-2
-"""Errors above show no order yet."""
+"""Largest error in the asymptotic regime of the order."""
 
 REPEATS = 3
 
 
 @unwarned()
 def run_compositions(plan: Plan, say: Say) -> ResultTable:
-    """Milliseconds of a trajectory for each error, and who is fastest."""
+    """Measure milliseconds of a trajectory for each error, and the fastest method."""
     rows = []
     for name in COMPARED:
         plain = case(name)
@@ -81,7 +81,7 @@ def _row(chosen: Case, error: float, curves: dict[str, list[Point]]) -> dict[str
 
 
 def _beyond(curve: list[Point], error: float, order: int | None) -> float:
-    """Time for an error smaller than any measured, from the smallest and the order."""
+    """Return the time for an error below all measured ones, extrapolated from the smallest by the order."""
     if not curve or not order:
         return math.nan
     best = min(curve, key=lambda point: point.error)

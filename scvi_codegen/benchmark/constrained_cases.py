@@ -1,4 +1,4 @@
-"""Masses on rods, from rest: held by constraints in their places, and in the angles of the rods, as peers have them."""
+"""Masses on rods, from rest: as holonomic constraints, and for peers in the angles of the rods."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from scvi_codegen.methods import as_method
 __all__ = ["CONSTRAINED_CASES", "ConstrainedCase", "constrained_contenders"]
 
 LARGEST_IN_ANGLES = 8
-"""Rods beyond which this project's mass matrix in angles, full and of n^2 terms, takes long to derive."""
+"""Largest number of rods in angles for this package: the full mass matrix has n^2 terms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstrainedCase:
-    """One motion twice.
+    """Problem in two formulations.
 
     Attributes:
-        angles: the case for peers, whose final q errors are measured in.
-        places: the case with constraints.
-        methods: of the constraints.
+        angles: case for peers; errors are measured in its final q.
+        places: case with constraints.
+        methods: methods for the constraints.
     """
 
     angles: Case
@@ -33,13 +33,13 @@ class ConstrainedCase:
     methods: tuple[str, ...]
 
     def shortened(self, share: float) -> ConstrainedCase:
-        """With a part of the span."""
+        """Return the cases with a part of the span."""
         span = share * self.angles.span
         return replace(self, angles=replace(self.angles, span=span), places=replace(self.places, span=span))
 
 
 def constrained_contenders(both: ConstrainedCase, *, quick: bool) -> list[Contender]:
-    """By constraints, then, where there are few rods, in their angles."""
+    """Return contenders with constraints and, for few rods, in angles."""
     methods = [as_method(name, both.places.system) for name in both.methods[: 1 if quick else None]]
     held = [_told_in_angles(each) for each in our_contenders(both.places, methods=methods, quick=quick)]
     few = both.angles.dimension <= LARGEST_IN_ANGLES
@@ -47,7 +47,7 @@ def constrained_contenders(both: ConstrainedCase, *, quick: bool) -> list[Conten
 
 
 def _told_in_angles(contender: Contender) -> Contender:
-    """Its final places as angles, which takes no time of a step."""
+    """Return the contender with final positions converted to angles, untimed."""
 
     def prepare(index: int) -> Callable[[], Array]:
         integrate = contender.prepare(index)
@@ -82,4 +82,4 @@ CONSTRAINED_CASES: Mapping[str, Callable[[], ConstrainedCase]] = {
     "chain:5": partial(_rods, "chain:5", 5, 0.3, methods=("svi:6",), span=100.0, fine=0.125),
     "chain:20": partial(_rods, "chain:20", 20, 0.3, methods=("svi:6",), span=50.0, fine=0.0625),
 }
-"""By the name after ``constrained:``."""
+"""Functions that build a case, by the name after ``constrained:``."""

@@ -1,4 +1,4 @@
-"""Work-precision curves: time at equal error, by interpolation between measured settings."""
+"""Work-precision curves: time at equal error, interpolated between measured settings."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from dataclasses import dataclass
 __all__ = ["FLOOR", "Point", "common_error", "error_at", "frontier", "time_at"]
 
 FLOOR = 1e-13
-"""Errors below count as equal to it: there they are round-off and luck."""
+"""Errors below count as equal to it: they are round-off and chance."""
 
 LEAST = 1e-18
-"""For an error that is 0."""
+"""Substitute for an error of 0."""
 
 MARGIN = 2.0
-"""On the plateau of round-off one setting beats the next by luck; a method's reach is twice its smallest error."""
+"""Factor on the smallest error of a method, for chance on the plateau of round-off."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
-    """A measured setting: seconds for one trajectory, and the error at its end."""
+    """Measured setting: seconds for one trajectory, and the error at its end."""
 
     seconds: float
     error: float
 
 
 def frontier(points: Iterable[Point]) -> list[Point]:
-    """The points that no other beats in time and error, the fastest first, up to the first below the floor.
+    """Return the Pareto-optimal points in time and error, fastest first, up to the first below the floor.
 
     >>> points = [Point(seconds=s, error=e) for s, e in [(1, 1e-3), (2, 1e-6), (3, 1e-5), (4, 1e-15), (5, 1e-16)]]
     >>> [point.seconds for point in frontier(points)]
@@ -42,10 +42,10 @@ def frontier(points: Iterable[Point]) -> list[Point]:
 
 
 def time_at(points: Iterable[Point], error: float) -> float | None:
-    """Seconds to reach an error, linear in log time against log error along the frontier.
+    """Return the seconds to reach an error, linearly interpolated in log-log along the frontier.
 
-    Nothing is extrapolated: an error looser than any measured takes the time of the fastest setting, and an error that
-    no setting reaches gives ``None``.
+    Nothing is extrapolated: a larger error than any measured takes the time of the fastest setting, and for an error
+    that no setting reaches the result is ``None``.
 
     >>> round(time_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 1e-6), 12)
     2.0
@@ -62,7 +62,7 @@ def time_at(points: Iterable[Point], error: float) -> float | None:
 
 
 def error_at(points: Iterable[Point], seconds: float) -> float | None:
-    """The error that is reached in a time, as :func:`time_at`; ``None`` in less than the fastest setting takes.
+    """Return the error reached in a time, as :func:`time_at`; ``None`` below the time of the fastest setting.
 
     >>> round(error_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 2.0), 12)
     1e-06
@@ -79,7 +79,7 @@ def error_at(points: Iterable[Point], seconds: float) -> float | None:
 
 
 def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
-    """The smallest error that two methods reach safely: twice the larger of their smallest, at least the floor."""
+    """Return the smallest error that both methods reach safely: twice the larger of their smallest, or the floor."""
     curves = frontier(one), frontier(other)
     if not all(curves):
         return None

@@ -1,4 +1,4 @@
-"""Ten million steps of Kepler's problem: does the energy drift? heyoka on the same spans, for comparison."""
+"""Benchmark of energy drift over ten million steps of the Kepler problem; heyoka on the same spans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["DRIFTS", "fitted_slope", "run_drift"]
 
 DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
-"""Three step sizes each, from the largest without a visible truncation error down."""
+"""Three step sizes for each case, from the largest without a visible truncation error down."""
 
 STEPS, QUICK_STEPS = 10_000_000, 20_000
 SAMPLES = 2000
@@ -29,7 +29,7 @@ BLOCKS = 20
 
 @unwarned()
 def run_drift(plan: Plan, say: Say) -> ResultTable:
-    """All cases at all step sizes, SVI(8) and heyoka at its default tolerance."""
+    """Measure all cases at all step sizes, with SVI(8) and heyoka at its default tolerance."""
     steps = QUICK_STEPS if plan.quick else STEPS
     with_heyoka = "heyoka" in plan.peers and importlib.util.find_spec("heyoka") is not None
     rows = []
@@ -51,7 +51,7 @@ def run_drift(plan: Plan, say: Say) -> ResultTable:
 
 
 def drift_rows(chosen: Case, h: float, steps: int, *, with_heyoka: bool) -> list[dict[str, Any]]:
-    """One row a method, from the first state of a case."""
+    """Return one row per method, from the first state of a case."""
     stepper = compile_stepper(chosen.system, SVI(8))
     q, p = chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0])
     every = max(1, steps // SAMPLES)
@@ -79,11 +79,11 @@ def _energy_entries(stepper: Stepper, q: Array, p: Array) -> dict[str, float]:
 
 
 def fitted_slope(error: Array) -> tuple[float, float]:
-    """Slope of a line fitted to equidistant samples, times their length, and its standard error.
+    """Return the slope of a line fitted to equidistant samples, times their length, and its standard error.
 
-    Round-off makes the energy walk at random, so the residuals of the fit are far from independent and the usual error
-    is too small. The walk's increments are independent: the error comes from the scatter of its gains over twenty
-    blocks, by the variance 6/5 of the slope of a walk of unit variance.
+    Round-off makes the energy a random walk, so the residuals of the fit are correlated and the usual error is too
+    small. The increments of the walk are independent: the error is estimated from the variance of its gains over twenty
+    blocks, with the variance 6/5 of the slope of a walk of unit variance.
     """
     t = np.linspace(-0.5, 0.5, len(error))
     slope = float(t @ error / (t @ t))

@@ -1,11 +1,11 @@
-"""Problems with friction and drives, from rest; peers have the same forces in their hand-solved right-hand sides.
+"""Problems with friction and driving forces, from rest; peers have the same forces in hand-derived right-hand sides.
 
     duffing           damped and driven in one of its wells
-    cart-pole         a crane: friction of the cart and of the hinge, the cart driven
+    cart-pole         a crane: friction of the cart and of the hinge, a force on the cart
     double-pendulum   friction in both joints, a motor in the first
-    chain:5           the same of five rods
+    chain:5           the same for five rods
 
-Drives keep the motions going for as long as they are followed.
+The driving forces sustain the motion over the whole span.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ __all__ = ["FORCED_CASES"]
 
 
 def duffing(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Q'' = -delta q' - alpha q - beta q^3 + F cos(w t)."""
+    """Return q'' = -delta q' - alpha q - beta q^3 + F cos(w t)."""
     drive = of["F"] * functions.cos(of["w"] * functions.time)
     return [drive - of["delta"] * v[0] - (of["alpha"] + of["beta"] * (q[0] * q[0])) * q[0]]
 
 
 def _duffing_case() -> Case:
-    """J. Guckenheimer, P. Holmes, Nonlinear Oscillations (1983), section 2.2, where the drive is weak."""
+    """Return the weakly driven oscillator of J. Guckenheimer, P. Holmes, Nonlinear Oscillations (1983), section 2.2."""
     system = LagrangianSystem.from_text(
         name="damped and driven Duffing oscillator",
         coordinates=["q"],
@@ -42,7 +42,7 @@ def _duffing_case() -> Case:
 
 
 def crane(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """The 2 x 2 mass matrix of a cart and its pendulum inverted by hand."""
+    """Return the accelerations, with the 2 x 2 mass matrix of a cart and its pendulum inverted by hand."""
     cart, mass, length = (of[name] for name in ("M", "m", "l"))
     sine, cosine = functions.sin(q[1]), functions.cos(q[1])
     drive = of["F"] * functions.cos(of["w"] * functions.time) - of["b"] * v[0]
@@ -64,7 +64,7 @@ def _crane_case() -> Case:
 
 
 def driven_rods(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
-    """Friction c times how fast each joint turns, and the motor's couple on the first rod."""
+    """Return accelerations with friction c times the rate of each joint, and a torque of the motor on the first rod."""
     turns = [v[0], *(after - before for before, after in pairwise(v))]
     joints = [-of["c"] * turn for turn in turns]
     joints[0] = joints[0] + of["F"] * functions.cos(of["w"] * functions.time)
@@ -109,4 +109,4 @@ FORCED_CASES: Mapping[str, Callable[[], Case]] = {
     "double-pendulum": partial(_rods_case, "double-pendulum", 2, span=200.0, fine=0.125),
     "chain:5": partial(_rods_case, "chain:5", 5, span=100.0, fine=0.125),
 }
-"""By the name after ``forced:``."""
+"""Functions that build a case, by the name after ``forced:``."""

@@ -1,4 +1,4 @@
-"""Generated C against hand-written C of the same method: ``hand_written.c`` here, Gauss's method of eight stages."""
+"""Benchmark of generated C and hand-written C (``hand_written.c``) of the Gauss method of eight stages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HAND_WRITTEN = {"planar-pendulum": 0.8, "kepler:0.2": 0.5, "kepler:0.5": 0.2}
 STAGES = 8
 STEPS = 20_000
 COMPARED = 100
-"""Steps over which positions are compared: later ones differ by what round-off has grown to."""
+"""Number of steps over which positions are compared; later, round-off has grown."""
 
 DECLARATIONS = (
     "long hand_written(double *q, double *v, double strength, double h, long steps, long every, double *out);"
@@ -39,7 +39,7 @@ DECLARATIONS = (
 
 @unwarned()
 def run_hand_written(plan: Plan, say: Say) -> ResultTable:
-    """Nanoseconds a step of both, timed in turn, and how far apart they end."""
+    """Measure nanoseconds per step of both in turn, and the difference of their final states."""
     rows = []
     for name, h in HAND_WRITTEN.items():
         say(f"hand-written: {name}")
@@ -58,14 +58,14 @@ def run_hand_written(plan: Plan, say: Say) -> ResultTable:
 
 
 def hand_written_source(pendulum: bool) -> Source:
-    """The C text with its constants."""
+    """Return the C source with its constants."""
     header = "\n".join(["#define PENDULUM" if pendulum else "", *_constants(), DECLARATIONS, ""])
     code = files("scvi_codegen.benchmark").joinpath("hand_written.c").read_text(encoding="utf-8")
     return Source(prefix="hand_written", header=header, code=code, declarations=DECLARATIONS)
 
 
 def _constants() -> Iterator[str]:
-    """Definitions of the type ``lanes``, of vectors (one row) and of tables, column after column."""
+    """Yield definitions of the type ``lanes``, of vectors (one row) and of tables, column by column."""
     c = gauss_legendre(STAGES).abscissae
     a, (b,) = (integrals(c, ends) for ends in (c, [mp.one]))
     product = matrix_product(a, a)
@@ -82,7 +82,7 @@ def _constants() -> Iterator[str]:
 
 
 def integrals(points: Sequence[Any], ends: Sequence[Any]) -> Matrix:
-    """Row n: the integrals from 0 to ends[n] of the polynomials that are 1 at one of the points and 0 at the others."""
+    """Return row n: the integrals from 0 to ends[n] of the Lagrange cardinal polynomials of the points."""
     powers = range(len(points))
     cardinal = mp.matrix([[x**k for k in powers] for x in points]) ** -1
     table = mp.matrix([[x ** (k + 1) / (k + 1) for k in powers] for x in ends]) * cardinal

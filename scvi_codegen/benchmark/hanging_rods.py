@@ -1,12 +1,12 @@
-"""Equal masses m on rods of length l, one below the other: in the angles of the rods, and in the places of the masses.
+"""Chain of equal masses m on rods of length l: in the angles of the rods, and in the positions of the masses.
 
-Accelerations of the angles are hand-solved by the tensions T of the rods, whose equations are tridiagonal: with e along
-a rod, n across, and couples C on the rods (the forces C n / l at their lower ends and -C n / l at the upper ones)
+Accelerations of the angles are computed from the tensions T of the rods, whose equations are tridiagonal: with
+unit vectors e along a rod and n across, and torques C on the rods (forces C n / l at lower, -C n / l at upper ends)
 
     m x''_k = m g - T_k e_k + T_(k+1) e_(k+1) + (C_k n_k - C_(k+1) n_(k+1)) / l,
 
 l e_k = x_k - x_(k-1) has the acceleration -l a_k'^2 along the rod, which gives T, and l a_k'' across. That is O(n);
-solving with the mass matrix of the angles is O(n^3). We know of nothing quicker in angles.
+solving with the mass matrix of the angles is O(n^3). No faster algorithm in angles is known to us.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def rods_in_angles(
     forces: Mapping[str, str] | None = None,
     dissipation: str | None = None,
 ) -> LagrangianSystem:
-    """In the angles a0, a1, .. from the vertical, nothing to hold, with forces of further parameters."""
+    """Return the system in the angles a0, a1, .. from the vertical, without constraints, optionally with forces."""
     terms = []
     for last in range(1, n + 1):
         speeds = (" + ".join(f"{turn}(a{k})*a{k}_dot" for k in range(last)) for turn in ("cos", "sin"))
@@ -49,7 +49,7 @@ def rods_in_angles(
 
 
 def rods_in_places(n: int) -> LagrangianSystem:
-    """In the places (x0, y0, x1, ..) of the masses, held at their distances."""
+    """Return the system in the positions (x0, y0, x1, ..) of the masses, with distance constraints."""
     kinetic = " + ".join(f"x{k}_dot**2 + y{k}_dot**2" for k in range(n))
     rods = [f"(x{k} - x{k - 1})**2 + (y{k} - y{k - 1})**2 = l**2" for k in range(1, n)]
     return LagrangianSystem.from_text(
@@ -64,7 +64,7 @@ def rods_in_places(n: int) -> LagrangianSystem:
 def rod_accelerations(
     q: Vector, v: Vector, of: Mapping[str, Any], functions: Any, couples: Sequence[Any] = ()
 ) -> list[Any]:
-    """Of the angles, by the tensions of the rods over m; couples on each rod."""
+    """Return the accelerations of the angles from the tensions over m; ``couples`` are torques on the rods."""
     n, length, g = len(q), of["l"], of["g"]
     sines = [functions.sin(after - before) for before, after in pairwise(q)]
     cosines = [functions.cos(after - before) for before, after in pairwise(q)]
@@ -85,7 +85,7 @@ def rod_accelerations(
 
 
 def _tridiagonal(diagonal: Sequence[float], beside: Vector, right: Vector) -> list[Any]:
-    """X with diagonal_k x_k - beside_k x_(k+1) - beside_(k-1) x_(k-1) = right_k, eliminated from the end."""
+    """Solve diagonal_k x_k - beside_k x_(k+1) - beside_(k-1) x_(k-1) = right_k by elimination from the end."""
     pivots, values = [diagonal[-1]], [right[-1]]
     for d, b, r in zip(diagonal[-2::-1], reversed(beside), right[-2::-1], strict=True):
         share = b / pivots[-1]
@@ -98,12 +98,12 @@ def _tridiagonal(diagonal: Sequence[float], beside: Vector, right: Vector) -> li
 
 
 def places_of(angles: Array, length: float = 1.0) -> Array:
-    """(.., 2 n) places of (.., n) angles."""
+    """Return (.., 2 n) positions of (.., n) angles."""
     steps = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
     return np.cumsum(steps, axis=-2).reshape(*angles.shape[:-1], -1)
 
 
 def angles_of(places: Array) -> Array:
-    """The (.., n) angles, between -pi and pi, of (.., 2 n) places."""
+    """Return the (.., n) angles, between -pi and pi, of (.., 2 n) positions."""
     x, y = (np.diff(places[..., axis::2], axis=-1, prepend=0.0) for axis in (0, 1))
     return np.arctan2(x, -y)

@@ -1,4 +1,4 @@
-"""Bodies held by rods: energies and lengths kept by this project and by MuJoCo, at equal time."""
+"""Benchmark of constrained bodies: errors of energy and rod lengths of this package and of MuJoCo at equal time."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ __all__ = ["run_held"]
 SPAN = 10.0
 METHODS = ("svi:1", "svi:2", "svi:4")
 OUR_STEPS = (2000, 1000, 500, 250, 100)
-"""In the span."""
+"""Numbers of steps in the span."""
 STEPS = (10000, 5000, 2000, 1000)
-"""Of MuJoCo, whose own default is 5000."""
+"""Numbers of steps of MuJoCo, whose default is 5000."""
 INTEGRATORS = ("Euler", "implicitfast", "RK4")
 LOST = 1.0
-"""Of the weight, where a change of energy leaves nothing to compare."""
+"""Energy change, in units of the weight, above which results are not compared."""
 
 Move = Callable[[float, int], HeldRun]
 
 
 def run_held(plan: Plan, say: Say) -> ResultTable:
-    """All rows; those of MuJoCo say why not where it is not installed."""
+    """Measure all rows; those of MuJoCo state the reason if it is not installed."""
     rows: list[dict[str, Any]] = []
     for name, make in HELD.items():
         held, own = make(), []
@@ -79,7 +79,7 @@ def _angles(held: Held, plan: Plan) -> Iterator[dict[str, Any]]:
 
 
 def _others(held: Held) -> Iterator[tuple[str, Move]]:
-    """MuJoCo's integrators; loops also as stiff as a step allows."""
+    """Yield MuJoCo's integrators; closed loops also with the stiffest constraint that the step allows."""
     try:
         import mujoco  # noqa: F401  (whether it is there)
     except ImportError:
@@ -91,13 +91,13 @@ def _others(held: Held) -> Iterator[tuple[str, Move]]:
 
 
 def _rows(held: Held, by: str, move: Move, counts: Sequence[int], plan: Plan) -> Iterator[dict[str, Any]]:
-    """One for each step, the median of the times."""
+    """Yield one row for each step size, with the median of the times."""
     span = SPAN * plan.share
     for count in (each for each in counts if each * plan.share >= PARTS):
         h = SPAN / count
         try:
             runs = [move(h, round(span / h)) for _ in range(plan.rounds)]
-        except ArithmeticError as error:  # too long a step
+        except ArithmeticError as error:  # too large a step
             yield {"by": by, "h": h, "why_not": str(error)}
             continue
         energy = runs[0].energy / held.weight
@@ -111,7 +111,7 @@ def _points(rows: Sequence[dict[str, Any]]) -> list[Point]:
 
 
 def _beside(row: dict[str, Any], curves: dict[str, list[Point]]) -> dict[str, Any]:
-    """What this project's errors are in the time of a row."""
+    """Return the errors of this package in the time of a row."""
     if "why_not" in row:
         return {}
     ours, angles = (error_at(curves[name], row["second_us"]) for name in ("energy", "angles"))

@@ -1,4 +1,4 @@
-"""Large systems to be timed: lattices, fields, molecules, cloth, bodies, of any size."""
+"""Large systems for timing: lattices, fields, molecules, cloth and bodies, of any size."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "
 
 SEED = 20261121
 SPACING = 0.98 * 2 ** (2 / 3)
-"""Of an argon crystal, in diameters of its atoms: neighbours stand a little closer than two atoms at rest would."""
+"""Lattice constant of an argon crystal in diameters of its atoms, slightly compressed."""
 
 
 class Lattice(NamedTuple):
-    """A problem: its system and start, how long it runs, steps to try, its accelerations by NumPy.
+    """Problem: system and initial state, duration, largest step size to try, accelerations by NumPy.
 
-    ``by_hand``: (is a field, places along an axis, strength) for the C by hand; ``tables``: of bonds.
+    ``by_hand``: (is a field, length of an axis, strength) for the hand-written C; ``tables``: index tables of bonds.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Lattice(NamedTuple):
 
 
 def ring(count: int, span: float) -> Lattice:
-    """A Fermi-Pasta-Ulam-Tsingou ring in which all places move."""
+    """Return a Fermi-Pasta-Ulam-Tsingou ring with random velocities."""
     beta, numbers = 0.25, np.random.default_rng(SEED)
 
     def accelerations(q: Array) -> Array:
@@ -65,7 +65,7 @@ def ring(count: int, span: float) -> Lattice:
 
 
 def field(side: int, span: float) -> Lattice:
-    """Sine-Gordon on a torus, a smooth bump."""
+    """Return the sine-Gordon equation on a torus with a smooth bump."""
     dx = 0.1
     x = dx * (np.arange(side) - side // 2)
     bump = 2.0 * np.exp(-(x[:, np.newaxis] ** 2 + x**2) / 4.0)
@@ -95,7 +95,7 @@ def field(side: int, span: float) -> Lattice:
 
 
 def bodies(count: int, span: float) -> Lattice:
-    """Gravity, softened, of a cluster."""
+    """Return a cluster with softened gravity."""
     softening, numbers = 0.1, np.random.default_rng(SEED)
 
     def accelerations(r: Array) -> Array:
@@ -124,7 +124,7 @@ def bodies(count: int, span: float) -> Lattice:
 
 
 def atoms(cells: int, span: float) -> Lattice:
-    """A crystal of argon (face-centred cubic, free surfaces), slightly compressed, whose atoms move at random."""
+    """Return a crystal of argon (face-centred cubic, free surfaces), slightly compressed, with random velocities."""
     corner = np.array([[0.0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]])
     q = SPACING * np.concatenate([corner + np.array(cell) for cell in np.ndindex(cells, cells, cells)])
 
@@ -154,7 +154,7 @@ def atoms(cells: int, span: float) -> Lattice:
 
 
 def waves(count: int, span: float) -> Lattice:
-    """A Klein-Gordon ring, q^4 at every place, in which long waves run."""
+    """Return a Klein-Gordon ring with on-site q^4 potential, with long waves."""
 
     def accelerations(q: Array) -> Array:
         found: Array = np.roll(q, -1) - 2.0 * q + np.roll(q, 1) - q - q**3
@@ -179,7 +179,7 @@ def waves(count: int, span: float) -> Lattice:
 
 
 def breather(count: int, span: float) -> Lattice:
-    """The breather of sine-Gordon's equation, 4 atan(k sin(w t) / (w cosh(k x))), k^2 = 1 - w^2, on a ring."""
+    """Return the breather of the sine-Gordon equation, 4 atan(k sin(w t) / (w cosh(k x))), k^2 = 1 - w^2, on a ring."""
     dx, frequency = 0.1, 0.8
     slope = np.sqrt(1.0 - frequency**2)
 
@@ -207,7 +207,7 @@ def breather(count: int, span: float) -> Lattice:
 
 
 def cloth(side: int, span: float) -> Lattice:
-    """Places on a square, springs between neighbours along both axes, stretched a little and waving."""
+    """Return points on a square with springs between neighbours along both axes, slightly stretched and waving."""
     places = np.arange(side**2).reshape(side, side)
     down, along = np.stack([places[:-1], places[1:]], -1), np.stack([places[:, :-1], places[:, 1:]], -1)
     bonds = np.concatenate([down.reshape(-1, 2), along.reshape(-1, 2)])

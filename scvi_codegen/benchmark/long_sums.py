@@ -1,4 +1,4 @@
-"""The energies of sums over indices over a hundred thousand steps: does round-off alone make them grow?"""
+"""Benchmark of the energy of indexed systems over a hundred thousand steps: growth by round-off."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = ["run_energies"]
 STEPS, QUICK_STEPS = 100_000, 2000
 SAMPLES = 500
 PARTS = 10
-"""Of a run, whose first is looked at by itself."""
+"""Number of parts of a run; the first is reported by itself."""
 
 
 def problems(plan: Plan) -> Iterator[tuple[Lattice, float, float]]:
-    """Each with a step of SVI(8), by which the error of a step is below rounding, and one of leapfrog."""
+    """Yield each problem with a step size for SVI(8), with local error below round-off, and one for leapfrog."""
     if plan.quick:
         yield from ((ring(16, 1.0), 0.1, 0.02), (cloth(3, 1.0), 0.01, 0.002))
         return
@@ -40,7 +40,7 @@ def problems(plan: Plan) -> Iterator[tuple[Lattice, float, float]]:
 
 @unwarned()
 def run_energies(plan: Plan, say: Say) -> ResultTable:
-    """All problems, by SVI(8) and by leapfrog."""
+    """Measure all problems with SVI(8) and with leapfrog."""
     steps = QUICK_STEPS if plan.quick else STEPS
     rows = []
     for each, h, short in problems(plan):

@@ -1,4 +1,4 @@
-"""What it was measured on."""
+"""Description of the machine on which the benchmark runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGES = ("numpy", "scipy", "sympy", "heyoka", "rebound", "CyRK", "numba", "ji
 
 
 def machine() -> dict[str, str | dict[str, str]]:
-    """Processor, system, compiler and versions, as plain data."""
+    """Return processor, system, compiler and versions as plain data."""
     compiler = find_compiler()
     shown = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=False).stdout
     return {
@@ -35,7 +35,7 @@ def machine() -> dict[str, str | dict[str, str]]:
 
 
 def _processor() -> str:
-    """Model name and widest vector unit, where the system tells."""
+    """Return model name and widest vector unit, if the system reports them."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""What a core of this machine can do at most: memory by STREAM's triad, arithmetic by multiply-adds in registers."""
+"""Limits of one core of this machine: memory bandwidth by STREAM's triad, arithmetic by multiply-adds in registers."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ DECLARATIONS = (
     "void triad(double *a, const double *b, const double *c, double s, long n);\ndouble multiply_adds(long count);\n"
 )
 PLACES, CHAINS, ROUNDS = 10**7, 96, 2 * 10**6
-"""Numbers of an array, several times as many as a cache has (J. D. McCalpin's rule for STREAM); as in the C text."""
+"""Length of an array, several times that of a cache (J. D. McCalpin's rule for STREAM); chains and rounds as in the C
+source."""
 TIMES = 5
 
 
 def machine_limits() -> tuple[float, float]:
-    """GB/s of a = b + s c, each number counted once as STREAM does, and GFLOP/s; of one core, the best of some."""
+    """Return GB/s of a = b + s c, each number counted once as in STREAM, and GFLOP/s; of one core, best of several."""
     code = files("scvi_codegen.benchmark").joinpath("machine_limits.c").read_text(encoding="utf-8")
     source = Source(prefix="machine_limits", header=DECLARATIONS, code=code, declarations=DECLARATIONS)
     library = building.load(source, flags=building.TUNED_FLAGS)

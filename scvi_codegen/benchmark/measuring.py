@@ -1,8 +1,7 @@
-"""Contenders timed in turn, in one process: all of them once, then all of them again.
+"""Timing of contenders in turn, in one process: all of them once, then all of them again.
 
-Times are processor times of the process. Every contender steps in one thread and does nothing but compute, so this is
-the wall clock of an idle machine; on a busy one it leaves out the shares of other programs, which would weigh on long
-runs and spare short ones.
+Times are processor times of the process. Every contender steps in one thread and does nothing but compute, so that this
+equals the wall time of an idle machine; on a busy one it excludes the time of other programs.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from scvi_codegen.errors import ScviCodegenError
 __all__ = ["PEER_ERRORS", "Measurement", "measure"]
 
 PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
-"""What a peer of an unknown version, or without its compiler, may raise; it is told, and the others go on."""
+"""Errors that a peer of an unknown version, or without its compiler, may raise; they are reported."""
 
 PATIENCE = 1.0
-"""Seconds for a round over all states beyond which a contender is timed once only."""
+"""Seconds per round over all states above which a contender is timed only once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """What came of one contender.
+    """Result of one contender.
 
     Attributes:
-        method, setting, options, compile_seconds: of the contender.
-        seconds: for one trajectory: the median of the repeats for each state, averaged over the states.
-        fastest: the same with minima for medians.
-        error: root mean square over the states at the end, relative.
-        repeats: rounds timed.
-        failure: why there is no result, or nothing.
+        method, setting, options, compile_seconds: as of the contender.
+        seconds: time of one trajectory: median of the repeats for each state, averaged over the states.
+        fastest: the same with minima instead of medians.
+        error: relative root-mean-square error over the final states.
+        repeats: number of rounds timed.
+        failure: reason why there is no result, or ``""``.
     """
 
     method: str
@@ -54,12 +53,12 @@ class Measurement:
 
     @property
     def point(self) -> Point:
-        """Its place on the work-precision curve."""
+        """Point on the work-precision curve."""
         return Point(seconds=self.seconds, error=self.error)
 
     @property
     def fastest_point(self) -> Point:
-        """The same with its shortest time."""
+        """Point with the shortest time."""
         return Point(seconds=self.fastest, error=self.error)
 
 
@@ -94,12 +93,12 @@ def measure(
     repeats: int,
     progress: Callable[[], None] = lambda: None,
 ) -> list[Measurement]:
-    """Time all contenders alternately; one that fails is reported with its reason.
+    """Time all contenders alternately; a contender that fails is reported with the reason.
 
     Args:
-        contenders: what to time.
-        reference_of: the states a contender ought to end in.
-        repeats: rounds; one more comes before them, untimed.
+        contenders: contenders to time.
+        reference_of: function that returns the exact final states for a contender.
+        repeats: number of rounds, after one that is not timed.
         progress: called after each round of all.
     """
     records = [_Record(contender) for contender in contenders]
@@ -138,6 +137,6 @@ def _summary(record: _Record, reference: Reference) -> Measurement:
 
 
 def _error(final: list[Array], reference: Reference) -> float:
-    """Of one array for each state, or of one for an ensemble that holds all states some times over."""
+    """Return the error of one array for each state, or of one for an ensemble that contains all states repeatedly."""
     copies = np.concatenate([np.atleast_2d(q) for q in final]).reshape(-1, *reference.high.shape)
     return float(np.sqrt(np.mean([rms_error(q, reference) ** 2 for q in copies])))

@@ -1,4 +1,4 @@
-"""From SymPy's description of n links on a cart to a motion: by this project, by SymPy's lambdify and by PyDy."""
+"""Benchmark from SymPy's description of n links on a cart to a trajectory: this package, SymPy's lambdify and PyDy."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["CONTENDERS", "LINKS", "run_mechanisms"]
 CONTENDERS = (OURS, "lambdify", "PyDy")
 LINKS = (2, 5, 10, 20, 40)
 ERROR = 1e-9
-"""Largest of the coordinates after a second at which times are compared."""
+"""Largest coordinate error after one second at which times are compared."""
 LONGEST = 1800
 
 
 def run_mechanisms(plan: Plan, say: Say) -> ResultTable:
-    """One process each, with an empty cache."""
+    """Measure one process per contender, with an empty cache."""
     rows: list[dict[str, Any]] = []
     for links in LINKS[: 1 if plan.quick else None]:
         found = {}
@@ -57,7 +57,7 @@ def run_mechanisms(plan: Plan, say: Say) -> ResultTable:
 
 
 def _measured(name: str, links: int) -> dict[str, Any]:
-    """What the contender says, or why it says nothing."""
+    """Return the measurements of a contender, or the reason of its failure."""
     command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.multibody", name, str(links)]
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
         environment = os.environ | {building.CACHE_VARIABLE: folder}
@@ -72,7 +72,7 @@ def _measured(name: str, links: int) -> dict[str, Any]:
 
 
 def _row(name: str, found: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Its times, with errors against another contender's most accurate run."""
+    """Return the times of a contender, with errors relative to another contender's most accurate run."""
     own, other = found[name], found["lambdify" if name == OURS else OURS]
     if "why_not" in own or "why_not" in other:
         return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "nothing to be held against"}

@@ -1,8 +1,8 @@
 """Tables 6 and 7 of the paper: SVI, a symplectic Runge-Kutta method (Gauss) with fewer stages, and collocation.
 
-The paper's step sizes, spans, initial states and tolerance (1e-14 for the largest change of a position or momentum);
-where it leaves the quadrature of an SVI of degree s open, s Gauss points. Its claim: SVI is cheaper than the Runge-
-Kutta method and more accurate.
+Step sizes, spans, initial states and tolerance (1e-14 for the largest change of a position or momentum) are the
+paper's; the quadrature, where it is not stated for an SVI of degree s, has s Gauss points. The claim of the paper: SVI
+is cheaper and more accurate than the Runge-Kutta method.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ TABLES = (
     (6, "planar-pendulum", (0.5, 0.0), 0.5, {SRK: (Gauss(2), 13.73), SPECTRAL: (SVI(3), 4.94)}, 3, 1.85),
     (7, "duffing", (0.0, 1.0), 0.6, {SRK: (Gauss(3), 86.98), SPECTRAL: (SVI(5), 39.18)}, 5, 4.35),
 )
-"""Number, case, (q0, v0), h, methods with the seconds printed, degree of collocation and its seconds."""
+"""Number, case, (q0, v0), h, methods with the printed seconds, degree of collocation and its seconds."""
 
 
 @unwarned()
 def run_paper_tables(plan: Plan, say: Say) -> ResultTable:
-    """Both tables."""
+    """Measure both tables."""
     rows: list[dict[str, Any]] = []
     for number, name, (q, v), h, methods, degree, seconds in TABLES:
         say(f"tables: Table {number}, {name}")
@@ -96,7 +96,7 @@ def _seconds(stepper: Stepper, chosen: Case, count: int) -> float:
 
 
 def _errors(stepper: Stepper, chosen: Case, count: int, exact: Reference, ms: float) -> dict[str, float]:
-    """Both systems have p = v."""
+    """Return the errors of energy and position; both systems have p = v."""
     run = stepper.integrate(chosen.q[0], chosen.velocity[0], h=chosen.span / count, steps=count, options=TOLERANCE)
     energy = run.energy()
     position = rms_error(run.q[-1:], exact)

@@ -1,4 +1,4 @@
-"""Work-precision plots: time against error, one panel a problem, one line a method through its settings in order."""
+"""Work-precision plots: time against error, one panel per problem, one line per method through its settings."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ __all__ = ["draw_curves", "plot_curves", "save_figure"]
 
 COLUMNS = 3
 PANEL, LINE = (4.6, 3.8), 0.25
-"""Inches: of a panel; the height of a line of the legend."""
+"""Sizes in inches: of a panel; height of a line of the legend."""
 MOST_ABREAST = 4
-"""Names of methods on such a line; on one of a single panel there is room for two."""
+"""Largest number of methods in a line of the legend; two for a single panel."""
 
 
 def plot_curves(results: Sequence[CaseResult], path: str | os.PathLike[str]) -> None:
-    """Draw all cases into one picture, .png or .svg. Raises as :func:`save_figure`."""
+    """Draw all cases into one file, .png or .svg; raises as :func:`save_figure`."""
     save_figure(partial(draw_curves, results), path)
 
 
 def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> None:
-    """Draw in the project's style into a file.
+    """Draw a figure in the package's style into a file.
 
     Raises:
         StateError: for another suffix.
@@ -53,7 +53,7 @@ def save_figure(draw: Callable[[], Figure], path: str | os.PathLike[str]) -> Non
 
 
 def draw_curves(results: Sequence[CaseResult]) -> Figure:
-    """The figure: logarithmic axes, better is down and to the left; a method has one colour in all panels."""
+    """Return the figure: logarithmic axes, better is down and to the left; a method has one colour in all panels."""
     from matplotlib.figure import Figure
 
     columns = min(COLUMNS, len(results))
@@ -77,7 +77,7 @@ def draw_curves(results: Sequence[CaseResult]) -> Figure:
 
 
 def _label_times(axes: Axes) -> None:
-    """Times as 0.1, 0.2, 0.5, 1, .. ms, as many as there is room for."""
+    """Label times as 0.1, 0.2, 0.5, 1, .. ms, as many as fit."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

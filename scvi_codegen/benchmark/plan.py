@@ -1,4 +1,4 @@
-"""How to measure."""
+"""Settings of a benchmark."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ QUICK_SHARE = 0.05
 QUICK_REPEATS = 2
 
 Say = Callable[[str], None]
-"""Told what is being done."""
+"""Function that is called with a description of each activity."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """How to measure.
+    """Settings of a benchmark.
 
     Attributes:
         peers: names of the peers.
-        repeats: timed rounds.
-        quick: a twentieth of the span, few settings: to see that everything works.
-        methods: of this project; by default SVI(8).
+        repeats: number of timed rounds.
+        quick: a twentieth of the span and few settings, as a smoke test.
+        methods: methods of this package; by default SVI(8).
     """
 
     peers: tuple[str, ...] = tuple(PEERS)
@@ -43,10 +43,10 @@ class Plan:
 
     @property
     def rounds(self) -> int:
-        """Timed rounds."""
+        """Number of timed rounds."""
         return min(self.repeats, QUICK_REPEATS) if self.quick else self.repeats
 
     @property
     def share(self) -> float:
-        """Part of each span that is run."""
+        """Part of each span that is integrated."""
         return QUICK_SHARE if self.quick else 1.0

@@ -1,4 +1,4 @@
-"""One case of the benchmark: everybody compiled, then timed in turn."""
+"""Comparison of all contenders on one case: compile all, then time them in turn."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 
 TRAJECTORIES = 64
 Makers = dict[str, Callable[[], Iterable[Contender]]]
-"""By the name of the peer."""
+"""Functions that return contenders, by name of the peer."""
 
 ReferenceOf = Callable[[Case, Array | None], Reference]
-"""Where a case ends, from its velocities or from momenta."""
+"""Function that returns the final states of a case, from its velocities or from momenta."""
 
 
 @unwarned()
 def run_case(name: str, plan: Plan, say: Say) -> CaseResult:
-    """One trajectory after the other, by this project and all peers."""
+    """Compare single trajectories of this package and all peers."""
     return _race_alone(case(name), plan, say)
 
 
 @unwarned()
 def run_forced(name: str, plan: Plan, say: Say) -> CaseResult:
-    """The same with friction and drives."""
+    """Compare single trajectories with friction and driving forces."""
     return _race_alone(FORCED_CASES[name](), plan, say)
 
 
@@ -58,7 +58,7 @@ def _makers(chosen: Case, plan: Plan) -> Makers:
 
 @unwarned()
 def run_constrained(name: str, plan: Plan, say: Say) -> CaseResult:
-    """Rods as constraints by this project, beside peers, and this project, in the angles of the rods."""
+    """Compare rods as constraints in this package with peers, and this package, in the angles of the rods."""
     both = CONSTRAINED_CASES[name]().shortened(plan.share)
     ours = partial(constrained_contenders, both, quick=plan.quick)
     return race(both.angles, ours, _makers(both.angles, plan), plan, say)
@@ -66,9 +66,9 @@ def run_constrained(name: str, plan: Plan, say: Say) -> CaseResult:
 
 @unwarned()
 def run_ensemble(name: str, plan: Plan, say: Say) -> CaseResult:
-    """64 trajectories in one thread, from the array of their states to that of the ends; heyoka in its batch mode.
+    """Compare ensembles of 64 trajectories in one thread; heyoka in its batch mode.
 
-    They start from the eight states of the case again and again, which saves computing more references.
+    They start from the eight states of the case repeatedly, so that eight references suffice.
     """
     few = case(name)
     few = replace(few, name=f"ensemble:{name}", span=few.span * plan.share)
@@ -86,7 +86,7 @@ def race(
     say: Say,
     ends: ReferenceOf = reference,
 ) -> CaseResult:
-    """This project's contenders and those of peers, in turn, against where the case ends."""
+    """Time the contenders of this package and of peers in turn, and compare them with the reference."""
     say(f"{chosen.name}: reference")
     exact = ends(chosen, None)
     say(f"{chosen.name}: step sizes")

@@ -1,9 +1,9 @@
-"""Where a case ends, to 18 digits: Gauss's method of 16 stages in extended precision, fixed step, compensated sums.
+"""Reference solutions to 18 digits: Gauss method of 16 stages in extended precision, fixed step, compensated sums.
 
-It works in NumPy's ``longdouble`` (80 bits on x86, 128 on 64-bit Arm under Linux), for all states at once, and
-knows nothing of the project's steppers: its right-hand sides are the hand-solved ones of :mod:`.cases`, its tables come
-from mpmath here. Tables are kept as sums of two numbers and steps are short binary fractions, so that neither brings in
-a systematic error. Each reference is computed with two different steps, and their difference is kept as its accuracy.
+NumPy's ``longdouble`` has 80 bits on x86 and 128 on 64-bit Arm under Linux. The computation is independent of the
+package's steppers: right-hand sides are the hand-derived ones of :mod:`.cases`, tables come from mpmath. Tables are
+sums of two numbers and steps are short binary fractions, so that neither causes a systematic error. Each reference is
+computed with two step sizes, and their difference is stored as its accuracy.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ __all__ = [
 
 Extended = NDArray[np.longdouble]
 Field = Callable[[Extended, Extended], Extended]
-"""x' of x, (.., d), at times t, (..)."""
+"""Function that returns x' for x, (.., d), at times t, (..)."""
 
 STAGES = 16
 MOST_SWEEPS = 100
 STALLED, ROUNDED = 1e-16, 1e-14
-"""Relative changes below are round-off once they hardly shrink, or, near collisions, no longer."""
+"""Relative changes below which the iteration has converged: once they hardly shrink, or, near collisions, grow."""
 
 DIGITS = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reference:
-    """Positions at the end.
+    """Final positions.
 
     Attributes:
         high, low: (k, m) positions as sums of two doubles.
-        accuracy: difference of two computations with different steps, measured like every error here.
+        accuracy: relative difference of two computations with different step sizes.
     """
 
     high: Array
@@ -68,22 +68,22 @@ class Reference:
 
 
 def rms_error(q: Array, reference: Reference) -> float:
-    """Root mean square over the states of |q - reference|, relative to that of |reference|; (k, m) positions."""
+    """Return the root mean square over the states of |q - reference|, relative to |reference|; (k, m) positions."""
     return rms((q - reference.high) - reference.low) / rms(reference.high)
 
 
 def rms(positions: NDArray[Any]) -> float:
-    """Root of the mean over states of |position|^2; (k, m) positions."""
+    """Return the root of the mean over states of |position|^2; (k, m) positions."""
     return float(np.sqrt(np.mean(np.sum(np.square(positions), axis=1))))
 
 
 def reference(case: Case, momenta: Array | None = None) -> Reference:
-    """The reference of a case, from the user's cache folder or computed now (seconds to a minute).
+    """Return the reference of a case, from the user's cache folder or computed now (seconds to a minute).
 
     Args:
-        case: what to compute.
-        momenta: (k, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p); it
-            matters only where the masses of the case are given.
+        case: case to compute.
+        momenta: (k, m) doubles to start from instead of the case's velocities, for steppers whose state is (q, p);
+            relevant only for cases with masses.
     """
     velocity = case.velocity.astype(np.longdouble)
     if momenta is not None and case.masses is not None:
@@ -92,7 +92,7 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
 
 
 def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended], Reference]) -> Reference:
-    """What is computed from a case and (k, m) velocities, from the user's cache folder the second time."""
+    """Return a result for a case and (k, m) velocities, from the user's cache folder if it is there."""
     path = building.cache_folder() / "references" / f"{_key(case, velocity, compute.__qualname__)}.npz"
     found = _read(path)
     if found is None:
@@ -102,7 +102,7 @@ def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended
 
 
 def _key(case: Case, velocity: Extended, kind: str) -> str:
-    """Everything the result depends on."""
+    """Return a hash of everything that the result depends on."""
     digest = hashlib.sha256(inspect.getsource(inspect.getmodule(_key)).encode())  # type: ignore[arg-type]
     digest.update(rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension).encode())
     for array in (case.q, *two_doubles(velocity)):
@@ -126,7 +126,7 @@ def _write(path: Path, result: Reference) -> None:
             path, lambda file: np.savez(file, high=result.high, low=result.low, accuracy=np.array(result.accuracy))
         )
     except OSError:
-        return  # a cache that cannot be written is no cache
+        return  # work without a cache
 
 
 def _compute(case: Case, velocity: Extended) -> Reference:
@@ -141,18 +141,18 @@ def _compute(case: Case, velocity: Extended) -> Reference:
 
 
 def two_doubles(x: Extended) -> tuple[Array, Array]:
-    """Extended numbers as sums of two doubles."""
+    """Return extended numbers as sums of two doubles."""
     high = x.astype(np.float64)
     return high, (x - high).astype(np.float64)
 
 
 def final_states(field: Field, start: Extended, span: float, h: float) -> Extended:
-    """(k, d) states after ``span``, by steps of h, a number of few binary digits, and a last shorter one.
+    """Return (k, d) states after ``span``, with steps of h, a short binary fraction, and a smaller last one.
 
     Args:
         field: x' for x of shape (..., d) and t.
         start: (k, d) initial states.
-        span: length of time.
+        span: duration.
         h: step size.
     """
     whole = int(span // h)
@@ -160,7 +160,7 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
 
 
 def states_after(field: Field, start: Extended, steps: Sequence[float] | Extended) -> Extended:
-    """(k, d) states after these steps."""
+    """Return (k, d) states after these steps."""
     a, b, guess_table = gauss_tables(STAGES)
     x, carry, before, t = start.copy(), np.zeros_like(start), None, np.longdouble(0)
     stages: Extended | None = None
@@ -176,12 +176,12 @@ def states_after(field: Field, start: Extended, steps: Sequence[float] | Extende
 
 
 def _at(field: Field, times: Extended, x: Extended) -> Extended:
-    """The field of (s, k, d) at (s,) times."""
+    """Return the field of (s, k, d) states at (s,) times."""
     return field(x, times[:, np.newaxis])
 
 
 def field_of(case: Case) -> Field:
-    """The hand-solved equations in extended precision."""
+    """Return the hand-derived equations in extended precision."""
     parameters = {name: np.longdouble(value) for name, value in case.parameters.items()}
 
     def field(x: Extended, t: Extended) -> Extended:
@@ -196,7 +196,7 @@ Table = tuple[Extended, Extended]
 
 
 def _product(table: tuple[Extended, ...], values: Extended) -> Extended:
-    """(rows, s) table, a sum of parts, times (s, k, d) values."""
+    """Return the product of a (rows, s) table, a sum of parts, with (s, k, d) values."""
     flat = values.reshape(values.shape[0], -1)
     result: Extended = sum(part @ flat for part in table[1:]) + table[0] @ flat
     return result.reshape(-1, *values.shape[1:])
@@ -205,9 +205,9 @@ def _product(table: tuple[Extended, ...], values: Extended) -> Extended:
 def _stages(
     field: Callable[[Extended], Extended], x: Extended, h: np.longdouble, a: Table, guess: Extended | None
 ) -> Extended:
-    """(s, k, d) slopes F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
+    """Return (s, k, d) derivatives F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
     slopes = field(np.broadcast_to(x, (len(a[0]), *x.shape))) if guess is None else guess
-    low = _product((a[1],), slopes)  # small enough to be left at the first guess
+    low = _product((a[1],), slopes)  # small: not updated in the iteration
     scale, last = h / np.max(np.abs(x)), np.inf
     for _ in range(MOST_SWEEPS):
         new = field(x + h * (_product((a[0],), slopes) + low))
@@ -220,7 +220,7 @@ def _stages(
 
 
 def gauss_tables(stages: int) -> tuple[Table, Table, Table]:
-    """Gauss's A and b, and the table that extrapolates slopes by one step, as sums of two extended numbers."""
+    """Return Gauss's A and b, and the table that extrapolates the stages by one step, as sums of two numbers."""
     with mp.workdps(DIGITS):
         legendre = list(reversed(taylor(lambda x: mp.legendre(stages, 2 * x - 1), 0, stages)))
         c = sorted(polyroots(legendre, maxsteps=500, extraprec=400), key=lambda root: root.real)
@@ -245,7 +245,7 @@ def _table(matrix: Any) -> Table:
 
 
 def _exact(x: np.longdouble) -> Any:
-    """An extended number as a sum of doubles in mpmath."""
+    """Return an extended number exactly, as a sum of doubles in mpmath."""
     high = float(x)
     middle = float(x - np.longdouble(high))
     return mp.mpf(high) + mp.mpf(middle) + mp.mpf(float(x - np.longdouble(high) - np.longdouble(middle)))

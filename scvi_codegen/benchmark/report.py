@@ -1,4 +1,4 @@
-"""Curves of a case as a table for the terminal and as JSON."""
+"""Work-precision curves of a case as a table for the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaseResult:
-    """Everything measured on one case.
+    """Measurements of one case.
 
     Attributes:
-        name, span, dimension: of the case.
-        accuracy: of its reference.
+        name, span, dimension: as of the case.
+        accuracy: accuracy of its reference.
         measurements: all settings of all methods.
-        skipped: methods that were left out, and why.
+        skipped: methods that were left out, with the reason.
     """
 
     name: str
@@ -36,16 +36,16 @@ class CaseResult:
     skipped: Mapping[str, str]
 
     def methods(self) -> list[str]:
-        """Names of the curves, in the order measured."""
+        """Return the names of the curves in the order of measurement."""
         return list(dict.fromkeys(measurement.method for measurement in self.measurements))
 
     def text(self) -> str:
-        """A block of the report for the terminal."""
+        """Return a block of the report for the terminal."""
         return _block(self)
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
-        """What :meth:`data` gave; numbers that it had as null are none."""
+        """Return the result that :meth:`data` describes; null becomes NaN."""
         found: list[dict[str, Any]] = [
             {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
         ]
@@ -59,7 +59,7 @@ class CaseResult:
         )
 
     def data(self) -> dict[str, Any]:
-        """Everything, as data that ``json.dump`` takes; numbers that do not exist are null."""
+        """Return all measurements as data for ``json.dump``; numbers that are not finite are null."""
         return {
             "name": self.name,
             "span": self.span,
@@ -73,15 +73,15 @@ class CaseResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportRow:
-    """One line of the table. Ratios are times of others at equal error over the time of this method: above 1 it wins.
+    """Line of the table; ratios are times of others over that of this method at equal error: above 1 it is faster.
 
     Attributes:
         measurement: the fastest setting that reaches the common error, else the most accurate one.
-        at_error: the error at which times are compared: the smallest that this method and heyoka both reach.
-        seconds: of this method there, interpolated on its curve.
-        default: against heyoka at its default tolerance, without ``fast_math``.
-        best: against heyoka, all its curves and tolerances taken together.
-        peer: against all peers taken together.
+        at_error: error at which times are compared: the smallest that this method and heyoka both reach.
+        seconds: time of this method at that error, interpolated on its curve.
+        default: ratio for heyoka at its default tolerance, without ``fast_math``.
+        best: ratio for heyoka, the best of all its curves and tolerances.
+        peer: ratio for the best of all peers.
         best_by_minima: like best, from the shortest times instead of the medians.
     """
 
@@ -96,7 +96,7 @@ class ReportRow:
 
 
 def rows(result: CaseResult) -> list[ReportRow]:
-    """One row a method."""
+    """Return one row per method."""
     made = [_row(result, method) for method in result.methods()]
     return [row for row in made if row is not None]
 
@@ -148,7 +148,7 @@ whichever is fastest; peer: against the fastest of all peers."""
 
 
 def header_lines(description: Mapping[str, Any]) -> str:
-    """Machine, compiler and versions."""
+    """Return machine, compiler and versions."""
     versions = ", ".join(f"{name} {version}" for name, version in description["versions"].items())
     first = f"{description['processor']}, {description['cores']} cores, load {description['load']}"
     return f"{first}\n{description['compiler']}, {description['flags']}\n{versions}"

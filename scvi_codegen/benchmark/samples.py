@@ -1,4 +1,4 @@
-"""A sample of a controller: an input held, a step, a look at the state; beside C called bare and NumPy's assignment."""
+"""Benchmark of a control step: set an input, step, read the state; compared with the bare C function and NumPy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["Sampling", "run_samples"]
 
 CALLS = 20_000
-"""Of each kind in a round."""
+"""Number of calls of each kind in a round."""
 STEP = 0.01
 METHODS = ("svi:2", "svi:4")
 PUSH = 0.1
@@ -41,10 +41,10 @@ SYSTEMS = {
 
 
 class Sampling:
-    """The same steps from the same state, by each way of taking them.
+    """Steps from one state, by each way of performing them.
 
     Attributes:
-        held, advanced: runs whose input was held before all steps, and before each.
+        held, advanced: runs whose input is set before every step, and once.
         calls: a function without arguments for each column.
     """
 
@@ -75,12 +75,12 @@ class Sampling:
         self.held.advance(1)
 
     def states(self) -> list[list[float]]:
-        """Positions of each."""
+        """Return the positions of each run."""
         return [self.advanced.q.tolist(), self.held.q.tolist(), list(self._memory.q)]
 
 
 def run_samples(plan: Plan, say: Say) -> ResultTable:
-    """Microseconds a call: minima of processor time, all ways in turn, round after round."""
+    """Measure microseconds per call: minima of processor time, all in turn, round after round."""
     rows = []
     for name, system in SYSTEMS.items():
         for method in METHODS:
@@ -104,7 +104,7 @@ def run_samples(plan: Plan, say: Say) -> ResultTable:
 
 
 def _fastest(calls: dict[str, Callable[[], object]], plan: Plan) -> dict[str, Any]:
-    """Microseconds of each."""
+    """Return the microseconds of each."""
     count, best = max(1, int(CALLS * plan.share)), dict.fromkeys(calls, float("inf"))
     for _ in range(plan.rounds):
         for name, call in calls.items():

@@ -1,4 +1,4 @@
-"""Steps of sums over indices by several threads: the time of the clock, in short turns, the quickest of each."""
+"""Benchmark of steps of indexed systems with several threads: wall time, in short turns, the minimum of each."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["run_threads"]
 
 METHODS = ("svi:8", "stoermer-verlet")
 TURN = 0.003
-"""Seconds that a turn is to take: other programs seldom break in."""
+"""Duration of a turn in seconds: short, so that other programs seldom interrupt it."""
 LOOK = 0.5
 """Seconds for a problem, a method and a number of threads."""
 
 
 @unwarned()
 def run_threads(plan: Plan, say: Say) -> ResultTable:
-    """Times of a step, and how many times as quick several threads are."""
+    """Measure the time of a step, and the speed-up by several threads."""
     numbers = _numbers()
     rows = []
     for each, h in _problems(plan):
@@ -47,13 +47,13 @@ def run_threads(plan: Plan, say: Say) -> ResultTable:
 
 
 def _numbers() -> list[int]:
-    """2, 4, 8, .. as the machine has cores."""
+    """Return 2, 4, 8, .. up to the number of cores."""
     cores = os.cpu_count() or 1
     return [number for number in (2, 4, 8, 16, 32) if number <= max(cores, 2)]
 
 
 def _problems(plan: Plan) -> Iterator[tuple[Lattice, float]]:
-    """Each with a step."""
+    """Yield each problem with a step size."""
     if plan.quick:
         yield from ((ring(5000, 1.0), 0.1), (atoms(2, 1.0), 0.002))
         return
@@ -82,7 +82,7 @@ def _row(each: Lattice, method: str, h: float, numbers: list[int], plan: Plan) -
 
 
 def _seconds(run: IndexedRun, steps: int) -> float:
-    """A step, of so many in one call."""
+    """Return the seconds per step of a call with ``steps`` steps."""
     report = run.problem.binding.new("report *")
     began = time.perf_counter()
     run.call("advance", run.problem.struct, steps, run.problem.binding.null, report)

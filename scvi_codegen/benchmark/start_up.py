@@ -1,4 +1,4 @@
-"""From text to the first step of Kepler's problem, in fresh processes: with an empty cache, and from the cache."""
+"""Benchmark of the time from text to the first step of the Kepler problem, without and with cache, in new processes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ print(json.dumps([imported - began, done - imported, symbolic, "sympy" in sys.mo
 
 
 def run_start_up(plan: Plan, say: Say) -> ResultTable:
-    """Medians, cold and cached in turn."""
+    """Measure medians, without and with cache in turn."""
     found: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
     for number in range(plan.rounds):
         say(f"start-up: round {number + 1}")

@@ -1,4 +1,4 @@
-"""A picture: the length of a step along an orbit, by each way of choosing it."""
+"""Plot of step sizes along an orbit, for each step-size selection."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ ECCENTRICITY = 0.9
 PERIOD = 2.0 * math.pi
 REVOLUTIONS = 2.0
 TRANSFORMED = 0.2
-"""A step of tau, dt = r^(3/2) dtau."""
+"""Step size of tau, dt = r^(3/2) dtau."""
 
 
 def step_lengths() -> dict[str, tuple[Array, Array]]:
-    """Times and lengths of the steps of two revolutions from the far end of Kepler's ellipse of eccentricity 0.9."""
+    """Return times and step sizes over two revolutions from the apocentre of a Kepler orbit of eccentricity 0.9."""
     e, span = ECCENTRICITY, REVOLUTIONS * PERIOD
     q, p = [1.0 + e, 0.0], [0.0, math.sqrt((1.0 - e) / (1.0 + e))]
     system = problem("kepler").system
@@ -42,7 +42,7 @@ def step_lengths() -> dict[str, tuple[Array, Array]]:
 
 
 def draw_step_lengths() -> Figure:
-    """Lengths on a logarithmic axis, against revolutions."""
+    """Return a figure of step sizes on a logarithmic axis, against revolutions."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
@@ -55,5 +55,5 @@ def draw_step_lengths() -> Figure:
 
 
 def plot_step_lengths(path: str | os.PathLike[str]) -> None:
-    """Draw them into a file, .png or .svg. Raises as :func:`~scvi_codegen.benchmark.picture.save_figure`."""
+    """Draw the figure into a file, .png or .svg; raises as :func:`~scvi_codegen.benchmark.picture.save_figure`."""
     save_figure(draw_step_lengths, path)

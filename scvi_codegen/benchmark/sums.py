@@ -1,4 +1,4 @@
-"""Sums over indices: time at equal error beside C by hand, SciPy, REBOUND, OpenMM; how time grows with their number."""
+"""Benchmark of indexed systems: time at equal error (hand-written C, SciPy, REBOUND, OpenMM), and scaling with size."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ DECLARATIONS = (
 )
 GROWTH = (10**3, 10**4, 10**5, 10**6)
 SIDE = 512
-"""Of the field."""
+"""Length of the axes of the field."""
 PATIENCE = 0.3
-"""Seconds beyond which a setting is timed twice only."""
+"""Seconds above which a setting is timed only twice."""
 
 
 def lattices(plan: Plan) -> tuple[Lattice, ...]:
-    """All problems, or small ones."""
+    """Return all problems, or small ones."""
     if plan.quick:
         return (ring(64, 2.0), field(16, 0.5), bodies(8, 1.0), atoms(1, 0.5))
     return (ring(1000, 20.0), ring(100_000, 2.0), field(256, 2.0), bodies(256, 2.0), atoms(4, 1.0))
@@ -55,7 +55,7 @@ def lattices(plan: Plan) -> tuple[Lattice, ...]:
 
 @unwarned()
 def run_sums(plan: Plan, say: Say) -> ResultTable:
-    """Times of every contender at equal error."""
+    """Measure the times of every contender at equal error."""
     rows: list[dict[str, Any]] = []
     for each in lattices(plan):
         say(f"sums: {each.name} of {each.q.size} coordinates")
@@ -91,7 +91,7 @@ def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: 
 
 
 def reference_of(each: Lattice) -> tuple[Array, float]:
-    """The end by SVI(10), and how far from it a composition of order 10 ends."""
+    """Return the final state by SVI(10), and its distance from a composition of order 10."""
     own = _ours(each, "svi:10", _count(each, each.longest / 8))()
     other = _ours(each, Composition(10), _count(each, each.longest / 32))()
     return own, rms(other, own)
@@ -100,7 +100,7 @@ def reference_of(each: Lattice) -> tuple[Array, float]:
 def _curves(
     contenders: Mapping[str, Sequence[Callable[[], Array]]], reference: Array, plan: Plan
 ) -> dict[str, list[Point]]:
-    """All settings of all contenders in turn, and that so many times; those that take long twice."""
+    """Measure all settings of all contenders in turn, for several rounds; slow ones twice."""
     seconds: dict[tuple[str, int], list[float]] = {}
     errors: dict[tuple[str, int], float] = {}
     for number in range(plan.rounds + 1):
@@ -119,7 +119,7 @@ def _curves(
 
 
 def rms(end: Array, reference: Array) -> float:
-    """Of the differences, over that of the reference."""
+    """Return the root mean square of the differences, relative to that of the reference."""
     return float(np.sqrt(np.mean((end - reference) ** 2) / np.mean(reference**2)))
 
 
@@ -128,7 +128,7 @@ def _count(each: Lattice, h: float) -> int:
 
 
 def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]]]:
-    """Settings by name."""
+    """Return the settings by name."""
     found = {
         method: [_ours(each, method, _count(each, each.longest / 2**k)) for k in range(7 - int(method[-1]) // 2)]
         for method in METHODS
@@ -220,7 +220,7 @@ def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], 
 
 @unwarned()
 def run_growth(plan: Plan, say: Say) -> ResultTable:
-    """Time to the first step, and time and memory a step, by the number of coordinates."""
+    """Measure the time to the first step, and time and memory per step, by number of coordinates."""
     rows, (memory, arithmetic) = list(_growth(plan, say)), machine_limits()
     return ResultTable(
         name="growth",

@@ -15,11 +15,11 @@ class ResultTable:
     """Rows with named entries.
 
     Attributes:
-        name: of the section, on the command line.
-        title: one line that says what is compared.
-        columns: formats by name of entry, in the order shown.
-        rows: entries by name; one that is missing, None or not a number is shown as a dash.
-        remarks: lines below.
+        name: name of the section on the command line.
+        title: one line that describes what is compared.
+        columns: formats by name of entry, in order.
+        rows: entries by name; one that is missing, None or NaN is shown as a dash.
+        remarks: lines below the table.
     """
 
     name: str
@@ -29,18 +29,18 @@ class ResultTable:
     remarks: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """The table for the terminal."""
+        """Return the table for the terminal."""
         header = [name.replace("_", " ") for name in self.columns]
         cells = [[_cell(row.get(name), form) for name, form in self.columns.items()] for row in self.rows]
         return "\n  ".join([f"{self.name}: {self.title}", *lines_of([header, *cells]), *self.remarks])
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> ResultTable:
-        """What :meth:`data` gave."""
+        """Return the table that :meth:`data` describes."""
         return cls(**{**data, "rows": tuple(data["rows"]), "remarks": tuple(data["remarks"])})
 
     def data(self) -> dict[str, Any]:
-        """The same for JSON."""
+        """Return the table as data for JSON."""
         rows = [finite(dict(row)) for row in self.rows]
         return {
             "name": self.name,
@@ -52,13 +52,13 @@ class ResultTable:
 
 
 def lines_of(cells: list[list[str]]) -> list[str]:
-    """Cells in columns, as wide as they need."""
+    """Return cells as lines with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
 
 
 def finite(entries: dict[str, Any]) -> dict[str, Any]:
-    """Numbers that JSON does not have become null."""
+    """Return entries with numbers that are not finite replaced by None."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()
     }

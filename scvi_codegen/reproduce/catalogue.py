@@ -1,4 +1,4 @@
-"""Every experiment by name, in the paper's order."""
+"""Catalogue of all experiments by name, in the paper's order."""
 
 from __future__ import annotations
 
@@ -43,4 +43,4 @@ def _catalogue() -> dict[str, Experiment]:
 
 
 EXPERIMENTS = _catalogue()
-"""By name, in the paper's order; ``claims`` last, which judges the others."""
+"""Experiments by name, in the paper's order; ``claims``, which judges the others, is last."""

@@ -1,4 +1,4 @@
-"""What the paper claims, each with everything that was measured about it and one verdict."""
+"""Claims of the paper, each with all measurements that concern it and one verdict."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["CLAIMS", "EVIDENCE", "EXPERIMENTS", "Claim"]
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A sentence of the paper and where it stands."""
+    """Sentence of the paper and its section."""
 
     text: str
     place: str
@@ -87,7 +87,7 @@ CLAIMS: Mapping[str, Claim] = {
         "section 4.2.2, Theorem 4.1",
     ),
 }
-"""By the keys that checks name in ``bears_on``."""
+"""Claims by the keys that checks name in ``bears_on``."""
 
 EVIDENCE: tuple[str, ...] = (
     "figure-1",
@@ -103,7 +103,7 @@ EVIDENCE: tuple[str, ...] = (
 
 
 def claims(results: Mapping[str, Result]) -> Result:
-    """A row a claim, with the checks that decide it."""
+    """Return a row for each claim, with the checks that decide it."""
     found = {key: tuple(_evidence(key, results)) for key in CLAIMS}
     return Result(
         name="claims",
@@ -126,7 +126,7 @@ def _listed(results: Mapping[str, Result]) -> str:
 
 
 def _evidence(key: str, results: Mapping[str, Result]) -> Iterator[tuple[str, Comparison]]:
-    """Names of experiments with their checks that bear on a claim, in the paper's order."""
+    """Yield names of experiments with their checks that concern a claim, in the paper's order."""
     for name in EVIDENCE:
         if name in results:
             yield from ((name, check) for check in results[name].checks if key in check.bears_on)

@@ -13,13 +13,13 @@ __all__ = ["label", "linked"]
 
 
 def label(name: str) -> str:
-    """The name of an experiment as the paper writes it: ``figure-4`` as Figure 4, ``tables-6-7`` as Tables 6-7."""
+    """Return the name of an experiment as in the paper: ``figure-4`` as Figure 4, ``tables-6-7`` as Tables 6-7."""
     first, *rest = name.split("-", 1)
     return " ".join([first.capitalize(), *rest])
 
 
 def linked(text: Markup, names: Collection[str]) -> Markup:
-    """Text with links to the sections of the experiments that it names; names without a digit are just words."""
+    """Return text with links to the sections of the experiments that it names; names without a digit are words."""
     numbered = sorted((re.escape(name) for name in names if re.search(r"\d", name)), key=len, reverse=True)
     if not numbered:
         return text

@@ -1,7 +1,7 @@
-"""All results as one page of HTML that needs nothing else: pictures inline, formulas as MathML, no script, no network.
+"""Report of all results as one self-contained HTML page: inline pictures, MathML, no script, no network.
 
-It adapts to light and dark, to narrow screens and to paper. The page is ``templates/report.html.jinja`` with
-``templates/report.css`` on the base of all pages; here is what turns results into text for it.
+It adapts to light and dark mode, to narrow screens and to paper. The page is ``templates/report.html.jinja`` with
+``templates/report.css`` on the base of all pages; this module converts results into text for it.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ PLURALS = {Verdict.HOLDS: "hold", Verdict.PARTLY: "hold in part", Verdict.FAILS:
 
 
 def report_html(results: Sequence[Result]) -> str:
-    """The page: a table of all verdicts, then one section a result; a single result is a page of its own.
+    """Return the page: a table of all verdicts, then one section per result; a single result is a page of its own.
 
-    Needs Matplotlib where a result has a picture.
+    Requires Matplotlib if a result has a picture.
     """
     pictures = {result.name: _picture(result) for result in results}
     alone = len(results) == 1
@@ -48,7 +48,7 @@ def report_html(results: Sequence[Result]) -> str:
 
 
 def tally(verdicts: Sequence[Verdict]) -> list[tuple[Verdict, str]]:
-    """How often each verdict was found: ``"3 hold"``, ``"1 does not hold"``."""
+    """Return the number of occurrences of each verdict: ``"3 hold"``, ``"1 does not hold"``."""
     counts = Counter(verdicts)
     return [
         (verdict, f"{counts[verdict]} {verdict.value if counts[verdict] == 1 else PLURALS[verdict]}")
@@ -65,7 +65,7 @@ def _picture(result: Result) -> Markup:
 
 
 def _color_rules(pictures: Sequence[str]) -> Markup:
-    """CSS for the colours of the pictures; paper is always light."""
+    """Return CSS for the colours of the pictures; print is always light."""
 
     def rule(dark: bool) -> str:
         variables = color_variables(pictures, dark=dark)
@@ -75,7 +75,7 @@ def _color_rules(pictures: Sequence[str]) -> Markup:
 
 
 def _heading(result: Result) -> str:
-    """The title, without the name where it begins with that."""
+    """Return the title, without the name if it begins with it."""
     name = label(result.name)
     shorter = result.title.removeprefix(name).lstrip(" .:,")
     return shorter[:1].upper() + shorter[1:] if shorter else result.title

@@ -1,7 +1,7 @@
-"""Experiments run one after the other, or several at a time in processes of their own; one that fails stops no other.
+"""Execution of experiments in turn or in parallel processes; one that fails does not stop the others.
 
-The scheduler gives a free process an experiment whose needs are there, if it can one of the module that the process ran
-last: what experiments of a module measure together is cached within a process.
+The scheduler assigns to a free process an experiment whose dependencies are complete, preferably of the module that
+the process ran last: measurements that experiments of a module share are cached within a process.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "w
 
 CATALOGUE = "scvi_codegen.reproduce.catalogue"
 PATIENCE = 2.0
-"""Seconds that a process is given to end."""
+"""Seconds to wait for a process to end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """An experiment that gave no result.
+    """Experiment without a result.
 
     Attributes:
-        name: of the experiment.
+        name: name of the experiment.
         message: what went wrong, one line.
-        details: the traceback, or nothing.
+        details: traceback, or ``""``.
     """
 
     name: str
@@ -50,13 +50,13 @@ Watch: TypeAlias = Callable[[Sequence[str]], None]
 
 
 def catalogue(module: str = CATALOGUE) -> Mapping[str, Experiment]:
-    """The experiments by name: ``EXPERIMENTS`` of a module."""
+    """Return the experiments by name: ``EXPERIMENTS`` of a module."""
     experiments: Mapping[str, Experiment] = importlib.import_module(module).EXPERIMENTS
     return experiments
 
 
 def with_needs(names: Sequence[str], experiments: Mapping[str, Experiment]) -> list[str]:
-    """The experiments called ``names`` and all that they need, each after its needs.
+    """Return the experiments called ``names`` and their dependencies, in topological order.
 
     Raises:
         StateError: for a name that is not among the experiments.
@@ -79,15 +79,15 @@ def with_needs(names: Sequence[str], experiments: Mapping[str, Experiment]) -> l
 def run_experiments(
     names: Sequence[str], workers: int | None = None, *, module: str = CATALOGUE, watch: Watch = lambda names: None
 ) -> Generator[Outcome, None, None]:
-    """Run experiments and what they need, and give each outcome as soon as it is there.
+    """Run experiments and their dependencies; yield each outcome as soon as it is complete.
 
-    What needs an experiment that failed fails too. To close the generator, or to interrupt it, ends all processes.
+    Experiments that depend on a failed one fail too. Closing or interrupting the generator ends all processes.
 
     Args:
-        names: of the experiments.
-        workers: processes, by default as many as processors; with one, everything is run in this process.
-        module: where ``EXPERIMENTS`` is; processes import it by this name.
-        watch: told the names of what is running whenever that changes.
+        names: names of experiments.
+        workers: number of processes, by default that of processors; with one, everything runs in this process.
+        module: module with ``EXPERIMENTS``; processes import it by this name.
+        watch: called with the names of the running experiments whenever they change.
 
     Raises:
         StateError: for an unknown name.
@@ -100,13 +100,13 @@ def run_experiments(
 
 @dataclass(kw_only=True)
 class _Plan:
-    """What is still to be started, and what is there."""
+    """Experiments to start, and results so far."""
 
     pending: dict[str, Experiment]
     results: dict[str, Result] = field(default_factory=dict)
 
     def next(self, last_module: str = "") -> Experiment | None:
-        """Take an experiment whose needs are there, of the module last run if possible."""
+        """Remove and return an experiment whose dependencies are complete, of the module last run if possible."""
         ready = [e for e in self.pending.values() if all(need in self.results for need in e.needs)]
         ready.sort(key=lambda experiment: _module_of(experiment) != last_module)
         return self.pending.pop(ready[0].name) if ready else None
@@ -115,7 +115,7 @@ class _Plan:
         return {need: self.results[need] for need in experiment.needs}
 
     def note(self, outcome: Outcome) -> Iterator[Outcome]:
-        """The outcome, and the failures of what needed it."""
+        """Yield the outcome, and the failures of the experiments that depend on it."""
         yield outcome
         if isinstance(outcome, Result):
             self.results[outcome.name] = outcome
@@ -132,10 +132,10 @@ def _module_of(experiment: Experiment) -> str:
 
 @unwarned()
 def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
-    """Run one experiment; whatever goes wrong in it is its failure."""
+    """Run one experiment; convert any error into a failure."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MethodWarning)  # what the paper does, whatever we would advise
+            warnings.simplefilter("ignore", MethodWarning)  # settings are the paper's
             result = experiment.run(needs)
     except Exception as error:  # noqa: BLE001  (others go on)
         return Failure(name=experiment.name, message=_described(error), details=traceback.format_exc())
@@ -156,7 +156,7 @@ def _in_this_process(plan: _Plan, watch: Watch) -> Generator[Outcome, None, None
 
 @dataclass(kw_only=True)
 class _Worker:
-    """A process that runs experiments by name, and what it is at."""
+    """Process that runs experiments by name, and the experiment that it runs."""
 
     process: SpawnProcess
     connection: Connection
@@ -174,11 +174,11 @@ class _Worker:
 
     def give(self, experiment: Experiment, needs: Mapping[str, Result]) -> None:
         self.module, self.running = _module_of(experiment), experiment.name
-        with suppress(OSError):  # it died; so says take
+        with suppress(OSError):  # the process died; take reports it
             self.connection.send((experiment.name, needs))
 
     def take(self) -> Outcome:
-        """What it sent, or that it died."""
+        """Return the outcome that the process sent, or the failure that it died."""
         name, self.running = self.running, ""
         try:
             outcome: Outcome = self.connection.recv()
@@ -189,7 +189,7 @@ class _Worker:
 
 
 def _work(connection: Connection, module: str) -> None:
-    """The life of a process: names in, outcomes out. Ctrl-C is the parent's to handle."""
+    """Serve a process: receive names, send outcomes. Ctrl-C is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     experiments = catalogue(module)
     while True:
@@ -202,7 +202,7 @@ def _work(connection: Connection, module: str) -> None:
             connection.send(outcome)
         except OSError:  # the parent is gone
             return
-        except Exception as error:  # noqa: BLE001  (what does not travel between processes)
+        except Exception as error:  # noqa: BLE001  (results that cannot be pickled)
             connection.send(Failure(name=name, message=_described(error), details=traceback.format_exc()))
 
 
@@ -222,7 +222,7 @@ def _in_processes(plan: _Plan, count: int, module: str, watch: Watch) -> Generat
 
 
 def _assign(plan: _Plan, crew: Sequence[_Worker], watch: Watch) -> None:
-    """Give work to all that have none."""
+    """Start experiments on all idle processes."""
     for worker in crew:
         if not worker.running and (experiment := plan.next(worker.module)) is not None:
             worker.give(experiment, plan.needs(experiment))

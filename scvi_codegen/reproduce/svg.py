@@ -1,8 +1,8 @@
-"""Matplotlib's SVG made part of a page: small, with identifiers of its own, in the colours of the page.
+"""Conversion of Matplotlib's SVG for an HTML page: small, with unique identifiers, in the colours of the page.
 
-Black becomes the colour of the page's text, white that of its paper. Every other colour becomes a CSS variable, so that
-:func:`color_variables` can give it another value on dark paper, where it stays as readable as it was. A picture with
-an image in it, or with the many colours of a scale, cannot follow: it keeps its colours, on light paper.
+Black becomes the colour of the page's text, white that of its background. Every other colour becomes a CSS variable, to
+which :func:`color_variables` assigns another value in dark mode, of the same contrast. A picture that contains an image
+or the many colours of a colour scale keeps its colours, on a light background.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ __all__ = ["color_variables", "contrast", "inline_svg"]
 
 DARK_PAPER, LIGHT_PAPER = "#16181c", "#ffffff"
 TEXT_CONTRAST, LINE_CONTRAST = 4.6, 5.0
-"""Least contrast with the paper, of letters (WCAG AA asks for 4.5) and, on dark paper, of lines."""
+"""Least contrast with the background, of letters (WCAG AA requires 4.5) and, in dark mode, of lines."""
 GREY, PALE = 16, 2.0
-"""Largest difference of the channels of a grey; largest contrast of a pale area with light paper."""
+"""Largest difference of the channels of a grey; largest contrast of a pale area with a light background."""
 MOST_COLORS = 16
 DROPPED = {"metadata", "style", "title"}
 COLOR = re.compile(r"#([0-9a-f]{6})\b")
@@ -29,12 +29,12 @@ SIDEWAYS = re.compile(r"rotate\(-?0(\.0*)? [^)]*\)")
 
 
 def inline_svg(svg: bytes, *, prefix: str, label: str) -> str:
-    """An ``<svg>`` element for the body of an HTML page.
+    """Return an ``<svg>`` element for the body of an HTML page.
 
     Args:
-        svg: a document as Matplotlib writes it.
-        prefix: of all identifiers, so that those of several pictures differ.
-        label: what it shows, for those who do not see it.
+        svg: document as Matplotlib writes it.
+        prefix: prefix of all identifiers, so that those of several pictures differ.
+        label: description for screen readers.
     """
     root = ElementTree.fromstring(svg)
     references = {name for element in root.iter() for name in _referenced(element)}
@@ -52,13 +52,13 @@ def inline_svg(svg: bytes, *, prefix: str, label: str) -> str:
 
 
 def color_variables(pages: Iterable[str], *, dark: bool) -> dict[str, str]:
-    """The values of all variables used in pieces of a page, by name, on light or on dark paper."""
+    """Return the values of all variables used in parts of a page, by name, for light or dark mode."""
     used = sorted({match for page in pages for match in VARIABLE.findall(page)})
     return {f"--{kind}-{digits}": _adapted(f"#{digits}", kind, dark=dark) for kind, digits in used}
 
 
 def contrast(one: str, other: str) -> float:
-    """The contrast of two colours ``#rrggbb`` as WCAG defines it, from 1 to 21."""
+    """Return the contrast of two colours ``#rrggbb`` as defined by WCAG, from 1 to 21."""
     low, high = sorted((_luminance(one), _luminance(other)))
     return (high + 0.05) / (low + 0.05)
 
@@ -69,7 +69,7 @@ def _keeps_colors(root: ElementTree.Element) -> bool:
 
 
 def _adapted(color: str, kind: str, *, dark: bool) -> str:
-    """A colour that is as readable on dark paper as on light, and letters on both readable enough."""
+    """Return a colour of equal contrast in dark and in light mode; letters get sufficient contrast in both."""
     if not dark and kind == "line":
         return color
     as_given = contrast(color, LIGHT_PAPER)
@@ -83,7 +83,7 @@ def _adapted(color: str, kind: str, *, dark: bool) -> str:
 
 
 def _mixtures(color: str, other: str) -> Iterator[str]:
-    """From one colour to another, a hundredth at a time."""
+    """Yield mixtures from one colour to another, in steps of a hundredth."""
     pairs = list(zip(_channels(color), _channels(other), strict=True))
     for part in range(101):
         yield "#" + "".join(f"{round(c + (end - c) * part / 100):02x}" for c, end in pairs)
@@ -100,19 +100,19 @@ def _channels(color: str) -> list[int]:
 
 
 def _local(name: str) -> str:
-    """A tag or attribute without its namespace."""
+    """Return a tag or attribute without its namespace."""
     return name.rpartition("}")[2]
 
 
 def _referenced(element: ElementTree.Element) -> Iterator[str]:
-    """Identifiers that an element refers to."""
+    """Yield identifiers that an element refers to."""
     for name, value in element.attrib.items():
         if (_local(name) == "href" and value.startswith("#")) or "url(#" in value:
             yield from REFERENCE.findall(value)
 
 
 def _simplify(element: ElementTree.Element, references: set[str], prefix: str, *, fixed: bool) -> None:
-    """Rewrite one element's attributes: no namespaces, short numbers, own identifiers, variables for colours."""
+    """Rewrite the attributes of an element: no namespaces, short numbers, unique identifiers, variables for colours."""
     element.tag = _local(element.tag)
     kind = None if fixed else "text" if element.tag in ("text", "tspan") else "line"
     attributes = {_local(name): value for name, value in element.attrib.items()}
@@ -144,7 +144,7 @@ def _value(name: str, value: str, kind: str | None, prefix: str) -> str:
 
 
 def _prune(element: ElementTree.Element) -> None:
-    """Drop white space, what browsers do not need, and groups that say nothing."""
+    """Remove white space, elements that browsers do not need, and groups without attributes."""
     children: list[ElementTree.Element] = []
     for child in list(element):
         child.tail = None

@@ -1,4 +1,4 @@
-"""A result on disk: NAME.svg, NAME.png, NAME.csv, and NAME.txt with the statement; each whole or not at all."""
+"""Files of a result: NAME.svg, NAME.png, NAME.csv, and NAME.txt with the statement; each written atomically."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DOTS_PER_INCH = 150
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
-    """Write the files of a result into an existing folder; their paths."""
+    """Write the files of a result into an existing folder; return their paths."""
     written = []
 
     def write(name: str, content: bytes) -> None:
@@ -45,7 +45,7 @@ def write_result(result: Result, folder: Path) -> list[Path]:
 
 
 def draw(picture: Picture, kind: str) -> bytes:
-    """The bytes of a picture, ``kind`` being ``"svg"`` or ``"png"``; equal results give equal bytes."""
+    """Return the bytes of a picture, ``kind`` being ``"svg"`` or ``"png"``; equal results give equal bytes."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -60,7 +60,7 @@ def draw(picture: Picture, kind: str) -> bytes:
 
 
 def csv_text(table: TableBlock) -> str:
-    """CSV with a line of headings; floats in full precision."""
+    """Return CSV with a line of headings; floats in full precision."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(table.columns)
@@ -69,7 +69,7 @@ def csv_text(table: TableBlock) -> str:
 
 
 def statement(result: Result) -> str:
-    """What was run, claimed and found, as text."""
+    """Return setting, claims and measurements as text."""
     lines = [f"{result.name}: {result.title}", f"verdict: {result.verdict.value}", ""]
     lines += [line for sentence in result.setting for line in _wrapped(sentence)]
     for check in result.checks:

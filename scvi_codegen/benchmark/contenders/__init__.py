@@ -1,1 +1,1 @@
-"""Who runs in the benchmark: this project, its peers, and what they are timed by."""
+"""Contenders of the benchmark: this package, its peers, and the processes in which they are timed."""

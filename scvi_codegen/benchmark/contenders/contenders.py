@@ -1,4 +1,4 @@
-"""One integrator at one setting, ready to be timed, and what is said of it."""
+"""Contender: one integrator at one setting, ready to be timed."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ OURS = "scvi-codegen"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Contender:
-    """An integrator that was compiled.
+    """Compiled integrator at one setting.
 
     Attributes:
-        method: name of the family whose settings make one work-precision curve, as in ``"heyoka"``.
-        setting: what distinguishes it on that curve: a step or a tolerance.
-        options: formulation and options chosen, for the reader.
-        compile_seconds: from the equations to a function that can be called.
-        prepare: from the number of a run, which is that of its initial state, to a function that integrates from there
-            and gives the final q.
-        momenta: (k, m) momenta that it starts from, where they are its state; ``None`` if it starts from velocities.
-        trajectories: initial states that one run starts from; the final q of an ensemble is (trajectories, m).
+        method: name of the work-precision curve, as in ``"heyoka"``.
+        setting: step size or tolerance.
+        options: formulation and options, for the reader.
+        compile_seconds: time from the equations to a function that can be called.
+        prepare: function from the number of a run, which is that of its initial state, to a function that integrates
+            from it and returns the final q.
+        momenta: (k, m) initial momenta, if they are its state; ``None`` if it starts from velocities.
+        trajectories: number of trajectories of one run; the final q of an ensemble is (trajectories, m).
     """
 
     method: str

@@ -1,13 +1,13 @@
-"""Bodies held by rods, with constraints by this project and by MuJoCo: the same masses, lengths and initial states.
+"""Constrained bodies in this package and in MuJoCo: the same masses, lengths and initial states.
 
-    chain      5 masses of 1/5 on rods of 1/5, let go from 0.6 (the first) to 0.3 from the vertical; MuJoCo has it in
-               the angles of its joints, in which there is no constraint to break, and so has this project once more
+    chain      5 masses of 1/5 on rods of 1/5, released from 0.6 (the first) to 0.3 from the vertical; MuJoCo uses
+               joint angles, which satisfy the constraints identically, and this package is also run in angles
     four-bar   masses at the two joints of rods of 1, 2 and 1.5 between points that are 2 apart; MuJoCo closes the loop
                by its equality ``connect``
 
-A contender gives a function of (step, number of steps): how energies at the end of ten equal parts differ, how far rods
-are off their lengths there, and the processor time that the steps took. It raises :class:`ArithmeticError` where a step
-is too long.
+A contender is a function of (step size, number of steps) that returns the spread of the energies at the ends of ten
+equal parts, the largest error of the rod lengths there, and the processor time of the steps. It raises
+:class:`ArithmeticError` if a step is too large.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["HELD", "PARTS", "Held", "HeldRun", "motion_in_angles", "mujoco_motio
 
 GRAVITY = 9.81
 PARTS = 10
-"""Of a run, after which energies are looked at."""
+"""Number of parts of a run; energies are computed after each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +36,8 @@ class Held:
     """Masses in the plane at (x, y), and rods between two of them, or one and a fixed point.
 
     Attributes:
-        rods: (i, j, length); i < 0 is the fixed point ``anchors[-1 - i]``.
-        closed: whether the last rod ends at a fixed point: a loop.
+        rods: (i, j); i < 0 is the fixed point ``anchors[-1 - i]``.
+        closed: True if the last rod ends at a fixed point: a closed loop.
     """
 
     name: str
@@ -48,21 +48,21 @@ class Held:
     closed: bool = False
 
     def point(self, i: int) -> Array:
-        """Where a mass, or a fixed point, is at the start."""
+        """Return the initial position of a mass, or a fixed point."""
         return np.array(self.anchors[-1 - i] if i < 0 else self.start[i])
 
     def length(self, i: int, j: int) -> float:
-        """Of a rod."""
+        """Return the length of a rod."""
         return float(np.linalg.norm(self.point(j) - self.point(i)))
 
     @property
     def weight(self) -> float:
-        """The energy that errors are told in: of all masses through a length of 1."""
+        """Unit of energy errors: the weight of all masses times a length of 1."""
         return GRAVITY * sum(self.masses)
 
 
 def hanging_chain(n: int) -> Held:
-    """Of n rods."""
+    """Return a chain of n rods."""
     angles = np.linspace(0.6, 0.3, n)
     places = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]) / n, axis=0)
     return Held(
@@ -74,7 +74,7 @@ def hanging_chain(n: int) -> Held:
 
 
 def four_bar() -> Held:
-    """From a state at rest: the second joint follows from the first."""
+    """Return a four-bar linkage at rest; the second joint follows from the first."""
     first, end, b, c = np.array([0.0, 1.0]), np.array([2.0, 0.0]), 2.0, 1.5
     apart = float(np.linalg.norm(end - first))
     along = (apart**2 + b**2 - c**2) / (2 * apart)
@@ -92,12 +92,12 @@ def four_bar() -> Held:
 
 LINKS = 5
 HELD: Mapping[str, Callable[[], Held]] = {"chain": lambda: hanging_chain(LINKS), "four-bar": four_bar}
-"""By name."""
+"""Functions that build a case, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeldRun:
-    """Of a run: processor seconds of its steps, largest change of energy, and of a rod's length as a part of it."""
+    """Result of a run: processor seconds of its steps, spread of the energy, largest relative error of a rod length."""
 
     seconds: float
     energy: float
@@ -105,7 +105,7 @@ class HeldRun:
 
 
 def our_motion(held: Held, method: str) -> Callable[[float, int], HeldRun]:
-    """By constraints in Cartesian coordinates."""
+    """Return a run with constraints in Cartesian coordinates."""
     n = len(held.masses)
     kinetic = " + ".join(f"{held.masses[i]!r}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in range(n))
     weights = " ".join(f"- {held.masses[i] * GRAVITY!r}*y{i}" for i in range(n))
@@ -125,7 +125,7 @@ def our_motion(held: Held, method: str) -> Callable[[float, int], HeldRun]:
 
 
 def motion_in_angles(held: Held, method: str) -> Callable[[float, int], HeldRun]:
-    """The same for an open chain in the angles of its rods, which leave nothing to hold."""
+    """Return a run of an open chain in the angles of its rods, without constraints."""
     n = len(held.masses)
     lengths, angles = [held.length(i, j) for i, j in held.rods], [f"a{k}" for k in range(n)]
     kinetic, height = [], []
@@ -144,7 +144,7 @@ def motion_in_angles(held: Held, method: str) -> Callable[[float, int], HeldRun]
 
 
 def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float]) -> Callable[[float, int], HeldRun]:
-    """Runs of a stepper, so many steps of h."""
+    """Return a run of a stepper, for a step size and a number of steps."""
 
     def move(h: float, steps: int) -> HeldRun:
         run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
@@ -160,7 +160,7 @@ def _by(stepper: Stepper, q: Array, p: Array, stretch: Callable[[Array], float])
 
 
 def _stretch(held: Held, places: Array) -> float:
-    """How much longer or shorter a rod is, as a part of its length."""
+    """Return the largest relative error of a rod length."""
     found = 0.0
     for i, j in held.rods:
         ends = [np.array(held.anchors[-1 - k]) if k < 0 else places[k] for k in (i, j)]
@@ -170,14 +170,14 @@ def _stretch(held: Held, places: Array) -> float:
 
 
 def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callable[[float, int], HeldRun]:
-    """By MuJoCo: hinges, and where a loop is closed its equality, as soft as it is or as stiff as a step allows.
+    """Return a run of MuJoCo: hinges, and for a closed loop its equality constraint, soft or as stiff as a step allows.
 
     Raises:
         ImportError: without ``mujoco``.
     """
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda _: None)  # of steps too large: else it writes MUJOCO_LOG.TXT where it is run
+    mujoco.set_mju_user_warning(lambda _: None)  # otherwise it writes MUJOCO_LOG.TXT to the working directory
 
     def move(h: float, steps: int) -> HeldRun:
         model = mujoco.MjModel.from_xml_string(_document(held, integrator, h, stiff=stiff))
@@ -202,7 +202,7 @@ def mujoco_motion(held: Held, integrator: str, *, stiff: bool = False) -> Callab
 
 @contextmanager
 def _warnings() -> Iterator[list[str]]:
-    """What MuJoCo warns of, which it would write to a file MUJOCO_LOG.TXT in the user's folder."""
+    """Collect MuJoCo's warnings, which it would otherwise write to a file MUJOCO_LOG.TXT."""
     import mujoco
 
     told: list[str] = []
@@ -215,7 +215,7 @@ def _warnings() -> Iterator[list[str]]:
 
 
 def _document(held: Held, integrator: str, h: float, *, stiff: bool) -> str:
-    """MJCF: bodies one inside the other along the rods; y is MuJoCo's z, the axis of hinges its y."""
+    """Return MJCF: bodies nested along the rods; y is MuJoCo's z, the axis of hinges its y."""
     open_rods = held.rods[:-1] if held.closed else held.rods
     bodies, tail = "", ""
     for i, j in open_rods:
@@ -241,7 +241,7 @@ def _document(held: Held, integrator: str, h: float, *, stiff: bool) -> str:
 
 
 def _body(name: str, before: Array, rod: Array, mass: float, site: str) -> str:
-    """A hinge at a place of the body around it, with a mass at the end of a rod; left open."""
+    """Return the opening of a body: a hinge at a position of its parent, with a mass at the end of a rod."""
     place, end = (" ".join(map(repr, (float(x), 0.0, float(y)))) for x, y in (before, rod))
     return (
         f'<body name="{name}" pos="{place}"><joint type="hinge" axis="0 1 0"/>'

@@ -1,4 +1,4 @@
-"""OpenMM's Verlet integrator for atoms that all attract and repel each other by the potential of Lennard-Jones."""
+"""OpenMM's Verlet integrator for Lennard-Jones atoms."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from scvi_codegen.benchmark.cases import Array
 __all__ = ["PLATFORMS", "openmm_run"]
 
 PLATFORMS = {"OpenMM_CPU": ("CPU", {"Threads": "1"}), "OpenMM_double": ("Reference", {})}
-"""Of OpenMM, by the name in the table: vectors of single precision in one thread; plain loops in double precision."""
+"""OpenMM's platforms by the name in the table: single precision with vectors in one thread; double precision with
+loops."""
 
 
 def openmm_run(
     name: str, q: Array, v: Array, accelerations: Callable[[Array], Array], span: float, steps: int
 ) -> Callable[[], Array]:
-    """Runs so many steps from (q, v), (N, 3) each, and gives the positions; atoms of mass, depth and diameter 1.
+    """Return a function that performs ``steps`` steps from (q, v), (N, 3) each, and returns the positions.
 
-    Its velocities are those half a step before positions, so that it begins half a kick back and is Stoermer-Verlet.
-    Units of mass, length, time and energy belong together: dalton, nm, ps, kJ/mol.
+    Atoms have unit mass, depth and diameter. OpenMM's velocities are those half a step before the positions, so that
+    the start is shifted by half a kick; the method is then Stoermer-Verlet. Units are consistent: dalton, nm, ps,
+    kJ/mol.
     """
     import openmm
 

@@ -1,4 +1,4 @@
-"""The pendulum of n links on a cart: from SymPy's description to a motion, by this project, by SymPy and by PyDy.
+"""Pendulum of n links on a cart, from SymPy's description to a trajectory, by this package, by SymPy and by PyDy.
 
 scvi-codegen   ``from_kanes_method`` of the bodies and loads, whose equations need not be formed; SVI(4).
 lambdify       Kane's equations formed by SymPy, mass matrix and forcing by ``lambdify(..., cse=True)``, NumPy's solve,
@@ -28,20 +28,20 @@ from scvi_codegen.errors import StepFailedError
 __all__ = ["CONTENDERS", "pendulum"]
 
 STEPS = (16, 32, 64, 128, 256, 512, 1024)
-"""Of this project, in the second."""
+"""Numbers of steps of this package, in one second."""
 TOLERANCES = (1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
-"""Of the others."""
+"""Tolerances of the others."""
 ANGLE = 0.3
-"""Of every link at the start, at rest; the cart is pushed by nothing."""
+"""Initial angle of every link, at rest; no force acts on the cart."""
 PATIENCE = 0.2
 """Processor seconds for which one setting is repeated."""
 
 Solve = Callable[[float], Array]
-"""The coordinates after a second, from a number of steps or a tolerance."""
+"""Function that returns the coordinates after one second, for a number of steps or a tolerance."""
 
 
 def pendulum(n: int) -> tuple[KanesMethod, dict[str, float]]:
-    """That of ``sympy.physics.mechanics.models``, its equations not formed, and the values of its parameters."""
+    """Return the pendulum of ``sympy.physics.mechanics.models``, equations not formed, and its parameter values."""
     q, u = dynamicsymbols(f"q:{n + 1}"), dynamicsymbols(f"u:{n + 1}")
     masses, lengths, g = sympy.symbols(f"m:{n + 1}"), sympy.symbols(f"l:{n}"), sympy.Symbol("g")
     frame, origin = ReferenceFrame("I"), Point("O")
@@ -69,12 +69,12 @@ def pendulum(n: int) -> tuple[KanesMethod, dict[str, float]]:
 
 
 def start(n: int) -> Array:
-    """(2 (n + 1),) coordinates and velocities."""
+    """Return (2 (n + 1),) coordinates and velocities."""
     return np.array([0.0, *[ANGLE] * n, *[0.0] * (n + 1)])
 
 
 def ours(n: int) -> Solve:
-    """A stepper, after its first step."""
+    """Return a solver by a stepper, after its first step."""
     from scvi_codegen.compiler import compile_stepper
     from scvi_codegen.mechanics.lagrangian import LagrangianSystem
     from scvi_codegen.methods.galerkin import SVI
@@ -88,7 +88,7 @@ def ours(n: int) -> Solve:
 
 
 def by_lambdify(n: int) -> Solve:
-    """SymPy's equations, after they were called once."""
+    """Return a solver by SymPy's equations, after one call."""
     method, values = pendulum(n)
     method.kanes_equations()
     given = {symbol: values[symbol.name] for symbol in _constants(method, values)}
@@ -104,7 +104,7 @@ def by_lambdify(n: int) -> Solve:
 
 
 def by_pydy(n: int) -> Solve:
-    """PyDy's function in Cython, after it was called once."""
+    """Return a solver by PyDy's Cython function, after one call."""
     from pydy.codegen.ode_function_generators import generate_ode_function
 
     method, values = pendulum(n)
@@ -120,7 +120,7 @@ def by_pydy(n: int) -> Solve:
         generator="cython",
     )
     numbers = np.array([values[symbol.name] for symbol in constants])
-    return _dop853(lambda t, x: generated(x, t, numbers).copy(), n)  # its array is the next call's, too
+    return _dop853(lambda t, x: generated(x, t, numbers).copy(), n)  # the function reuses its array
 
 
 def _constants(method: KanesMethod, values: Mapping[str, float]) -> list[sympy.Symbol]:
@@ -143,18 +143,18 @@ def _dop853(rates: Callable[[float, Array], Array], n: int) -> Solve:
 
 
 CONTENDERS: Mapping[str, Callable[[int], Solve]] = {OURS: ours, "lambdify": by_lambdify, "PyDy": by_pydy}
-"""From the number of links to a function that integrates."""
+"""Functions from the number of links to a solver."""
 
 
 def _processor_seconds() -> float:
-    return sum(os.times()[:4])  # of the compilers it started, too
+    return sum(os.times()[:4])  # child processes (compilers) included
 
 
 def _runs(solve: Solve, settings: Iterable[float]) -> Iterator[dict[str, Any]]:
     for setting in settings:
         try:
             final = solve(setting)
-        except StepFailedError:  # too long a step
+        except StepFailedError:  # too large a step
             continue
         seconds: list[float] = []
         while sum(seconds) < PATIENCE:

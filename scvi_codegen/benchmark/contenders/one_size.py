@@ -1,4 +1,4 @@
-"""A ring or a field of one size in a fresh process: time to the first step, time a step, memory."""
+"""Measurement of a ring or a field of one size in a fresh process: time to the first step, time per step, memory."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__: list[str] = []
 
 
 LENGTHS = {"ring": 0.1, "field": 0.03}
-"""Of steps."""
+"""Step sizes."""
 
 
 def _one_size(method: str, name: str, size: int) -> str:
-    """What a fresh process measures."""
+    """Return the measurements of a fresh process."""
     began = time.perf_counter()
     each = {"ring": ring, "field": field}[name](size, 1.0)
     count = each.q.size
@@ -43,7 +43,7 @@ def _one_size(method: str, name: str, size: int) -> str:
 
 
 def _operations(program: IndexedProgram, sweeps: float) -> float:
-    """Additions, multiplications and the like, a coordinate and step: of kernels, and of the products with tables."""
+    """Return arithmetic operations per coordinate and step: of kernels, and of the products with tables."""
     force = sum(_counted(each.kernel) for each in program.forces)
     if program.sweep is None:
         drifts = program.splitting.drifts if program.splitting is not None else ()
@@ -53,10 +53,11 @@ def _operations(program: IndexedProgram, sweeps: float) -> float:
 
 
 def _bytes(program: IndexedProgram, sweeps: float) -> float:
-    """What is read and written of arrays in a coordinate and step, every array once a loop.
+    """Return the bytes of arrays read and written per coordinate and step, every array once a loop.
 
-    A sweep clears and adds up forces and reads positions, then reads forces, positions and state and writes positions;
-    a leap adds to increments by positions, then reads momenta, positions and both increments, and writes two arrays.
+    A fixed-point iteration clears and sums forces and reads positions, then reads forces, positions and state and
+    writes positions; a leapfrog step sums increments from positions, then reads momenta, positions and both increments,
+    and writes two arrays.
     """
     if program.sweep is None:
         return 8.0 * len(program.splitting.drifts if program.splitting else ()) * (3 + 7)
@@ -64,13 +65,13 @@ def _bytes(program: IndexedProgram, sweeps: float) -> float:
 
 
 def _counted(kernel: Kernel) -> int:
-    """Each result is added to what other terms gave."""
+    """Return the operations of a kernel; each result is added to those of other terms."""
     return sum(kernel.operation_counts().values()) + len(kernel.results)
 
 
 def _most_memory() -> float:
-    """The most that the process had, in megabytes; where the system tells it (Linux)."""
-    try:  # ru_maxrss would be that of the process which began this one, if that had more
+    """Return the peak memory of the process in megabytes, if the system reports it (Linux)."""
+    try:  # ru_maxrss would include the parent process
         status = Path("/proc/self/status").read_text(encoding="ascii")
     except OSError:
         return float("nan")

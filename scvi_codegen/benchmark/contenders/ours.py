@@ -1,4 +1,4 @@
-"""This project's own steppers, at the step sizes that :func:`scvi_codegen.advise` gives for a ladder of tolerances."""
+"""Steppers of this package at the step sizes that :func:`scvi_codegen.advise` recommends for a list of tolerances."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
 
 TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
-"""For which advice is asked; what is reached is measured."""
+"""Tolerances for which a step size is recommended; the errors reached are measured."""
 
 QUICK_TOLERANCES = (1e-8, 1e-10, 1e-12)
 LARGEST_NEWTON = 18
-"""Degrees of freedom beyond which the steps advised are those of the iteration by fixed point: Newton's method allows
-longer ones, each of which takes seconds."""
+"""Largest number of degrees of freedom for which Newton's method is used; beyond, its larger steps take seconds
+each."""
 
 _builds = itertools.count()
 
 
 def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = False) -> list[Contender]:
-    """Every method at every step advised.
+    """Return contenders for every method at every recommended step size.
 
     Args:
-        case: what to integrate.
-        methods: by default the default method, SVI(8).
-        quick: few tolerances.
+        case: case to integrate.
+        methods: by default SVI(8).
+        quick: use few tolerances.
     """
     result = []
     for method in methods or (SVI(8),):
@@ -61,11 +61,11 @@ def our_contenders(case: Case, *, methods: Iterable[Method] = (), quick: bool = 
 
 
 def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
-    """SVI(8) with all states of the case as one ensemble, in one thread."""
+    """Return contenders by SVI(8) with all states of the case as one ensemble, in one thread."""
     stepper, seconds = compiled(case, SVI(8))
     momenta = momenta_of(stepper, case)
     began = time.perf_counter()
-    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled at its first use
+    stepper.integrate_ensemble(case.q, momenta, h=case.step, steps=1, threads=1)  # compiled on first use
     seconds += time.perf_counter() - began
     return [
         Contender(
@@ -82,20 +82,20 @@ def our_ensembles(case: Case, *, quick: bool = False) -> list[Contender]:
 
 
 def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) -> dict[int, float]:
-    """Numbers of steps that fill the span -> the tolerance for which each was advised, at the first initial state."""
+    """Return numbers of steps that fill the span -> the tolerance for which each is recommended, at the first state."""
     counts: dict[int, float] = {}
     solver = "auto" if case.dimension <= LARGEST_NEWTON or case.system.constraints else "fixed-point"
     for tolerance in QUICK_TOLERANCES if quick else TOLERANCES:
         try:
             advice = advise(case.system, method, case.q[0], momentum, case.span, tolerance, solver=solver)
-        except StateError:  # no step is known to be good enough
+        except StateError:  # no step size is known to be small enough
             continue
         counts.setdefault(advice.steps, tolerance)
     return counts
 
 
 def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
-    """The stepper, and the seconds from the Lagrangian to it with an empty cache and a name that is new."""
+    """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder, _cache_in(folder):
         began = time.perf_counter()
         stepper = compile_stepper(case.system, method, prefix=f"bench_{next(_builds)}")
@@ -103,7 +103,7 @@ def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
 
 
 def momenta_of(stepper: Stepper, case: Case) -> Array:
-    """(k, m) initial momenta."""
+    """Return (k, m) initial momenta."""
     return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
 
 

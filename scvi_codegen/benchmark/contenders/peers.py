@@ -1,4 +1,4 @@
-"""Other people's integrators, each with the best options and the best formulation we know of.
+"""Integrators of other packages, each with the best options and the best formulation known to us.
 
 heyoka      adaptive Taylor series, compiled by LLVM: see :mod:`.taylor`.
 rebound     IAS15, for gravitating bodies, with its default step control.
@@ -36,12 +36,12 @@ MOST_STEPS = 10**9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Peer:
-    """One library.
+    """Library to compare with.
 
     Attributes:
-        modules: what must be installed.
-        contenders: makes its contenders, one setting after the other.
-        suits: the cases it can integrate.
+        modules: modules that must be installed.
+        contenders: function that yields its contenders, one per setting.
+        suits: predicate of the cases it can integrate.
     """
 
     modules: tuple[str, ...]
@@ -50,12 +50,12 @@ class Peer:
 
 
 def missing_module(peer: Peer) -> str | None:
-    """The first module that is not installed."""
+    """Return the first module that is not installed."""
     return next((name for name in peer.modules if importlib.util.find_spec(name) is None), None)
 
 
 def peer_contenders(name: str, case: Case, *, quick: bool = False) -> Iterator[Contender]:
-    """The contenders of a peer for a case."""
+    """Yield the contenders of a peer for a case."""
     return PEERS[name].contenders(case, quick)
 
 
@@ -103,7 +103,7 @@ def _rebound_preparation(case: Case, epsilon: float) -> Callable[[int], Callable
     return prepare
 
 
-# ---- Dormand and Prince's method of order 8, three times
+# ---- Dormand-Prince method of order 8, in three packages
 
 
 def _start(case: Case, index: int) -> Array:
@@ -111,7 +111,7 @@ def _start(case: Case, index: int) -> Array:
 
 
 def _right_hand_side(case: Case) -> Callable[..., None]:
-    """Plain Python ``rates(out, t, x, unused)``: the loops of the case if it has some, else lines without any."""
+    """Return a Python function ``rates(out, t, x, unused)``: the loops of the case if any, else unrolled."""
     names: dict[str, Any] = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
     text = case.loops or rates_text(case.formulations[0].rates, case.parameters, 2 * case.dimension)
     exec(compile(text, f"<rates of {case.name}>", "exec"), names)
@@ -122,7 +122,7 @@ def _right_hand_side(case: Case) -> Callable[..., None]:
 def _dop853(
     method: str, options: str, seconds: float, case: Case, quick: bool, solve: Callable[[Array, float], Array]
 ) -> Iterator[Contender]:
-    """One contender a tolerance; ``solve`` maps (state, relative tolerance) to the final state."""
+    """Yield one contender per tolerance; ``solve`` maps (state, relative tolerance) to the final state."""
 
     def preparation(tolerance: float) -> Callable[[int], Callable[[], Array]]:
         def prepare(index: int) -> Callable[[], Array]:
@@ -142,7 +142,7 @@ def _dop853(
 
 
 def _absolute(tolerance: float, start: Array) -> float:
-    """Absolute tolerance that belongs to a relative one: a tenth of it for the smaller of typical q and v."""
+    """Return the absolute tolerance: a tenth of the relative one times the smaller typical size of q and v."""
     sizes = [float(np.sqrt(np.mean(half**2))) for half in np.split(start, 2)]
     return 0.1 * tolerance * min(size for size in sizes if size > 0.0)
 
@@ -200,7 +200,7 @@ def _jitcode(case: Case, quick: bool) -> Iterator[Contender]:
 
 @contextlib.contextmanager
 def _elsewhere() -> Iterator[None]:
-    """In a temporary folder: setuptools, which JiTCODE calls, would read a pyproject.toml here; and its logs aside."""
+    """Work in a temporary folder, as setuptools (for JiTCODE) would read a pyproject.toml here; restore logging."""
     level = logging.root.level
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         try:
@@ -253,4 +253,4 @@ PEERS = {
     "scipy": Peer(modules=("scipy",), contenders=_scipy),
     "openmm": Peer(modules=("openmm",), contenders=lambda case, quick: iter(()), suits=lambda case: False),
 }
-"""Peers by the name on the command line, the fastest first; the last is for sums over pairs alone."""
+"""Peers by the name on the command line, the fastest first; the last is for indexed systems only."""

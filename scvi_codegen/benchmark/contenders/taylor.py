@@ -1,13 +1,14 @@
-"""Heyoka: adaptive Taylor series, compiled by LLVM.
+"""Contenders of heyoka: adaptive Taylor series, compiled by LLVM.
 
-Every formulation (accelerations solved for by hand, ``heyoka.lagrangian``, Hamilton's equations where they are shorter,
+Every formulation (hand-derived accelerations, ``heyoka.lagrangian``, Hamilton's equations where they are shorter,
 ``heyoka.model.nbody``) and, for systems that are not small, unrolled as well as compact code is tried; the fastest at
-the default tolerance makes the curve. A second curve is made with ``fast_math``, which allows what the C compiler calls
-``-ffast-math``, and a third from the Lagrangian alone, which is what this project is given. Powers whose base is 0 at
-the start (in a chain's Lagrangian, the stretch of its middle spring) make heyoka stop; such a formulation is left out.
+the default tolerance makes the curve. A second curve uses ``fast_math``, which allows what the C compiler's
+``-ffast-math`` allows, and a third the Lagrangian alone, which is the input of this package. Powers whose base is 0 at
+the start (in a chain's Lagrangian, the elongation of its middle spring) make heyoka fail; such a formulation is left
+out.
 
-Ensembles go through its batch mode, as many trajectories at once as it recommends for this processor. Its
-``ensemble_propagate`` functions add threads to that and nothing else.
+Ensembles use its batch mode, with as many trajectories at once as it recommends for this processor. Its
+``ensemble_propagate`` functions add only threads to that.
 """
 
 from __future__ import annotations
@@ -28,22 +29,22 @@ from scvi_codegen.mechanics.forms import forms_of
 __all__ = ["heyoka_contenders", "heyoka_ensembles", "heyoka_states"]
 
 TOLERANCES = (0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, 1e-8)
-"""0 is heyoka's default, 2^-52."""
+"""Tolerances; 0 is heyoka's default, 2^-52."""
 
 FEW_TOLERANCES = (0.0, 1e-14, 1e-13, 1e-12)
-"""For what takes long to compile, and in quick runs."""
+"""Tolerances for systems that take long to compile, and for quick runs."""
 
 FEWEST_TOLERANCES = (0.0, 1e-12, 1e-10)
-"""For what takes very long."""
+"""Tolerances for systems that take very long to compile."""
 
 TRIALS = 5
 LARGEST_SMALL, LARGEST_QUICK, LARGEST_COUPLED, LARGEST_LAGRANGIAN, LARGEST_UNROLLED = 2, 8, 2, 18, 64
-"""Degrees of freedom up to which compact code is never faster, code compiles within a second or so, the Lagrangian is
-tried where masses are coupled (5 rods take minutes), and where they are not, unrolled code compiles within a minute."""
+"""Limits on degrees of freedom: compact code is never faster; compiles within about a second; Lagrangian with coupled
+masses (5 rods take minutes); without; unrolled code compiles within a minute."""
 
 
 def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
-    """The curves ``heyoka``, ``heyoka fast_math`` and ``heyoka.lagrangian``."""
+    """Yield the curves ``heyoka``, ``heyoka fast_math`` and ``heyoka.lagrangian``."""
     variants = list(_variants(case))
     for fast in (False, True):
         yield from _curve([variant.allowing(fast) for variant in variants], case, _tolerances(case, quick))
@@ -52,7 +53,7 @@ def heyoka_contenders(case: Case, quick: bool) -> Iterator[Contender]:
 
 
 def heyoka_ensembles(case: Case, quick: bool) -> Iterator[Contender]:
-    """The curves ``heyoka batch`` and ``heyoka batch fast_math``."""
+    """Yield the curves ``heyoka batch`` and ``heyoka batch fast_math``."""
     variants = [replace(variant, curve="heyoka batch") for variant in _variants(case) if not variant.compact]
     for fast in (False, True):
         yield from _curve([variant.allowing(fast) for variant in variants], case, _tolerances(case, quick))
@@ -65,7 +66,7 @@ def _tolerances(case: Case, quick: bool) -> tuple[float, ...]:
 
 
 def heyoka_states(case: Case, times: Array) -> Array:
-    """(n, 2 m) states (q, v) at some times from the first state of a case, at the default tolerance."""
+    """Return (n, 2 m) states (q, v) at times from the first state of a case, at the default tolerance."""
     plain = next(variant for variant in _variants(case) if not variant.formulation.momenta)
     integrator, _ = plain.integrator(0.0)
     integrator.time = 0.0
@@ -79,7 +80,7 @@ LAGRANGIAN = "heyoka.lagrangian"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Taylor:
-    """A heyoka system with its options."""
+    """System of heyoka with its options."""
 
     name: str
     equations: list[Any]
@@ -92,7 +93,7 @@ class _Taylor:
         return replace(self, fast=fast)
 
     def integrator(self, tolerance: float, batch: int = 0) -> tuple[Any, float]:
-        """Compiled anew, and the seconds that took; of so many trajectories at once if batch is not 0."""
+        """Compile anew; return the integrator and the seconds, for ``batch`` trajectories at once unless 0."""
         import heyoka
 
         heyoka.llvm_state.clear_memcache()
@@ -106,7 +107,7 @@ class _Taylor:
         return made, time.perf_counter() - began
 
     def contender(self, case: Case, tolerance: float) -> Contender:
-        """One trajectory after the other, or all trajectories of the case in batches."""
+        """Return a contender for one trajectory at a time, or for all trajectories of the case in batches."""
         import heyoka
 
         batch = heyoka.recommended_simd_size() if len(case.q) > STATES else 0
@@ -121,7 +122,7 @@ class _Taylor:
         )
 
     def _second(self, case: Case) -> Array:
-        """Second half of the states; momenta only for cases that start from rest."""
+        """Return the second half of the states; momenta are used only for cases that start from rest."""
         return np.zeros_like(case.q) if self.formulation.momenta else case.velocity
 
     def _preparation(self, integrator: Any, case: Case) -> Callable[[int], Callable[[], Array]]:
@@ -142,7 +143,7 @@ class _Taylor:
         return prepare
 
     def _batches(self, integrator: Any, case: Case) -> Callable[[int], Callable[[], Array]]:
-        """From all states to all final positions, one batch after the other."""
+        """Return a function from all states to all final positions, batch by batch."""
         starts, size = np.concatenate([case.q, self._second(case)], axis=1), integrator.batch_size
 
         def integrate() -> Array:
@@ -166,7 +167,7 @@ def _variants(case: Case) -> Iterator[_Taylor]:
 
 
 def _curve(variants: list[_Taylor], case: Case, tolerances: Sequence[float]) -> Iterator[Contender]:
-    """Of the variant that is fastest at the first tolerance, which is the default; nothing if all fail there."""
+    """Yield contenders of the variant that is fastest at the first tolerance, the default; nothing if all fail."""
     made = [variant.contender(case, tolerances[0]) for variant in variants]
     seconds = [_quickest(contender) for contender in made]
     if seconds and min(seconds) < math.inf:
@@ -198,7 +199,7 @@ def _formulations(case: Case) -> Iterator[tuple[str, list[Any], Formulation]]:
 
 
 def _from_lagrangian(case: Case) -> list[Any]:
-    """Equations in the order q, v, from the Lagrangian of the system with numbers for its parameters."""
+    """Return equations in the order q, v, from the Lagrangian with numbers for its parameters."""
     import heyoka
     import sympy
 
@@ -211,7 +212,7 @@ def _from_lagrangian(case: Case) -> list[Any]:
 
 
 def _n_bodies(case: Case) -> list[Any]:
-    """Heyoka's own N-body equations, in the order of the case: all positions, then all velocities."""
+    """Return heyoka's N-body equations in the order of the case: all positions, then all velocities."""
     import heyoka
 
     bodies = case.bodies
@@ -224,7 +225,7 @@ def _n_bodies(case: Case) -> list[Any]:
 
 
 def _quickest(contender: Contender) -> float:
-    """Seconds of the fastest of a few runs; infinite if they fail, as powers of a distance that is 0 make heyoka do."""
+    """Return the seconds of the fastest of a few runs; infinite if they fail (heyoka: powers of a zero distance)."""
     seconds = []
     for _ in range(TRIALS):
         integrate = contender.prepare(0)

@@ -1,4 +1,4 @@
-"""Accelerations written for any kind of number, turned into straight lines of Python text, for Numba to compile."""
+"""Conversion of accelerations, written for any kind of number, into straight-line Python source for Numba."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["rates_text"]
 
 
 class _Lines:
-    """Assignments, each operation once; stands for the module of functions as well."""
+    """Assignments with common subexpressions shared; also replaces the module of functions."""
 
     def __init__(self) -> None:
         self.names: dict[str, str] = {}
@@ -34,7 +34,7 @@ class _Lines:
 
 
 class _Traced:
-    """A number that writes down what is done with it."""
+    """Number that records the operations on it."""
 
     def __init__(self, lines: _Lines, text: str) -> None:
         self.lines, self.text = lines, text
@@ -67,7 +67,7 @@ class _Traced:
         return self.lines.add(f"-{self.text}")
 
     def __pow__(self, exponent: float) -> _Traced:
-        """Half-integer powers by a square root, which is several times faster than ``pow``."""
+        """Return half-integer powers by a square root, which is several times faster than ``pow``."""
         root = self.lines.sqrt(self)
         power = {0.5: root, 1.5: self * root}[abs(exponent)]
         return self.lines.add(f"1.0 / {power.text}") if exponent < 0 else power
@@ -78,7 +78,7 @@ def _text(value: object) -> str:
 
 
 def rates_text(rates: Rates, parameters: Mapping[str, float], size: int) -> str:
-    """Text of ``def rates(out, t, x, unused)``, which fills ``out`` with the derivative of ``x``."""
+    """Return the source of ``def rates(out, t, x, unused)``, which fills ``out`` with the derivative of ``x``."""
     lines = _Lines()
     results: list[Any] = rates([_Traced(lines, f"x[{n}]") for n in range(size)], parameters, lines)
     body = [f"{name} = {operation}" for operation, name in lines.names.items()]

@@ -1,4 +1,4 @@
-"""The chain-rule term that the printed SCVI lacks: derived, measured, drawn."""
+"""The chain-rule term missing from the printed SCVI: derivation, measurement, figure."""
 
 from __future__ import annotations
 

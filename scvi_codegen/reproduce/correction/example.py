@@ -1,7 +1,7 @@
-"""The pendulum with three points, twice: what the compiler derives, and the same by hand, to compare.
+"""The pendulum with three points: equations derived by the compiler, and by hand for comparison.
 
-By hand means: the generating function is written down in SymPy from the interpolant and the nodes, without any table of
-the compiler.
+By hand means: the generating function is formed in SymPy from the interpolant and the nodes, without any table of the
+compiler.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ PENDULUM = LagrangianSystem.from_text(
 
 @lru_cache(maxsize=2)
 def compiled(variational: bool) -> StepEquations:
-    """The compiler's equations of one step, SCVI(2) with two Gauss points, for L = q_dot^2/2 + cos(q)."""
+    """Return the compiler's equations of one step, SCVI(2) with two Gauss points, for L = q_dot^2/2 + cos(q)."""
     return derive(PENDULUM, SCVI(2, QUADRATURE, variational=variational), radicals=True)
 
 
 def two_points_agree() -> bool:
-    """Whether the printed (34d), (34e) with two points are the equations (27a), (27c) of SVI, derivatives of L_d."""
+    """Return True if the printed (34d), (34e) with two points equal (27a), (27c) of SVI, derivatives of L_d."""
     shooting = derive(PENDULUM, SCVI(1, QUADRATURE, variational=False))
     galerkin = derive(PENDULUM, SVI(1, QUADRATURE))
     return all(
@@ -56,7 +56,7 @@ def two_points_agree() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ByHand:
-    """One step by hand.
+    """Quantities of one step derived by hand.
 
     Attributes:
         curve: q(tau).
@@ -73,13 +73,13 @@ class ByHand:
 
     @property
     def generator(self) -> sympy.Expr:
-        """G = L_d + lambda . E."""
+        """Generating function G = L_d + lambda . E."""
         return self.action + lambda_1 * self.residuals[0] + lambda_2 * self.residuals[1]
 
 
 @lru_cache(maxsize=1)
 def by_hand() -> ByHand:
-    """Nodes -1, 0, 1; the slope at the middle and at the end of a parabola through three values, applied twice."""
+    """Return one step on the nodes -1, 0, 1: derivatives of the parabola through three values, applied twice."""
     curve = tau * (tau - 1) / 2 * q_k + (1 - tau**2) * Q_1 + tau * (tau + 1) / 2 * Q_2
     velocities = _slopes(q_k, Q_1, Q_2)
     accelerations = _slopes(v_0, *velocities)
@@ -96,7 +96,7 @@ def _slopes(start: sympy.Expr, middle: sympy.Expr, end: sympy.Expr) -> tuple[sym
 
 
 def largest_difference() -> float:
-    """Between the compiler's variational equations and the derivatives of G by hand, at some states."""
+    """Return the largest difference of the compiler's variational equations and the derivatives of G by hand."""
     generator, derived = by_hand().generator, compiled(variational=True)
     expected = {
         "34d": p_k + generator.diff(q_k),
@@ -114,7 +114,7 @@ def _states() -> list[dict[sympy.Symbol, sympy.Expr]]:
 
 
 def eliminated() -> dict[sympy.Symbol, sympy.Expr]:
-    """The multipliers from the compiler's rows dG/dQ and dG/dv0, with X for the derivative of L_d after Q_1."""
+    """Return the multipliers from the compiler's rows dG/dQ and dG/dv0, with X for dL_d/dQ_1."""
     derived = compiled(variational=True)
     rows = {e.number: e.residual for e in derived.equations if e.kind == "multiplier"}
     free = dict.fromkeys((lambda_1, lambda_2), 0)
@@ -125,14 +125,14 @@ def eliminated() -> dict[sympy.Symbol, sympy.Expr]:
 
 
 def _positive(fraction: sympy.Expr) -> sympy.Expr:
-    """With the constant of the denominator positive."""
+    """Return a fraction with a denominator whose constant term is positive."""
     numerator, denominator = sympy.fraction(sympy.together(fraction))
     sign = 1 if denominator.subs(h, 0) > 0 else -1
     return sympy.expand(sign * numerator) / sympy.expand(sign * denominator)
 
 
 def lost_terms() -> tuple[sympy.Expr, sympy.Expr]:
-    """What the compiler's variational (34d) and (34e) have more than the printed ones."""
+    """Return the terms of the compiler's variational (34d) and (34e) that the printed ones lack."""
     full, printed = compiled(variational=True), compiled(variational=False)
 
     def row(derived: StepEquations) -> sympy.Expr:
@@ -145,13 +145,13 @@ def lost_terms() -> tuple[sympy.Expr, sympy.Expr]:
 
 @dataclass(frozen=True, slots=True)
 class MiddleValue:
-    """The inner value Q_1 as a function of both ends, which here needs no multipliers.
+    """Inner value Q_1 as a function of both ends, which requires no multipliers here.
 
     Attributes:
-        condition: h^2 times the sum of the two collocation equations, in which v_0 cancels; it vanishes.
-        slopes: dQ_1/dq_k and dQ_1/dQ_2, from differentiating the condition.
-        inner: X = dL_d/dQ_1 from the compiler, with the condition used.
-        leading: its first term for small steps, with the position q and the velocity v.
+        condition: h^2 times the sum of the two collocation equations, in which v_0 cancels; it is 0.
+        slopes: dQ_1/dq_k and dQ_1/dQ_2, by implicit differentiation of the condition.
+        inner: X = dL_d/dQ_1 from the compiler, simplified with the condition.
+        leading: its leading term for small h, with position q and velocity v.
     """
 
     condition: sympy.Expr
@@ -162,7 +162,7 @@ class MiddleValue:
 
 @lru_cache(maxsize=1)
 def middle_value() -> MiddleValue:
-    """From the compiler's rows (34a) and dG/dQ."""
+    """Return the inner value from the compiler's rows (34a) and dG/dQ."""
     derived = compiled(variational=True)
     condition = sympy.expand(h**2 * sum(e.residual for e in derived.equations if e.number == "34a"))
     after_middle = condition.diff(Q_1)
@@ -176,7 +176,7 @@ def middle_value() -> MiddleValue:
 
 
 def multipliers_agree() -> bool:
-    """Whether the multipliers' terms are X dQ_1/dq_k and X dQ_1/dQ_2, the chain rule."""
+    """Return True if the multipliers' terms are X dQ_1/dq_k and X dQ_1/dQ_2, the chain rule."""
     X, multipliers = sympy.Symbol("X", real=True), eliminated()
     return all(
         sympy.simplify(lost.subs(multipliers) - X * slope) == 0

@@ -1,4 +1,4 @@
-"""An experiment that the paper does not have: why (34d) needs the chain-rule term, derived and measured."""
+"""Additional experiment: why (34d) needs the chain-rule term, derived and measured."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 __all__ = ["EXPERIMENTS", "ROWS", "measured"]
 
 ROWS = ((2, 2), (3, 2), (4, 3), (5, 4), (6, 5), (7, 6), (9, 7))
-"""(points, Gauss points)."""
+"""Numbers of points and of Gauss points."""
 NOISE = 1e-11
-"""Above what the measurement of a defect leaves of zero."""
+"""Upper bound on the measured symplecticity defect of a symplectic step."""
 SAME_EQUATIONS = 1e-11
 SETTLED = 7
-"""Points up to which the slope of the error settles before round-off."""
+"""Largest number of points for which the order shows above round-off."""
 SETTING = (
     "Not a figure of the paper. First the derivation, in general and for the pendulum with three points; then Kepler's "
     "problem: one step h = 0.3 from q = (0.3, 0.8), p = (-1.1, 0.4), derivatives of the step by central differences of "
@@ -39,7 +39,7 @@ SETTING = (
 
 
 def measured(points: int, gauss: int, *, variational: bool) -> Structure:
-    """Of one step of Kepler's problem."""
+    """Return the structure of one step of Kepler's problem."""
     return structure_of(SCVI(points - 1, f"gauss-legendre:{gauss}", variational=variational))
 
 
@@ -48,7 +48,7 @@ def _both(points: int, gauss: int) -> tuple[Structure, Structure]:
 
 
 def _promised(points: int, gauss: int) -> int:
-    """Min(p, q) of Theorem 4.1: the orders of spectral collocation and of the quadrature."""
+    """Return min(p, q) of Theorem 4.1: the orders of spectral collocation and of the quadrature."""
     return min(SpectralCollocation(points - 1).order or 0, 2 * gauss)
 
 
@@ -191,4 +191,4 @@ def _line(label: str) -> dict[str, Any]:
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(name="correction", title="Why (34d) needs the chain-rule term, derived and measured", run=_correction),
 )
-"""The one experiment."""
+"""The experiment of this package."""

@@ -1,4 +1,4 @@
-"""Why (34d) needs the chain-rule term: the page, in general and for the pendulum with three points."""
+"""Text of the experiment ``correction``: why (34d) needs the chain-rule term, in general and for the pendulum."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["body"]
 q_0, q_1, Q, p_0, p_1, J_0, J_1, X, tau = sympy.symbols("q_0 q_1 Q p_0 p_1 J_0 J_1 X tau", real=True)
 G, L_d, xi, inner = sympy.Function("G"), sympy.Function("L_d"), sympy.Function("xi"), sympy.Function("Q")
 BIG_O = sympy.Function("O")
-"""SymPy's own would try to simplify."""
+"""Unevaluated O(.); SymPy's own would simplify."""
 ENDS = G(q_0, q_1)
 ACTION = L_d(q_0, Q, q_1)
 INNER = inner(q_0, q_1)
 
 
 def body() -> tuple[Block, ...]:
-    """The whole page."""
+    """Return all blocks of the page."""
     return (
         *_generating_function(),
         *_chain_rule(),

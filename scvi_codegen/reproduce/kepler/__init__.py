@@ -1,1 +1,1 @@
-"""The paper's figures on Kepler's problem."""
+"""Figures of the paper on Kepler's problem."""

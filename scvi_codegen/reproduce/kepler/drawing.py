@@ -1,4 +1,4 @@
-"""Orbits of Kepler's problem on axes."""
+"""Plots of Kepler orbits."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ Array = NDArray[np.float64]
 
 
 def draw_states(axes: Axes, q: Array, scheme: str, label: str | None = None) -> None:
-    """Positions of a long run as dots, pixels also in SVG."""
+    """Draw positions of a long run as dots, rasterised also in SVG."""
     style: dict[str, Any] = {"color": COLORS[scheme], "markersize": 1.2, "rasterized": True}
     axes.plot(q[:, 0], q[:, 1], ".", label=label or scheme, **style)
 
 
 def draw_ellipse(axes: Axes, e: float) -> None:
-    """The exact orbit."""
+    """Draw the exact orbit."""
     axes.plot(*ellipse(e), color="black", linewidth=0.8, label="exact")

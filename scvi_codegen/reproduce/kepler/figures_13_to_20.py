@@ -1,6 +1,6 @@
 """Section 3.3.4: SVI and SC on Kepler's problem.
 
-Figs. 13-15, long runs, are here; 16 and 17 in :mod:`.more_points`, 18-20 in :mod:`.smaller_steps`.
+This module has Figs. 13-15, long runs; 16 and 17 are in :mod:`.more_points`, 18-20 in :mod:`.smaller_steps`.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ Array = NDArray[np.float64]
 
 ECCENTRICITY, STEP, SPAN = 0.5, 0.2, 2000.0
 DEGREE = 5
-"""Six Chebyshev points."""
+"""Degree of six Chebyshev points."""
 SCHEMES = ("SVI", "SC")
 VISIBLE = 0.01
-"""What can be seen in a picture of the orbit, in semi-major axes."""
+"""Smallest distance that is visible in a plot of the orbit, in semi-major axes."""
 ROUNDOFF_OF_A_RUN = 1e-12
 SETTING = (
     "Kepler's problem, e = 0.5, from the perihelion, h = 0.2, T = 2000 (10000 steps, 318 revolutions), six Chebyshev "
@@ -52,7 +52,7 @@ SETTING = (
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """A run in numbers: errors of energy, momentum and orbit, each the largest, and of the last position."""
+    """Largest errors of energy, momentum and orbit of a run, and the error of the last position."""
 
     energy: float
     last_energy: float
@@ -64,7 +64,7 @@ class Numbers:
 
 @lru_cache(maxsize=8)
 def _run(scheme: str, degree: int = DEGREE) -> tuple[Array, Array, Array, Array]:
-    """(t, q, p, energy) over the whole span."""
+    """Return (t, q, p, energy) over the whole span."""
     method = SVI(degree) if scheme == "SVI" else SpectralCollocation(degree)
     found = trajectory(SYSTEM, method, *perihelion(ECCENTRICITY), h=STEP, span=SPAN)
     return found.t, found.q, found.p, found.energy()
@@ -72,7 +72,7 @@ def _run(scheme: str, degree: int = DEGREE) -> tuple[Array, Array, Array, Array]
 
 @lru_cache(maxsize=8)
 def numbers(scheme: str, degree: int = DEGREE) -> Numbers:
-    """Of :func:`_run`."""
+    """Return the errors of :func:`_run`."""
     t, q, p, energy = _run(scheme, degree)
     momentum = angular_momentum(q, p)
     exact, _ = exact_flow(*perihelion(ECCENTRICITY), t[-1])
@@ -137,7 +137,7 @@ def _figure_13(_: Mapping[str, Result]) -> Result:
 
 
 def _draw_orbits(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> None:
-    """The orbits, and what they do not show: the distance from the ellipse."""
+    """Draw the orbits, and the distance from the ellipse, which they do not show."""
     *orbits, distance = panels(figure, 1, 3)
     for axes, (scheme, (t, q)) in zip(orbits, runs.items(), strict=True):
         draw_states(axes, q, scheme)
@@ -194,7 +194,7 @@ def _figure_15(_: Mapping[str, Result]) -> Result:
 
 
 def _draw_invariant(figure: Figure, t: Array, values: Mapping[str, Array], name: str) -> None:
-    """As the paper draws it, and the error on a log axis, which shows what the paper's axes hide."""
+    """Draw an invariant as in the paper, and its error on a logarithmic axis."""
     left, right = panels(figure, 1, 2)
     every = 4
     for scheme in reversed(SCHEMES):

@@ -1,7 +1,7 @@
 """Section 4.3.2: SCVI on Kepler's problem.
 
-Figs. 23-26, with two points, are here. With more points the printed equations and the variational ones part: Fig. 27 in
-:mod:`.phase_plane`, Figs. 28-30 in :mod:`.many_points`.
+This module has Figs. 23-26, with two points. With more points the printed and the variational equations differ: Fig. 27
+is in :mod:`.phase_plane`, Figs. 28-30 in :mod:`.many_points`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LONG_STEP = math.pi / 20
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """Positions of some successive steps, the range of their energies, and the largest error of the momentum."""
+    """Positions of consecutive steps, the range of their energies, and the largest error of the momentum."""
 
     q: Array
     lowest: float
@@ -54,7 +54,7 @@ class Segment:
 
 @lru_cache(maxsize=1)
 def segments() -> tuple[Segment, ...]:
-    """Of one run of 400000 steps, only the steps that are drawn."""
+    """Return the steps that are drawn, of one run of 400000 steps."""
     stepper = stepper_of(SYSTEM, TWO_POINTS)
     q, velocity = perihelion(ECCENTRICITY)
     run = stepper.start(q, stepper.momentum(q, velocity), h=LONG_STEP, options=SECTION_4)
@@ -122,7 +122,7 @@ SETTING = (
     QUADRATURE,
 )
 FACTOR = 2.5, 3.0
-"""What "almost three" is taken to mean."""
+"""Range of factors that counts as "almost three"."""
 
 
 @lru_cache(maxsize=2)
@@ -132,12 +132,12 @@ def _run(scheme: str) -> Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Durations of the first and the last full revolution (from one greatest distance to the next).
+    """Durations of the first and the last full revolution, from apocentre to apocentre.
 
     Attributes:
-        first, last: the durations.
-        kepler: the period of an exact orbit of the last energy.
-        turn: of the perihelion, in radians over the whole run.
+        first, last: durations.
+        kepler: period of an exact orbit of the last energy.
+        turn: rotation of the perihelion over the whole run, in radians.
     """
 
     first: float
@@ -147,13 +147,13 @@ class Periods:
 
     @property
     def factor(self) -> float:
-        """By which the period has shrunk from that of the exact orbit."""
+        """Ratio of the period of the exact orbit to the last period."""
         return 2 * math.pi / self.last
 
 
 @lru_cache(maxsize=2)
 def periods(scheme: str) -> Periods:
-    """Of ``"SCVI"`` with two points or of ``"SC"`` with three."""
+    """Return the periods of ``"SCVI"`` with two points or of ``"SC"`` with three."""
     run = _run(scheme)
     durations = revolutions(run.t, run.q, run.p)
     energy = float(run.energy()[-1])
@@ -167,7 +167,7 @@ def periods(scheme: str) -> Periods:
 
 @lru_cache(maxsize=1)
 def two_points_fail_at() -> tuple[float, float]:
-    """(time, energy) of the last state of SC with two points; the whole span if it gets there."""
+    """Return (time, energy) of the last state of SC with two points; the end of the span if it succeeds."""
     try:
         run = trajectory(
             SYSTEM, SpectralCollocation(1), *perihelion(ECCENTRICITY), h=STEP, span=SPAN, options=SECTION_4
@@ -232,7 +232,7 @@ def _figure_24(_: Mapping[str, Result]) -> Result:
 
 
 def _draw_periods(figure: Figure, runs: Mapping[str, tuple[Array, Array]]) -> None:
-    """All 30 periods on the left, the last 2 pi on the right."""
+    """Draw all 30 periods on the left, the last 2 pi on the right."""
     axes = panels(figure, 2, 2)
     for row, (scheme, (t, q)) in enumerate(runs.items()):
         whole, last = axes[2 * row], axes[2 * row + 1]

@@ -1,7 +1,7 @@
-"""SCVI as printed and in variational form on Kepler's problem: runs, and the structure of one step, side by side.
+"""SCVI as printed and in variational form on Kepler's problem: runs, and the structure of one step.
 
-With two points both are one map. With more, the printed (34d) and (34e) lack the chain-rule term: see the experiment
-``correction``.
+With two points both are the same map. With more, the printed (34d) and (34e) lack the chain-rule term: see the
+experiment ``correction``.
 """
 
 from __future__ import annotations
@@ -46,25 +46,25 @@ TWO_FORMS = (
     "SCVI is run twice: as printed, (34a)-(34e), and in variational form, with the chain-rule term in (34d), (34e)."
 )
 KEPT = 0.05
-"""The energy error up to which a phase trajectory is called preserved: a tenth of the semi-major axis."""
+"""Largest energy error at which a phase trajectory counts as preserved: a tenth of the semi-major axis."""
 SYMPLECTIC = 1e-11
-"""Above the noise of the differences."""
+"""Largest defect of a symplectic step, above the noise of the differences."""
 
 
 def shooting(points: int, gauss: int, form: str) -> SCVI:
-    """SCVI with so many Chebyshev and Gauss points."""
+    """Return SCVI with given numbers of Chebyshev and Gauss points."""
     return SCVI(points - 1, f"gauss-legendre:{gauss}", variational=form == VARIATIONAL)
 
 
 @dataclass(frozen=True, slots=True)
 class Orbit:
-    """A run and its largest errors; ``failed`` where a step had no solution before the end.
+    """Run and its errors over time.
 
     Attributes:
-        run: the states.
+        run: states.
         energy, momentum: errors over time.
-        turn: of the perihelion, in radians a revolution.
-        failed: whether it ended early.
+        turn: rotation of the perihelion, in radians per revolution.
+        failed: True if a step had no solution before the end.
     """
 
     run: Trajectory
@@ -75,24 +75,24 @@ class Orbit:
 
     @property
     def largest(self) -> tuple[float, float]:
-        """Errors of (energy, momentum)."""
+        """Largest errors of energy and momentum."""
         return float(np.abs(self.energy).max()), float(np.abs(self.momentum).max())
 
     @property
     def lost(self) -> float:
-        """The first time at which the energy is off by a tenth, or the last time."""
+        """First time at which the energy is off by a tenth, or the last time."""
         off = np.flatnonzero(np.abs(self.energy) > KEPT)
         return float(self.run.t[off[0]]) if len(off) else self.end
 
     @property
     def end(self) -> float:
-        """The time of the last state."""
+        """Time of the last state."""
         return float(self.run.t[-1])
 
 
 @lru_cache(maxsize=16)
 def orbit_of(method: Method, h: float, span: float, e: float = ECCENTRICITY) -> Orbit:
-    """From the perihelion, with the tolerance of section 4."""
+    """Return the orbit from the perihelion, with the tolerance of section 4."""
     failed = False
     try:
         run = trajectory(SYSTEM, method, *perihelion(e), h=h, span=span, options=SECTION_4, solver=_solver(method))
@@ -108,7 +108,7 @@ def _solver(method: Method) -> str:
 
 
 def structure_table(points: int, gauss: tuple[int, ...]) -> TableBlock:
-    """Symplecticity defect, change of momentum and order of both forms."""
+    """Return symplecticity defect, change of momentum and order of both forms."""
 
     def row(count: int, form: str) -> tuple[str | int | float, ...]:
         found = structure_of(shooting(points, count, form))
@@ -123,7 +123,7 @@ def structure_table(points: int, gauss: tuple[int, ...]) -> TableBlock:
 
 
 def structure_check(points: int, gauss: tuple[int, ...], form: str) -> Comparison:
-    """Whether one form is symplectic."""
+    """Return the check that one form is symplectic."""
     found = [structure_of(shooting(points, count, form)) for count in gauss]
     defects = ", ".join(f"{structure.defect:.1e}" for structure in found)
     orders = ", ".join(f"{structure.order:.1f}" for structure in found)

@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 FORM_COLORS = {PRINTED: "printed", VARIATIONAL: "SCVI"}
 EXACT_MOMENTUM = 1e-11
-"""Above the rounding of 4200 steps."""
+"""Largest momentum error due to round-off over 4200 steps."""
 NINE, GAUSS, SPAN = 9, (5, 6, 7), 400 * math.pi
 SETTING = (
     "Kepler's problem, e = 0.5, from the perihelion, h = 0.3, T = 400 pi (200 periods): SCVI with nine Chebyshev "
@@ -165,7 +165,7 @@ def _figure_30(_: Mapping[str, Result]) -> Result:
 
 
 def _bounded_check(form: str, energies: list[Array]) -> Comparison:
-    """A bounded error is as large in the second half as in the first."""
+    """Return the check that the error is as large in the second half of a run as in the first."""
     growth = [float(np.abs(e[len(e) // 2 :]).max() / np.abs(e[: len(e) // 2]).max()) for e in energies]
     return Comparison(
         claim=f"The energy error of SCVI remains bounded ({form}).",

@@ -1,8 +1,8 @@
-"""Figs. 16 and 17: the error of a single step of Kepler's problem when points are added.
+"""Figs. 16 and 17: error of a single step of Kepler's problem over the number of points.
 
-The captions do not name the eccentricity. The lines that the paper draws along its curves have the slopes and the sizes
-of the errors on the circle, e = 0. The same is run, and judged, with e = 0.2 and 0.5, the eccentricities of Table 8 and
-of Figs. 13-15, where the errors are others.
+The captions do not state the eccentricity. The lines in the paper have the slopes and sizes of the errors on the
+circle, e = 0. The errors for e = 0.2 and 0.5, the eccentricities of Table 8 and of Figs. 13-15, differ; they are
+computed and judged, too.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ LONG_STEP = 5.0
 POINTS = (8, 9, 10, 11, 12, 14, 16, 18, 20, 22)
 N = np.array(POINTS, dtype=float)
 JUDGED = CIRCLE, 0.2, ELLIPSE
-"""The eccentricities that are run; verdicts are on all of them."""
+"""Eccentricities that are run; verdicts require all of them."""
 PAPER_BASES: Mapping[tuple[str, str], Line] = {
     ("SC", "q1"): (1e7, 0.1),
     ("SC", "q2"): (1e7, 0.1),
@@ -57,7 +57,7 @@ PAPER_BASES: Mapping[tuple[str, str], Line] = {
     ("SC", "energy"): (1e6, 0.1),
     ("SVI", "energy"): (1e13, 0.004),
 }
-"""(c, b) of the lines c b^N drawn by the paper."""
+"""Constants (c, b) of the lines c b^N in the paper."""
 N_SETTING = (
     "Kepler's problem, one step h = 5 from the perihelion, N = 8, 10, ..., 22 Chebyshev points, which is degree N - 1; "
     "SVI has N - 1 Gauss points. The error is that at the end of the step.",
@@ -69,13 +69,13 @@ N_SETTING = (
 
 
 def _errors(scheme: str, e: float, quantity: str) -> Array:
-    """Over :data:`POINTS`; NaN where a step has no solution."""
+    """Return the errors over :data:`POINTS`; NaN if a step has no solution."""
     found = (one_step(scheme, points - 1, e, LONG_STEP) for points in POINTS)
     return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in found])
 
 
 def bases(scheme: str, e: float, quantity: str) -> Line | None:
-    """(c, b) of the line c b^N fitted to the errors inside the window; ``None`` with fewer than three of them."""
+    """Return (c, b) of the line c b^N fitted to the errors inside the window; ``None`` for fewer than three."""
     return fitted_line(N, _errors(scheme, e, quantity))
 
 
@@ -96,7 +96,7 @@ def _n_refinement(name: str, quantities: tuple[str, str], title: str, _: Mapping
 
 
 def _curves_with_errors(quantities: tuple[str, str], e: float) -> list[tuple[str, str]]:
-    """(scheme, quantity) of curves with a line; SVI keeps the momentum."""
+    """Return (scheme, quantity) of curves with a fitted line; SVI conserves the momentum."""
     return [(s, q) for q in quantities for s in SCHEMES if bases(s, e, q)]
 
 
@@ -137,7 +137,7 @@ def _check_bases(quantities: tuple[str, str]) -> Comparison:
 
 
 def _check_lines(quantities: tuple[str, str]) -> Comparison:
-    """Which eccentricity the lines of the paper belong to."""
+    """Return the check which eccentricity the lines of the paper match."""
     off = {e: _distance_from_lines(quantities, e) for e in JUDGED}
     return Comparison(
         claim="The lines c b^N run along the errors.",
@@ -149,7 +149,7 @@ def _check_lines(quantities: tuple[str, str]) -> Comparison:
 
 
 def _distance_from_lines(quantities: tuple[str, str], e: float) -> float:
-    """The median factor by which errors inside the window are above or below their line."""
+    """Return the median factor between errors inside the window and their line."""
     return typical(factors(N, _errors(s, e, q), line) for (s, q), line in PAPER_BASES.items() if q in quantities)
 
 
@@ -200,7 +200,7 @@ def _n_curves(quantities: tuple[str, str]) -> Curves:
 
 
 def _draw_n(figure: Figure, curves: Curves) -> None:
-    """The lines of the paper are named where they belong, on the circle."""
+    """Draw the errors; lines of the paper are labelled on the circle, which they match."""
     for axes, ((e, quantity), errors) in zip(panels(figure, len(JUDGED), 2), curves.items(), strict=True):
         for scheme, values in errors.items():
             shown = np.where(values > 0, values, np.nan)

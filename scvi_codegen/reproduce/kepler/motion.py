@@ -1,7 +1,7 @@
-"""Kepler's problem with mu = 1: the exact flow, and what is measured on an orbit.
+"""Kepler's problem with mu = 1: exact flow, and quantities measured on an orbit.
 
-The paper's "analytic solution" of section 2.2 puts the time where the eccentric anomaly belongs; here Kepler's equation
-is solved.
+The "analytic solution" in section 2.2 of the paper has the time in place of the eccentric anomaly; here Kepler's
+equation is solved.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 SYSTEM = kepler()
-"""q'' = -q / |q|^3, built once."""
+"""System q'' = -q / |q|^3, built once."""
 
 NEWTON_STEPS = 60
 
 
 def perihelion(e: float) -> tuple[Pair, Pair]:
-    """(q, v) nearest to the centre, on the orbit of semi-major axis 1 (energy -1/2, period 2 pi) and eccentricity e."""
+    """Return (q, v) at perihelion for semi-major axis 1 (energy -1/2, period 2 pi) and eccentricity e."""
     return (1.0 - e, 0.0), (0.0, math.sqrt((1.0 + e) / (1.0 - e)))
 
 
 def exact_flow(q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
-    """(q, p) after times t, one row each, by Kepler's equation for the change x of the eccentric anomaly."""
+    """Return (q, p) after times t, one row each, from Kepler's equation for the change x of the eccentric anomaly."""
     start, velocity = np.asarray(q, dtype=float), np.asarray(p, dtype=float)
     times = np.atleast_1d(np.asarray(t, dtype=float))
     r0 = float(np.hypot(*start))
@@ -56,27 +56,27 @@ def exact_flow(q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
 
 
 def ellipse(e: float) -> tuple[Array, Array]:
-    """The curve of the exact orbit from :func:`perihelion`."""
+    """Return points of the exact orbit from :func:`perihelion`."""
     anomaly = np.linspace(0.0, 2 * np.pi, 361)
     return np.cos(anomaly) - e, math.sqrt(1 - e * e) * np.sin(anomaly)
 
 
 def angular_momentum(q: Array, p: Array) -> Array:
-    """M = q1 p2 - q2 p1, along the last axis."""
+    """Return M = q1 p2 - q2 p1, along the last axis."""
     found: Array = q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]
     return found
 
 
 def off_ellipse(q: Array, e: float) -> Array:
-    """How far positions lie outside the exact orbit: half the sum of the distances to its foci, less 1."""
+    """Return the distance of positions outside the exact orbit: half the sum of the distances to its foci, less 1."""
     found: Array = (np.hypot(q[:, 0], q[:, 1]) + np.hypot(q[:, 0] + 2 * e, q[:, 1])) / 2 - 1
     return found
 
 
 def perihelion_turn(q: Array, p: Array) -> float:
-    """The angle (radians) by which the perihelion has turned from the first state to the last, whole turns included.
+    """Return the angle in radians by which the perihelion has rotated, whole turns included.
 
-    It is the direction of the Laplace-Runge-Lenz vector p x M - q / |q|, which stands still on exact orbits.
+    It is the direction of the Laplace-Runge-Lenz vector p x M - q / |q|, which is constant on exact orbits.
     """
     m, r = angular_momentum(q, p), np.hypot(q[:, 0], q[:, 1])
     angle = np.unwrap(np.arctan2(-p[:, 0] * m - q[:, 1] / r, p[:, 1] * m - q[:, 0] / r))
@@ -84,7 +84,7 @@ def perihelion_turn(q: Array, p: Array) -> float:
 
 
 def revolutions(t: Array, q: Array, p: Array) -> Array:
-    """How long each revolution took, from one greatest distance to the next: q . p falls through 0 there."""
+    """Return the duration of each revolution, from apocentre to apocentre, where q . p changes sign."""
     outward = (q * p).sum(axis=1)
     before = np.flatnonzero((outward[:-1] > 0) & (outward[1:] <= 0))
     share = outward[before] / (outward[before] - outward[before + 1])

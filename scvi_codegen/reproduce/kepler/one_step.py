@@ -1,4 +1,4 @@
-"""The error of a single step from the perihelion, in double precision and in 60 digits; SVI against SC."""
+"""Errors of a single step from the perihelion, in double precision and in 60 digits, of SVI and SC."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ Array = NDArray[np.float64]
 SCHEMES = ("SVI", "SC")
 LABELS = {"q1": "$q_1$", "q2": "$q_2$", "momentum": "angular momentum", "energy": "energy"}
 CIRCLE, ELLIPSE = 0.0, 0.5
-"""The eccentricities that are run."""
+"""Eccentricities that are run."""
 
 MOSTLY = 0.9
-"""The share of comparisons from which on a claim holds in part."""
+"""Least share of comparisons at which a claim holds in part."""
 ROUNDOFF = 1e-13
-"""Of the error of a step."""
+"""Round-off level of the error of a step."""
 TO_ROUNDOFF = SolverOptions(max_iterations=1000)
 SLOPE_STEPS = ("0.05", "0.025")
-"""Times (1 - e)^(3/2), the time scale at the perihelion."""
+"""Step sizes in units of (1 - e)^(3/2), the time scale at perihelion."""
 NEGLIGIBLE = mp.mpf(10) ** (5 - DIGITS)
 
 
 class StepErrors(NamedTuple):
-    """Of the four quantities of Figs. 16-20, absolute values."""
+    """Absolute errors of the four quantities of Figs. 16-20."""
 
     q1: float
     q2: float
@@ -63,7 +63,7 @@ QUANTITIES = StepErrors._fields
 
 @lru_cache(maxsize=4096)
 def one_step(scheme: str, degree: int, e: float, h: float) -> StepErrors | None:
-    """Errors of the compiled step of h from the perihelion; ``None`` where it finds no solution."""
+    """Return the errors of the compiled step of h from the perihelion; ``None`` if it has no solution."""
     stepper = stepper_of(SYSTEM, SVI(degree) if scheme == "SVI" else SpectralCollocation(degree), "newton")
     q0, v0 = perihelion(e)
     try:
@@ -77,10 +77,10 @@ def one_step(scheme: str, degree: int, e: float, h: float) -> StepErrors | None:
 
 @lru_cache(maxsize=64)
 def slopes(scheme: str, degree: int, e: float) -> tuple[float | None, ...]:
-    """The power of h with which each error falls as h goes to 0; ``None`` where the error is below 1e-55.
+    """Return the order in h of each error as h goes to 0; ``None`` for an error below 1e-55.
 
-    In 60 digits, as Runge-Kutta methods: an SVI with as many Gauss points as its degree is Gauss collocation, SC is
-    collocation on its nodes.
+    Steps are computed in 60 digits, as Runge-Kutta methods: an SVI with as many Gauss points as its degree is Gauss
+    collocation, SC is collocation on its nodes.
     """
     tableau = Gauss(degree).tableau if scheme == "SVI" else SpectralCollocation(degree).tableau
     scale = (1 - mp.mpf(e)) ** 1.5
@@ -106,7 +106,7 @@ Vector = tuple[Number, Number]
 
 
 def _runge_kutta(tableau: Tableau, q: Vector, v: Vector, h: Number) -> tuple[Vector, Vector]:
-    """One step of q'' = -q / |q|^3 by fixed-point iteration, which gains two digits or more a turn at these h."""
+    """Return one step of q'' = -q / |q|^3 by fixed-point iteration, which gains at least two digits per iteration."""
     rows = [*tableau.A, tableau.b]
     accelerations = [(mp.zero, mp.zero)] * len(tableau.b)
     for _ in range(DIGITS // 2):
@@ -127,13 +127,13 @@ def _attraction(q: Vector) -> Vector:
 
 
 def shares_won(svi: Array, sc: Array, *, roundoff: float = ROUNDOFF) -> tuple[int, int]:
-    """(how often the error of SVI is smaller, out of how many), where that of SC is above round-off."""
+    """Return how often the error of SVI is smaller, and the number of comparisons with SC above round-off."""
     counted = np.isfinite(svi) & (sc > roundoff)
     return int((svi[counted] < sc[counted]).sum()), int(counted.sum())
 
 
 def superiority(won: list[tuple[int, int]], *, otherwise: str = "") -> Comparison:
-    """Conclusion (ii), from counts of :func:`shares_won`; ``otherwise`` says where SVI is not better."""
+    """Return the check of conclusion (ii) from counts of :func:`shares_won`; ``otherwise`` names exceptions."""
     smaller, all_ = (sum(column) for column in zip(*won, strict=True))
     mostly = MOSTLY * all_ <= smaller < all_
     return Comparison(

@@ -1,4 +1,4 @@
-"""Figures 1 and 2: four methods on Kepler's problem; the points of a step, and why they are not equally spaced."""
+"""Figures 1 and 2: four methods on Kepler's problem; nodes of a step, and why they are not equispaced."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PERIOD = 2.0 * math.pi
 
 @dataclass(frozen=True, slots=True)
 class PaperRun:
-    """A method with its step, and the name of its colour."""
+    """Method with its step size, and the name of its colour."""
 
     method: Method
     h: float
@@ -70,7 +70,7 @@ RUNS = {
     "Chebyshev collocation": PaperRun(SpectralCollocation(4), 0.25, "SC"),
 }
 SAME_AREA = 0.03
-"""Relative change of the mean area over three revolutions that counts as none."""
+"""Largest relative change of the mean area over three revolutions that counts as constant."""
 
 
 @lru_cache
@@ -80,14 +80,14 @@ def _orbit(name: str) -> Trajectory:
 
 
 def _ellipse_area(run: Trajectory) -> Array:
-    """The area pi a b of the ellipse on which each state would go on: a = -1/(2 E), b = M sqrt(a)."""
+    """Return the area pi a b of the osculating ellipse of each state: a = -1/(2 E), b = M sqrt(a)."""
     momentum = run.q[:, 0] * run.p[:, 1] - run.q[:, 1] * run.p[:, 0]
     area: Array = np.pi * np.abs(momentum) * (-2.0 * run.energy()) ** -1.5
     return area
 
 
 def _area_change(run: Trajectory) -> float:
-    """The mean area over the last three periods over that of the first three, less 1."""
+    """Return the mean area over the last three periods relative to the first three, less 1."""
     area, count = _ellipse_area(run), round(3.0 * PERIOD / run.h)
     return float(area[-count:].mean() / area[:count].mean()) - 1.0
 
@@ -153,7 +153,7 @@ def _accuracy(errors: Mapping[str, Array]) -> Comparison:
 
 
 def _printed_solution() -> Comparison:
-    """Whether (cos t - e, sqrt(1 - e^2) sin t) has the initial velocity and the acceleration of a solution."""
+    """Return the check that (cos t - e, sqrt(1 - e^2) sin t) is a solution with the initial velocity."""
     minor = math.sqrt(1.0 - ECCENTRICITY**2)
     t = np.linspace(0.0, PERIOD, 400)
     q = np.array([np.cos(t) - ECCENTRICITY, minor * np.sin(t)])
@@ -248,14 +248,14 @@ def _numbers(points: Vector) -> Array:
 
 
 def _interpolated(points: Vector, values: Array, at: Array) -> Array:
-    """The polynomial through ``values`` at ``points``, evaluated at ``at``."""
+    """Return the values at ``at`` of the polynomial through ``values`` at ``points``."""
     table = np.array([_numbers(row) for row in cardinal_values(points, [float(x) for x in at])])
     result: Array = table @ values
     return result
 
 
 def _interpolation_error(family: str, count: int) -> float:
-    """Of Runge's function on [-1, 1], the largest at 101 points."""
+    """Return the largest interpolation error of Runge's function on [-1, 1] at 101 points."""
     points, at = FAMILIES[family](count - 1).points, np.linspace(-1.0, 1.0, 101)
     return largest(_interpolated(points, _runge(_numbers(points)), at) - _runge(at))
 

@@ -84,7 +84,7 @@ def _figure_27(_: Mapping[str, Result]) -> Result:
 
 
 def _with_less_eccentricity() -> str:
-    """What the printed form does on a rounder orbit, in case the paper's was one."""
+    """Return the errors of the printed form on an orbit of smaller eccentricity, as text."""
     energy, momentum = orbit_of(METHODS[PRINTED_NAME][0], STEP, SPAN, ROUNDER).largest
     return f" With e = {ROUNDER:g}: energy {energy:.1e}, momentum {momentum:.1e}."
 

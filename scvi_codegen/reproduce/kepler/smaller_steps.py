@@ -1,8 +1,8 @@
-"""Figs. 18-20: the error of a single step of Kepler's problem over the step.
+"""Figs. 18-20: error of a single step of Kepler's problem over the step size.
 
-The captions name neither the eccentricity nor, without doubt, what "N" counts. The lines of Fig. 18 tell: they have the
-slopes and the sizes of the errors on the circle, e = 0, with N points, which is degree N - 1. The same is run with
-e = 0.5, the eccentricity of Figs. 13-15, and there N is read as the degree.
+The captions state neither the eccentricity nor, unambiguously, what "N" counts. The lines of Fig. 18 have the slopes
+and sizes of the errors on the circle, e = 0, with N points, which is degree N - 1. The same is run with e = 0.5, the
+eccentricity of Figs. 13-15, where N is read as the degree.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ PAPER_POWERS: Mapping[str, tuple[Line, ...]] = {
     "q1": ((1.5, 2), (1e-2, 4), (1e-5, 6), (1e-4, 8), (1e-8, 12)),
     "q2": ((1.5, 3), (1e-2, 5), (1e-5, 7), (1e-7, 10)),
 }
-"""(c, p) of the lines c h^p drawn by the paper in Fig. 18."""
+"""Constants (c, p) of the lines c h^p in Fig. 18 of the paper."""
 H_SETTING = (
     "Kepler's problem, one step of h = 0.001 to 3 from the perihelion; SVI has as many Gauss points as its degree. The "
     "error is that at the end of the step.",
@@ -92,7 +92,7 @@ def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping
 
 
 def _check_powers() -> Comparison:
-    """Whether the powers of the paper's lines are those of the circle with N points."""
+    """Return the check that the exponents of the paper's lines are those of the circle with N points."""
     _, e, degree = READINGS[0]
     found = {
         quantity: {round(_slope(s, degree(n), e, quantity) or 0) for n in LEGEND for s in SCHEMES}
@@ -115,7 +115,7 @@ def _listed(powers: set[int]) -> str:
 
 
 def _check_slopes(quantity: str) -> Comparison:
-    """The slopes of both readings; an SVI keeps the momentum in any case."""
+    """Return the check of the orders in both readings; an SVI conserves the momentum in any case."""
     e_and_degrees = [(e, degree(n)) for _, e, degree in READINGS for n in LEGEND]
     exact = all(_slope("SVI", d, e, quantity) is None for e, d in e_and_degrees)
     faster = all((_slope("SVI", d, e, quantity) or 99) > (_slope("SC", d, e, quantity) or 0) for e, d in e_and_degrees)

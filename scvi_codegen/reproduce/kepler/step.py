@@ -1,4 +1,4 @@
-"""The structure of one step of Kepler's problem: what it does to dq ^ dp and to the angular momentum, and its order."""
+"""Structure of one step of Kepler's problem: symplectic form, angular momentum, and order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["STATE", "STEP", "Structure", "structure_of", "symplecticity_defect"]
 Array = NDArray[np.float64]
 
 STATE = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
-"""(q, p) off the symmetry axes of the orbit (eccentricity 0.17), so that no error vanishes by symmetry."""
+"""State (q, p) off the symmetry axes of the orbit (eccentricity 0.17), so that no error vanishes by symmetry."""
 STEP = 0.3
 SPAN = 2.4
 STEPS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
@@ -28,17 +28,17 @@ ABOVE_ROUNDOFF = 1e-13
 POINTS_OF_A_SLOPE = 3
 SLOPE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 WIDTH = 2e-3
-"""Of central differences of order six; round-off and truncation are then both near 1e-13."""
+"""Width of central differences of order six; round-off and truncation are then both near 1e-13."""
 
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What a step keeps.
+    """Structure of a step.
 
     Attributes:
-        defect: max |J^T Omega J - Omega|, J the derivative of the step; 1e-13 is the noise of its measurement.
+        defect: max |J^T Omega J - Omega|, J the Jacobian of the step; its measurement has noise 1e-13.
         momentum: change of the angular momentum in the step.
-        order: slope of the error over h, where it is above round-off.
+        order: slope of the error over h, above round-off.
     """
 
     defect: float
@@ -48,7 +48,7 @@ class Structure:
 
 @lru_cache(maxsize=64)
 def structure_of(method: Method) -> Structure:
-    """One step of :data:`STEP` from :data:`STATE`, and runs over 2.4 for the order."""
+    """Return the structure of one step of :data:`STEP` from :data:`STATE`; the order is from runs over 2.4."""
     stepper = stepper_of(SYSTEM, method, "newton")
     q, p = stepper.step(*STATE, STEP)
     return Structure(
@@ -59,7 +59,7 @@ def structure_of(method: Method) -> Structure:
 
 
 def symplecticity_defect(stepper: Stepper, q: Array, p: Array, h: float) -> float:
-    """Max |J^T Omega J - Omega| of the step of h from (q, p)."""
+    """Return max |J^T Omega J - Omega| of the step of h from (q, p)."""
     m = len(q)
     jacobian = _jacobian(lambda z: np.concatenate(stepper.step(z[:m], z[m:], h)), np.concatenate([q, p]))
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m))
@@ -75,7 +75,7 @@ def _jacobian(step: Callable[[Array], Array], state: Array) -> Array:
 
 
 def _order(stepper: Stepper) -> float:
-    """The slope through the smallest errors that are still above round-off."""
+    """Return the slope through the smallest errors that are above round-off."""
     errors = {steps: error for steps in STEPS if (error := _error(stepper, steps)) > ABOVE_ROUNDOFF}
     smallest: Sequence[int] = sorted(errors)[-POINTS_OF_A_SLOPE:]
     slope, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([errors[n] for n in smallest]), 1)
@@ -83,7 +83,7 @@ def _order(stepper: Stepper) -> float:
 
 
 def _error(stepper: Stepper, steps: int) -> float:
-    """Of the state after :data:`SPAN`; 0 where a step fails, so that it is left out."""
+    """Return the error of the state after :data:`SPAN`; 0, which is ignored, if a step fails."""
     try:
         run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, every=steps)
     except StepFailedError:

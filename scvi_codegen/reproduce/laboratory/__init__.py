@@ -1,1 +1,1 @@
-"""What every experiment is made with: results, drawings, plain implementations to compare with."""
+"""Components shared by experiments: results, drawings, plain implementations to compare with."""

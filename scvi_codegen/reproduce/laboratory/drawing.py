@@ -1,7 +1,7 @@
-"""What the pictures have in common: one colour a scheme, thinned curves, error axes.
+"""Drawing functions shared by the pictures: one colour per scheme, thinned curves, error axes.
 
-A picture is drawn on a Matplotlib figure under :data:`STYLE`; text stays text in SVG. Curves are thinned to what a page
-can show, so a file has tens of kilobytes whatever the run's length.
+A picture is drawn on a Matplotlib figure under :data:`STYLE`; text remains text in SVG. Curves are thinned to what a
+page can show, so that a file has tens of kilobytes whatever the run's length.
 """
 
 from __future__ import annotations
@@ -33,46 +33,46 @@ COLORS = {
     "Euler": "#2b8c9e",
     "exact": "#888888",
 }
-"""By scheme; the same scheme has the same colour in every picture."""
+"""Colours by scheme, the same in every picture."""
 MOST_POINTS = 1500
 BINS = 400
 
 
 def panels(figure: Figure, rows: int, columns: int) -> list[Axes]:
-    """Axes row by row, laid out so that nothing overlaps."""
+    """Return axes row by row, laid out without overlap."""
     figure.set_layout_engine("constrained")
     return list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
 
 
 def thinned(*series: ArrayLike, most: int = MOST_POINTS) -> tuple[Array, ...]:
-    """Every k-th entry of each series, at most ``most``."""
+    """Return every k-th entry of each series, at most ``most``."""
     arrays = [np.asarray(values, dtype=float) for values in series]
     every = max(1, -(-len(arrays[0]) // most))
     return tuple(values[::every] for values in arrays)
 
 
 def largest_in_bins(t: ArrayLike, error: ArrayLike, *, bins: int = BINS) -> tuple[Array, Array]:
-    """Times and the largest |error| from each to the next; zeros, which a log axis cannot show, become NaN."""
+    """Return times and the largest |error| from each to the next; zeros become NaN for a log axis."""
     times, values = np.asarray(t, dtype=float), np.abs(np.asarray(error, dtype=float))
     size = max(1, len(times) // bins)
-    starts = np.arange(0, max(1, len(times) - size + 1), size)  # what is left over belongs to the last bin
+    starts = np.arange(0, max(1, len(times) - size + 1), size)  # the last bin includes the remainder
     largest: Any = np.maximum.reduceat(values, starts)
     return times[starts], np.where(largest > 0.0, largest, np.nan)
 
 
 def draw_error(axes: Axes, t: ArrayLike, error: ArrayLike, scheme: str, label: str | None = None, **style: Any) -> None:
-    """|error| over time on a log axis: the largest in each of some hundred bins."""
+    """Draw |error| over time on a log axis: the largest in each of some hundred bins."""
     axes.plot(*largest_in_bins(t, error), **{"color": COLORS.get(scheme), "label": label or scheme} | style)
     axes.set_yscale("log")
 
 
 def draw_orbit(axes: Axes, x: ArrayLike, y: ArrayLike, scheme: str, label: str | None = None, **style: Any) -> None:
-    """A curve in a plane."""
+    """Draw a curve in a plane."""
     axes.plot(*thinned(x, y), **{"color": COLORS.get(scheme), "label": label or scheme, "linewidth": 0.8} | style)
 
 
 def draw_powers(axes: Axes, h: ArrayLike, powers: Sequence[tuple[float, float]]) -> None:
-    """Lines c h^p for (c, p) in ``powers``, each named at its end, on log-log axes."""
+    """Draw lines c h^p for (c, p) in ``powers``, each labelled at its end, on log-log axes."""
     steps = np.asarray(h, dtype=float)
     for constant, power in powers:
         axes.plot(steps, constant * steps**power, color=COLORS["exact"], linestyle=":", linewidth=0.8)

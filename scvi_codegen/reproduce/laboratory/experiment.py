@@ -1,7 +1,7 @@
-"""What an experiment gives back: what was run, what the paper claims of it, what was measured, numbers and a picture.
+"""Results of experiments: setting, claims of the paper, measurements, numbers and a picture.
 
-Everything is plain data that travels between processes: a picture is a module-level function with its numbers bound by
-``functools.partial``, a formula is SymPy.
+Everything is plain data that can be sent between processes: a picture is a module-level function with its numbers bound
+by ``functools.partial``, a formula is SymPy.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ __all__ = [
 
 
 class Verdict(Enum):
-    """Whether what the paper says was found."""
+    """Verdict on a statement of the paper."""
 
     HOLDS = "holds"
     PARTLY = "holds in part"
     FAILS = "does not hold"
     SHOWN = "shown"
-    """Nothing is claimed, or nothing can be decided."""
+    """No claim, or none that can be decided."""
 
 
 def holds(condition: bool) -> Verdict:
-    """``HOLDS`` or ``FAILS``."""
+    """Return ``HOLDS`` or ``FAILS``."""
     return Verdict.HOLDS if condition else Verdict.FAILS
 
 
 def judged(*conditions: bool) -> Verdict:
-    """``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
+    """Return ``HOLDS`` if all conditions do, ``FAILS`` if none does, else ``PARTLY``."""
     if all(conditions):
         return Verdict.HOLDS
     return Verdict.PARTLY if any(conditions) else Verdict.FAILS
@@ -58,11 +58,11 @@ def judged(*conditions: bool) -> Verdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """One statement of the paper beside what was measured.
+    """Statement of the paper and the measurement that tests it.
 
     Attributes:
-        claim: what the paper says, in one sentence.
-        measured: what was found, in one sentence with its numbers.
+        claim: statement of the paper, in one sentence.
+        measured: measurement, in one sentence with its numbers.
         verdict: whether they agree.
         bears_on: keys of the claims (:mod:`scvi_codegen.reproduce.claims`) that this decides.
     """
@@ -74,7 +74,7 @@ class Comparison:
 
 
 def common_verdict(checks: Iterable[Comparison]) -> Verdict:
-    """Of several checks: ``PARTLY`` where they differ, ``SHOWN`` where none decides anything."""
+    """Return the verdict of several checks: ``PARTLY`` if they differ, ``SHOWN`` if none decides anything."""
     found = {check.verdict for check in checks} - {Verdict.SHOWN}
     if not found:
         return Verdict.SHOWN
@@ -83,7 +83,7 @@ def common_verdict(checks: Iterable[Comparison]) -> Verdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """``draw`` fills an empty Matplotlib figure of ``width`` x ``height`` inches."""
+    """Picture of ``width`` x ``height`` inches; ``draw`` fills an empty Matplotlib figure."""
 
     draw: Callable[[Figure], None]
     width: float = 9.0
@@ -92,16 +92,16 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """What an experiment found.
+    """Result of an experiment.
 
     Attributes:
-        name: ``"figure-4"``.
-        title: what the paper calls it, one line.
-        setting: what was run, and what the caption leaves open and how it was chosen, a sentence each.
-        checks: claims and findings.
+        name: name, as ``"figure-4"``.
+        title: the paper's title, one line.
+        setting: what was run, and how details that the caption omits were chosen, a sentence each.
+        checks: claims and measurements.
         tables: numbers; the first has no name.
-        picture: or ``None``.
-        body: text and formulas, in order, for experiments that are read rather than looked at.
+        picture: picture, or ``None``.
+        body: text and formulas, in order, for experiments with a derivation.
     """
 
     name: str
@@ -114,18 +114,18 @@ class Result:
 
     @property
     def verdict(self) -> Verdict:
-        """The common verdict of all checks; ``PARTLY`` where they differ, ``SHOWN`` where there is none."""
+        """Common verdict of all checks; ``PARTLY`` if they differ, ``SHOWN`` if there is none."""
         return common_verdict(self.checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """Something of the paper that can be run.
+    """Part of the paper that can be reproduced.
 
     Attributes:
-        name: on the command line.
+        name: name on the command line.
         title: one line.
-        run: gives the result; it is called with the results of ``needs``, by name.
+        run: function that returns the result, called with the results of ``needs``, by name.
         needs: names of experiments whose results it judges.
     """
 

@@ -1,4 +1,4 @@
-"""Newton's iteration in full on the equations of a step as they are derived: slow, and independent of the C solvers."""
+"""Newton's method on the derived equations of a step, in Python: slow, and independent of the C solvers."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ __all__ = ["newton_counts"]
 
 Array = NDArray[np.float64]
 Function: TypeAlias = Callable[[Array, Sequence[float]], Array]
-"""Of the unknowns and of (q_k, p_k, h)."""
+"""Function of the unknowns and of (q_k, p_k, h)."""
 
 
 def newton_counts(
     system: LagrangianSystem, method: Method, q: Sequence[float], p: Sequence[float], *, h: float, steps: int
 ) -> list[int]:
-    """Iterations of every step: a new Jacobian at every iterate, first guess on the straight line, until |dQ| < 1e-14.
+    """Return the iterations of every step: new Jacobian at every iterate, straight-line guess, until |dQ| < 1e-14.
 
-    For systems of unit masses without explicit time (a velocity is a momentum), and methods that end in Q^s. The end
-    momentum, a sum of large terms, is left out of the rule: its rounding alone is of the size of the tolerance.
+    For systems of unit masses without explicit time (velocity = momentum), and methods that end in Q^s. The end
+    momentum, a sum of large terms, is excluded from the criterion: its rounding alone is of the size of the tolerance.
     """
     derived = derive(system, method)
     equations = sympy.Matrix([equation.residual for equation in derived.equations])
@@ -58,7 +58,7 @@ def _function(derived: StepEquations, expression: sympy.Matrix) -> Function:
 
 
 def _solved(unknowns: Array, state: Sequence[float], residual: Function, slope: Function) -> tuple[Array, int]:
-    """Unknowns and the number of updates."""
+    """Return the unknowns and the number of updates."""
     count, size = 0, np.inf
     while size >= SECTION_3.tolerance and count < SECTION_3.max_iterations:
         update = np.linalg.solve(slope(unknowns, state), residual(unknowns, state).ravel())

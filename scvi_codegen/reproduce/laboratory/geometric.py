@@ -1,4 +1,4 @@
-"""Lines C K^N along errors that fall geometrically: those that fit, and how far errors are from those of a legend."""
+"""Lines C K^N through errors that decrease geometrically: fits, and distances from the lines of a legend."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ __all__ = ["ALONG", "STRAIGHT", "WINDOW", "Line", "factors", "fitted_line", "is_
 
 Array = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]
-"""(C, K)."""
+"""Constants (C, K)."""
 
 WINDOW = 1e-13, 1e-1
-"""Errors that count: below is round-off, above the solution is not resolved."""
+"""Range of errors that count: smaller ones are round-off, larger ones are not resolved."""
 LEAST = 3
-"""Errors that make a line."""
+"""Least number of errors for a fit."""
 ALONG = 30.0
-"""A line of a legend runs along errors that are typically off it by a smaller factor."""
+"""Largest typical factor between errors and a line that counts as agreement."""
 STRAIGHT = 0.9
-"""Least square of the correlation of N and the logarithms of errors that fall geometrically."""
+"""Least squared correlation of N and the logarithms of errors that decrease geometrically."""
 
 
 def within(errors: Array) -> NDArray[np.bool_]:
-    """Which errors are inside :data:`WINDOW`."""
+    """Return a mask of the errors inside :data:`WINDOW`."""
     return (errors > WINDOW[0]) & (errors < WINDOW[1])
 
 
 def fitted_line(n: Array, errors: Array) -> Line | None:
-    """The line through the errors inside the window; ``None`` with fewer than three of them."""
+    """Return the line through the errors inside the window; ``None`` with fewer than three of them."""
     used = within(errors)
     if np.count_nonzero(used) < LEAST:
         return None
@@ -39,19 +39,19 @@ def fitted_line(n: Array, errors: Array) -> Line | None:
 
 
 def is_straight(n: Array, errors: Array) -> bool:
-    """Whether errors inside the window fall, and along a line."""
+    """Return True if errors inside the window decrease, along a line."""
     used = within(errors)
     correlation = np.corrcoef(n[used], np.log(errors[used]))[0, 1]
     return bool(correlation < 0 and correlation**2 > STRAIGHT)
 
 
 def factors(n: Array, errors: Array, line: Line) -> Array:
-    """By how much each error inside the window is above or below a line, at least 1."""
+    """Return the factor, at least 1, between each error inside the window and a line."""
     used = within(errors)
     found: Array = np.exp(np.abs(np.log(errors[used]) - np.log(line[0]) - n[used] * np.log(line[1])))
     return found
 
 
 def typical(all_factors: Iterable[Array]) -> float:
-    """The median of :func:`factors` of several curves."""
+    """Return the median of :func:`factors` of several curves."""
     return float(np.median(np.concatenate([*all_factors])))

@@ -1,7 +1,8 @@
-"""Plain Picard iteration on the equations of a step, from a constant guess: (18) of SC and (30) of SVI in NumPy.
+"""Picard iteration on the equations of a step, from a constant guess: (18) of SC and (30) of SVI in NumPy.
 
-Both are Q = q0 + h c v0 + h^2 B f(E Q): E takes Q at the nodes to the points where forces act, the nodes themselves for
-SC, and B solves for Q. Unlike the project's solvers it starts anew in each step, which the counts of the paper do.
+Both are Q = q0 + h c v0 + h^2 B f(E Q): E maps Q at the nodes to the points where forces are evaluated, the nodes
+themselves for SC, and B solves for Q. Unlike the package's solvers it starts anew in each step, as the counts of the
+paper do.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ __all__ = ["Equations", "Force", "NotSolvedError", "galerkin", "picard_step", "s
 
 Array = NDArray[np.float64]
 Force: TypeAlias = Callable[[Array], Array]
-"""Accelerations (points, m) at positions (points, m); masses are 1."""
+"""Function that returns accelerations (points, m) at positions (points, m); masses are 1."""
 
 
 class NotSolvedError(Exception):
-    """The iteration has not converged."""
+    """The iteration did not converge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """A step of h = 1 on nodes that end at c = 1.
+    """Step of h = 1 on nodes that end at c = 1.
 
     Attributes:
-        c: (s,) the nodes but the first, in [0, 1].
-        at: (points, s + 1) from positions at all nodes to those where the force is taken.
-        solution: (s, points) B, from forces to what they add to the positions.
-        momentum: (points,) from forces to what they add to the momentum.
+        c: (s,) nodes without the first, in [0, 1].
+        at: (points, s + 1) matrix from positions at all nodes to those where the force is evaluated.
+        solution: (s, points) B, from forces to their contribution to the positions.
+        momentum: (points,) from forces to their contribution to the momentum.
     """
 
     c: Array
@@ -48,7 +49,7 @@ class Equations:
 
 @lru_cache(maxsize=64)
 def spectral_collocation(degree: int) -> Equations:
-    """(18) on Chebyshev nodes: A^2 Q = F(Q) - a0 v0 - (A a0) q0."""
+    """Return (18) on Chebyshev nodes: A^2 Q = F(Q) - a0 v0 - (A a0) q0."""
     nodes = chebyshev_lobatto(degree).points
     inverse = np.linalg.inv(2.0 * _array(differentiation_matrix(nodes))[1:, 1:])
     return Equations(_unit(nodes), np.eye(degree + 1)[1:], inverse @ inverse, inverse[-1])
@@ -56,7 +57,7 @@ def spectral_collocation(degree: int) -> Equations:
 
 @lru_cache(maxsize=64)
 def galerkin(degree: int, points: int) -> Equations:
-    """(30) on Chebyshev nodes with Gauss points: the first s rows of the stiffness (29), solved for Q."""
+    """Return (30) on Chebyshev nodes with Gauss points: the first s rows of the stiffness (29), solved for Q."""
     nodes, rule = chebyshev_lobatto(degree).points, gauss_legendre(points)
     weights = _array([rule.weights])[0] / 2.0
     values, slopes = (_array(table(nodes, rule.points)) for table in (cardinal_values, cardinal_slopes))
@@ -67,7 +68,7 @@ def galerkin(degree: int, points: int) -> Equations:
 def picard_step(
     equations: Equations, force: Force, q: Array, p: Array, *, h: float, tolerance: float, max_iterations: int
 ) -> tuple[Array, Array, int]:
-    """(q, p) after a step of h, and the number of iterations until max |dQ| < tolerance.
+    """Return (q, p) after a step of h, and the number of iterations until max |dQ| < tolerance.
 
     Raises:
         NotSolvedError: if there are more than ``max_iterations``, or numbers overflow.

@@ -1,6 +1,7 @@
-"""What "N" counts in the captions of section 3: points, as they say, or the degree, as other figures have it.
+"""Meanings of "N" in the captions of section 3: number of points, as they say, or degree, as in other figures.
 
-Either way SVI has N Gauss points here, which the paper leaves open: one more than the degree if N counts points.
+In both readings SVI has N Gauss points here, which the paper does not state: one more than the degree if N counts
+points.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ SCHEMES = ("SVI", "SC")
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A meaning of N.
+    """Meaning of N.
 
     Attributes:
         name: ``"by points"``.
-        meaning: in a few words.
+        meaning: description in a few words.
         beyond_degree: N less the degree.
     """
 
@@ -30,16 +31,16 @@ class Reading:
     beyond_degree: int
 
     def degree(self, n: int) -> int:
-        """Of the curves that N stands for."""
+        """Return the degree of the curves for N."""
         return n - self.beyond_degree
 
     def method(self, scheme: str, n: int, *, more: int = 0) -> Method:
-        """``"SC"``, or ``"SVI"`` with N Gauss points and ``more``."""
+        """Return ``"SC"``, or ``"SVI"`` with N + ``more`` Gauss points."""
         degree = self.degree(n)
         return SVI(degree, f"gauss-legendre:{n + more}") if scheme == "SVI" else SpectralCollocation(degree)
 
 
 BY_POINTS = Reading("by points", "N Chebyshev points, degree N - 1", 1)
-"""As the captions and the axes say: verdicts are on this."""
+"""Meaning in captions and on axes, on which verdicts are based."""
 BY_DEGREE = Reading("by degree", "N the degree, N + 1 Chebyshev points", 0)
 READINGS = (BY_POINTS, BY_DEGREE)

@@ -1,8 +1,8 @@
-"""Compiled steppers and trajectories as the captions of the paper ask for them.
+"""Compiled steppers and trajectories with the settings of the paper's captions.
 
 The paper ends the nonlinear iteration when max(|Q^{i+1} - Q^i|, |P^{i+1} - P^i|) < TOL with TOL = 1e-14 in section 3
-and 1e-12 in section 4, after at most 1000 iterations; :data:`SECTION_3` and :data:`SECTION_4` say so to our solvers.
-Code is compiled with flags that give the same bits on every machine.
+and 1e-12 in section 4, after at most 1000 iterations: :data:`SECTION_3` and :data:`SECTION_4`. Code is compiled with
+flags that give the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ __all__ = ["ROUNDOFF", "SECTION_3", "SECTION_4", "stepper_of", "steps_in", "traj
 SECTION_3 = SolverOptions(tolerance=1e-14, max_iterations=1000, absolute=True)
 SECTION_4 = SolverOptions(tolerance=1e-12, max_iterations=1000, absolute=True)
 ROUNDOFF = SolverOptions()
-"""To round-off: the rule of this project, where the paper states none."""
+"""Default convergence criterion of this package, to round-off, where the paper states none."""
 
 
 @lru_cache(maxsize=256)
 def stepper_of(system: MechanicalSystem, method: Method, solver: str = "auto") -> Stepper:
-    """The compiled integrator, once a process."""
+    """Return the compiled integrator, cached in the process."""
     return compile_stepper(system, method, solver=solver, flags=PORTABLE_FLAGS)
 
 
 def steps_in(span: float, h: float) -> int:
-    """The number of steps nearest to span / h, at least 1."""
+    """Return the number of steps nearest to span / h, at least 1."""
     return max(1, round(span / abs(h)))
 
 
@@ -49,7 +49,7 @@ def trajectory(
     options: SolverOptions = SECTION_3,
     solver: str = "auto",
 ) -> Trajectory:
-    """The run of a method from (q, velocity) at t = 0 over ``span``."""
+    """Integrate with a method from (q, velocity) at t = 0 over ``span``."""
     stepper = stepper_of(system, method, solver)
     p = stepper.momentum(q, velocity)
     return stepper.integrate(q, p, h=h, steps=steps_in(span, h), every=every, options=options)

@@ -1,1 +1,1 @@
-"""The paper's figures on systems of one degree of freedom: oscillator, pendulum, Duffing."""
+"""Figures of the paper on systems with one degree of freedom: oscillator, pendulum, Duffing."""

@@ -60,7 +60,7 @@ METHODS: dict[str, Method] = {
 DRAWN = ("SVI, degree 5", "SC, degree 5", "SRK6")
 MOST_DOTS = 450
 WINDOW = (0.6, 1.1)
-"""Both coordinates of the paper's magnified part."""
+"""Range of both coordinates in the paper's magnified part."""
 
 SETTING = (
     "L = v^2/2 + q^2/2 - 2 q^4/3 (alpha = -1, beta = 8/3, undriven, undamped), q(0) = 0, p(0) = 1.",
@@ -77,7 +77,7 @@ def _run(scheme: str, span: float) -> Trajectory:
 
 
 def _level_curve() -> tuple[Array, Array]:
-    """The exact orbit in the phase plane, p^2 = 1 + q^2 - 4 q^4/3."""
+    """Return the exact orbit in the phase plane, p^2 = 1 + q^2 - 4 q^4/3."""
     end = np.sqrt((3.0 + np.sqrt(57.0)) / 8.0)
     angle = np.linspace(0.0, 2.0 * np.pi, 600)
     q = end * np.cos(angle)
@@ -85,7 +85,7 @@ def _level_curve() -> tuple[Array, Array]:
 
 
 def _roughness(run: Trajectory) -> float:
-    """The largest jump of the distance from the exact curve between states that are neighbours along it."""
+    """Return the largest jump of the distance from the exact curve between neighbours along it."""
     offset = offset_from_curve(run)[np.argsort(np.arctan2(run.p[:, 0], run.q[:, 0]))]
     return float(np.abs(np.diff(offset)).max())
 
@@ -149,7 +149,7 @@ def _draw_phase(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Arr
 
 
 def _family(scheme: str) -> str:
-    """The name of a scheme without its degree or order."""
+    """Return the name of a scheme without its degree or order."""
     return scheme.partition(",")[0].removesuffix("6")
 
 

@@ -1,4 +1,4 @@
-"""Figure 6: the harmonic oscillator over one long step, with more and more points."""
+"""Figure 6: the harmonic oscillator over one long step, over the number of points."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ TITLE = "Harmonic oscillator: error over one step h = 20 with more and more poin
 STEP = 20.0
 DEGREES: Mapping[str, Sequence[int]] = {"SVI": range(10, 31, 3), "SC": range(10, 37, 3)}
 PRINTED: Mapping[str, Line] = {"SVI": (1e14, 0.09), "SC": (1e10, 0.21)}
-"""(C, K) of the lines of the paper's legend, the steeper for SVI."""
+"""Constants (C, K) of the lines of the paper's legend, the steeper for SVI."""
 QUANTITIES = ("q", "energy")
 
 
 class Errors(NamedTuple):
-    """After the step, absolute values."""
+    """Absolute errors after the step."""
 
     q: float
     energy: float
@@ -58,7 +58,7 @@ class ErrorsOverN(NamedTuple):
     energy: Array
 
     def fit(self, what: str) -> Line | None:
-        """(C, K) of one of the two."""
+        """Return (C, K) for one of the two quantities."""
         return fitted_line(self.n, getattr(self, what))
 
 
@@ -79,7 +79,7 @@ def _curve(reading: Reading, scheme: str, degrees: Sequence[int]) -> ErrorsOverN
 
 
 def convergence(_: Mapping[str, Result], degrees: Mapping[str, Sequence[int]] = DEGREES) -> Result:
-    """The figure, at some degrees."""
+    """Return the figure, for some degrees."""
     curves = {(reading, scheme): _curve(reading, scheme, degrees[scheme]) for reading in READINGS for scheme in SCHEMES}
     formats = {"N": "g", "error of q": ".2e", "error of the energy": ".2e", "C": ".1e", "printed C": ".0e"}
     return Result(
@@ -152,7 +152,7 @@ def _bases(curves: Curves) -> Comparison:
 
 
 def _lines(curves: Curves) -> Comparison:
-    """How far the errors are from the lines, constants included: it tells what N counts."""
+    """Return the check of the lines including their constants, which indicates what N counts."""
     off = {
         (reading, scheme, what): typical([factors(curve.n, getattr(curve, what), PRINTED[scheme])])
         for (reading, scheme), curve in curves.items()
@@ -172,7 +172,7 @@ def _lines(curves: Curves) -> Comparison:
 
 
 def _ahead(curves: Curves) -> Comparison:
-    """SVI against SC at the degrees that both have, where SC resolves the step and is above round-off."""
+    """Return the comparison of SVI and SC at common degrees, where SC resolves the step above round-off."""
     svi, sc = curves[BY_POINTS, "SVI"], curves[BY_POINTS, "SC"]
     _, ours, theirs = np.intersect1d(svi.n, sc.n, return_indices=True)
     wins, cases = 0, 0

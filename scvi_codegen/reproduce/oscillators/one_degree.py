@@ -1,4 +1,4 @@
-"""What is measured on runs with one degree of freedom: energy errors, drift, the area in the phase plane."""
+"""Quantities of runs with one degree of freedom: energy errors, drift, area in the phase plane."""
 
 from __future__ import annotations
 
@@ -32,43 +32,43 @@ __all__ = [
 Array = NDArray[np.float64]
 
 NO_DRIFT = 1e-12
-"""An error below is round-off, wherever it walks."""
+"""Largest error that counts as round-off."""
 
 
 def svi_with_points(degree: int, points: int) -> SVI:
-    """SVI with Gauss points of any number, fewer than the degree without a warning: the paper seems to use such."""
+    """Return an SVI with any number of Gauss points, without the warning for fewer than the degree."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MethodWarning)
         return SVI(degree, f"gauss-legendre:{points}")
 
 
 def energy_error(run: Trajectory) -> Array:
-    """H - H(0) along a run."""
+    """Return H - H(0) along a run."""
     error: Array = run.energy() - run.energy()[0]
     return error
 
 
 def largest(error: Array) -> float:
-    """The largest absolute value."""
+    """Return the largest absolute value."""
     return float(np.abs(error).max())
 
 
 def drift(error: Array) -> float:
-    """The mean over the last fifth of a run less that over the first: 0.8 of the final value of a straight line."""
+    """Return the mean over the last fifth of a run less that over the first: 0.8 of the end of a straight line."""
     part = max(1, len(error) // 5)
     return float(error[-part:].mean() - error[:part].mean())
 
 
 def drifts(error: Array) -> bool:
-    """Whether more than a third of the largest error is drift, rather than oscillation; never for round-off."""
+    """Return True if more than a third of the largest error is drift, not oscillation; never for round-off."""
     return largest(error) > NO_DRIFT and abs(drift(error)) > largest(error) / 3
 
 
 def area_change(run: Trajectory) -> float:
-    """The area inside the states of the last fifth of a run over that of the first fifth, less 1.
+    """Return the area enclosed by the last fifth of a run relative to the first fifth, less 1.
 
-    The states must surround the origin of the phase plane. Few states make the polygon smaller than the curve, by
-    about (2 pi / n)^2 / 3 for n of them.
+    The states must surround the origin of the phase plane. For n states the polygon is smaller than the curve by about
+    (2 pi / n)^2 / 3.
     """
     part = len(run) // 5
     first, last = (_enclosed_area(run.q[states, 0], run.p[states, 0]) for states in np.s_[:part, -part:])
@@ -76,14 +76,14 @@ def area_change(run: Trajectory) -> float:
 
 
 def _enclosed_area(q: Array, p: Array) -> float:
-    """The area of the polygon through points in the order of their angle about the origin."""
+    """Return the area of the polygon through points in the order of their angle about the origin."""
     order = np.argsort(np.arctan2(p, q))
     x, y = q[order], p[order]
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def area_factor(stepper: Stepper, q: float, p: float, h: float, *, distance: float = 1e-4) -> float:
-    """The determinant of the derivative of one step, by central differences: 1 for a symplectic step."""
+    """Return the determinant of the Jacobian of one step, by central differences: 1 for a symplectic step."""
 
     def difference(dq: float, dp: float) -> Array:
         ahead, behind = (stepper.step([q + sign * dq], [p + sign * dp], h=h) for sign in (1.0, -1.0))
@@ -93,7 +93,7 @@ def area_factor(stepper: Stepper, q: float, p: float, h: float, *, distance: flo
 
 
 def offset_from_curve(run: Trajectory, *, distance: float = 1e-5) -> Array:
-    """How far each state lies outside the curve of the initial energy, to first order: (H - H(0)) / |grad H|."""
+    """Return the distance of each state from the energy curve, to first order: (H - H(0)) / |grad H|."""
 
     def slope(dq: float, dp: float) -> Array:
         ahead, behind = (run.stepper.energy(run.q + s * dq, run.p + s * dp, run.t, run.parameters) for s in (1.0, -1.0))
@@ -105,7 +105,7 @@ def offset_from_curve(run: Trajectory, *, distance: float = 1e-5) -> Array:
 
 
 def energy_table(runs: Mapping[str, Trajectory]) -> TableBlock:
-    """Largest energy error, drift and change of the enclosed area of each run, by scheme."""
+    """Return largest energy error, drift and change of the enclosed area of each run, by scheme."""
     rows: list[tuple[Cell, ...]] = []
     for scheme, run in runs.items():
         error = energy_error(run)
@@ -118,7 +118,7 @@ def energy_table(runs: Mapping[str, Trajectory]) -> TableBlock:
 
 
 def curves_table(name: str, t: Array, errors: Mapping[str, Array], *, bins: int = 1000) -> TableBlock:
-    """The curves of a picture of errors over time; of long ones the largest |error| in each bin."""
+    """Return the curves of a plot of errors over time; the largest |error| in each bin for long ones."""
     columns = [largest_in_bins(t, error, bins=bins) for error in errors.values()]
     rows = zip(columns[0][0].tolist(), *(values.tolist() for _, values in columns), strict=True)
     return TableBlock(name=name, columns=("t", *errors), rows=tuple(map(tuple, rows)), shown=False)

@@ -51,7 +51,7 @@ TITLES = {
 
 DEGREE = 8
 POINTS = (7, 8, 9)
-"""Gauss points tried; the caption gives none."""
+"""Numbers of Gauss points tried; the caption states none."""
 
 METHODS: dict[str, Method] = {
     **{f"SVI, {points} Gauss points": svi_with_points(DEGREE, points) for points in POINTS},
@@ -59,7 +59,7 @@ METHODS: dict[str, Method] = {
 }
 SVI_LABEL = f"SVI, {DEGREE} Gauss points"
 VISIBLE = 2e-3
-"""Of a picture's width: a line is not thinner."""
+"""Width of a line relative to the picture."""
 
 SYSTEM = "m = k = 1, q(0) = 0, p(0) = 1; the exact solution is q = sin t, p = cos t."
 NINE_POINTS = "9 Chebyshev points: degree 8."

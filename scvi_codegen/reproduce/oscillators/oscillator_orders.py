@@ -1,4 +1,4 @@
-"""Figures 7-8: the harmonic oscillator over one step of many sizes; the orders of SVI and SC."""
+"""Figures 7-8: the harmonic oscillator over one step of several sizes; orders of SVI and SC."""
 
 from __future__ import annotations
 
@@ -42,37 +42,37 @@ TITLES = {
     "figure-8": "Harmonic oscillator: error of the energy over one step of size h",
 }
 LEGEND = (2, 4, 6)
-"""The values of N."""
+"""Values of N."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A meaning of N, and how many Gauss points SVI has beyond N."""
+    """Meaning of N, and the number of Gauss points of SVI beyond N."""
 
     reading: Reading
     more: int = 0
 
     @property
     def title(self) -> str:
-        """In words."""
+        """Description in words."""
         return f"{self.reading.meaning}; SVI: N{f' + {self.more}' if self.more else ''} Gauss points"
 
     def method(self, scheme: str, n: int) -> Method:
-        """What runs under the label ``SVI, N = 2``."""
+        """Return the method with the label ``SVI, N = 2``."""
         return self.reading.method(scheme, n, more=self.more)
 
 
 POINTS, DEGREES, BEYOND = Variant(BY_POINTS), Variant(BY_DEGREE), Variant(BY_DEGREE, more=1)
 SHOWN = {"q": (POINTS, DEGREES), "energy": (POINTS, DEGREES, BEYOND)}
-"""Verdicts are on the first."""
+"""Variants in the pictures; verdicts are based on the first."""
 STEPS = tuple(10.0 ** (0.3 * k - 3.0) for k in range(14))
 FITTED = tuple(2.0**exponent for exponent in (-8, -6, -4))
-"""Steps small enough for a straight line; in 60 digits no error there is near round-off."""
+"""Step sizes for fits in 60 digits: small enough for a straight line, errors far above round-off."""
 NO_ERROR = 1e-50
 ALIKE = 10.0
-"""Constants of lines that differ by a smaller factor count as the same."""
+"""Largest factor between constants of lines that count as equal."""
 PRINTED = {"q": {3: 1.5, 5: 1e-2, 7: 1e-5, 9: 1e-5, 13: 1e-10}, "energy": {2: 1.0, 4: 1e-2, 6: 1e-5, 8: 1e-5, 11: 1e-9}}
-"""The lines of the paper's legends: the constant of each power of h."""
+"""Lines of the paper's legends: the constant of each power of h."""
 SETTING = (
     SYSTEM,
     "One step of size h, errors at its end.",
@@ -87,21 +87,21 @@ SETTING = (
 
 
 class PowerLaw(NamedTuple):
-    """The line constant h^power."""
+    """Line constant h^power."""
 
     constant: float
     power: float
 
 
 def _errors(q: Number, p: Number, h: float) -> dict[str, float]:
-    """Absolute errors at the end of a step, formed in 60 digits."""
+    """Return the absolute errors at the end of a step, computed in 60 digits."""
     q, p, h = mp.mpf(q), mp.mpf(p), mp.mpf(h)
     return {"q": abs(q - mp.sin(h)), "energy": abs(q * q + p * p - 1) / 2}
 
 
 @lru_cache
 def _exact_errors(method: Method, steps: tuple[float, ...]) -> dict[str, Array]:
-    """By quantity, what the method itself errs in a step."""
+    """Return the errors of the method in a step, by quantity."""
     step = derived_step(OSCILLATOR, method)
     ends = [(step(POSITION, VELOCITY, h), h) for h in steps]
     return _collected([_errors(end.q[0], end.p[0], h) for end, h in ends])
@@ -109,7 +109,7 @@ def _exact_errors(method: Method, steps: tuple[float, ...]) -> dict[str, Array]:
 
 @lru_cache
 def _compiled_errors(method: Method, steps: tuple[float, ...]) -> dict[str, Array]:
-    """By quantity, what the compiled code errs in a step."""
+    """Return the errors of the compiled code in a step, by quantity."""
     stepper = stepper_of(OSCILLATOR, method)
     ends = [(*stepper.step(POSITION, VELOCITY, h=h, options=ROUNDOFF), h) for h in steps]
     return _collected([_errors(q[0], p[0], h) for q, p, h in ends])
@@ -120,7 +120,7 @@ def _collected(errors: Sequence[Mapping[str, float]]) -> dict[str, Array]:
 
 
 def fitted_power(what: str, method: Method) -> PowerLaw | None:
-    """The line through the errors of small steps; ``None`` where the method makes none."""
+    """Return the line through the errors of small steps; ``None`` for an exact method."""
     errors = _exact_errors(method, FITTED)[what]
     if errors.max() < NO_ERROR:
         return None
@@ -129,19 +129,19 @@ def fitted_power(what: str, method: Method) -> PowerLaw | None:
 
 
 def _fits(what: str, variant: Variant) -> dict[tuple[str, int], PowerLaw | None]:
-    """By scheme and N."""
+    """Return the fitted lines by scheme and N."""
     return {(scheme, n): fitted_power(what, variant.method(scheme, n)) for scheme in SCHEMES for n in LEGEND}
 
 
 class ErrorsOverH(NamedTuple):
-    """Errors over h, of the method and, where it was run, of the compiled code."""
+    """Errors over h, of the method and, if it was run, of the compiled code."""
 
     exact: Array
     compiled: Array | None
 
 
 Curves: TypeAlias = Mapping[tuple[str, int], ErrorsOverH]
-"""By scheme and N."""
+"""Errors by scheme and N."""
 
 
 def _curves(what: str, variant: Variant, steps: tuple[float, ...]) -> Curves:
@@ -156,7 +156,7 @@ def _curves(what: str, variant: Variant, steps: tuple[float, ...]) -> Curves:
 
 
 def refinement(name: str, what: str, _: Mapping[str, Result], steps: tuple[float, ...] = STEPS) -> Result:
-    """A figure, at some steps."""
+    """Return a figure, for some step sizes."""
     curves = {variant: _curves(what, variant, steps) for variant in SHOWN[what]}
     return Result(
         name=name,
@@ -195,7 +195,7 @@ def _errors_table(curves: Mapping[Variant, Curves], steps: tuple[float, ...]) ->
 
 
 def _powers(what: str) -> Comparison:
-    """Whether the powers of the legend are those of the curves."""
+    """Return the check that the powers of the legend are those of the curves."""
     found = {variant: {round(fit.power) for fit in _fits(what, variant).values() if fit} for variant in SHOWN[what]}
     printed, ours = set(PRINTED[what]), found[POINTS]
     outcome = "These are the printed ones"
@@ -223,14 +223,14 @@ def _powers_of_h(powers: Iterable[int]) -> str:
 
 
 def _factors(what: str, variant: Variant) -> list[float]:
-    """By how much the constant of each fitted line is off that of the printed line of its power."""
+    """Return the factors between fitted constants and the printed constant of the same power."""
     fits = [fit for fit in _fits(what, variant).values() if fit]
     printed = [(fit.constant, PRINTED[what].get(round(fit.power))) for fit in fits]
     return [max(ours / theirs, theirs / ours) for ours, theirs in printed if theirs]
 
 
 def _constants(what: str) -> Comparison:
-    """How far lines of the same power are apart: it tells what N counts."""
+    """Return the check of the constants of lines of equal power, which indicates what N counts."""
     ours = _factors(what, POINTS)
     beside = [
         f"{min(f):.1f} to {max(f):.0f} ({variant.title})"
@@ -247,7 +247,7 @@ def _constants(what: str) -> Comparison:
 
 
 def _ahead(what: str, curves: Curves, steps: tuple[float, ...]) -> Comparison:
-    """SVI against SC at every N and step, as the methods are, without round-off."""
+    """Return the comparison of SVI and SC at every N and step size, without round-off."""
     pairs = [(curves["SVI", n].exact, curves["SC", n].exact) for n in LEGEND]
     wins = sum(int(np.count_nonzero(svi < sc)) for svi, sc in pairs)
     lost = sorted({f"{steps[k]:.3g}" for svi, sc in pairs for k in np.flatnonzero(svi >= sc)}, key=float)

@@ -87,7 +87,7 @@ def _two_points(scheme: str) -> Trajectory:
 
 
 def _level_curve() -> tuple[Array, Array]:
-    """The exact orbit in the phase plane, p^2/2 - cos q = -cos q(0)."""
+    """Return the exact orbit in the phase plane, p^2/2 - cos q = -cos q(0)."""
     angle = np.linspace(0.0, 2.0 * np.pi, 400)
     q = POSITION[0] * np.cos(angle)
     return q, -np.sign(np.sin(angle)) * np.sqrt(np.maximum(0.0, 2.0 * (np.cos(q) - np.cos(POSITION[0]))))
@@ -133,7 +133,7 @@ def _draw_phase(
 
 
 def _family(scheme: str) -> str:
-    """The name of a scheme without its degree or order."""
+    """Return the name of a scheme without its degree or order."""
     return scheme.partition(",")[0].removesuffix("4")
 
 

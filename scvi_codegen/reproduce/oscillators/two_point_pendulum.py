@@ -36,7 +36,7 @@ __all__ = ["EXPERIMENTS"]
 QUADRATURE = "gauss-legendre:2"
 METHOD = SCVI(1, QUADRATURE)
 STATES = ((0.5, 0.0, 0.005), (0.5, 0.0, 0.1), (1.2, -0.7, 0.3), (-2.0, 0.9, 0.5), (3.0, 0.1, 1.0))
-"""(q_k, p_k, h) of the steps checked in numbers; the first is the paper's."""
+"""States and step sizes (q_k, p_k, h) of the numerical check; the first is the paper's."""
 
 SMALL = 1e-14
 
@@ -47,7 +47,7 @@ tau = Symbol("tau")
 
 @lru_cache(maxsize=1)
 def pendulum() -> LagrangianSystem:
-    """M = l = g = 1."""
+    """Return the pendulum with m = l = g = 1."""
     return LagrangianSystem.from_text(
         name="planar pendulum of unit mass and length",
         coordinates=["q"],
@@ -58,7 +58,7 @@ def pendulum() -> LagrangianSystem:
 
 @dataclass(frozen=True, slots=True)
 class Scheme:
-    """The two-point scheme as derived: residuals of (36) and (37), new momentum, Jacobian in (q_{k+1}, v_k)."""
+    """Two-point scheme as derived: residuals of (36) and (37), new momentum, Jacobian in (q_{k+1}, v_k)."""
 
     stage: sympy.Expr
     momentum: sympy.Expr
@@ -68,7 +68,7 @@ class Scheme:
 
 @lru_cache(maxsize=1)
 def derived_scheme() -> Scheme:
-    """Of the general derivation, with the paper's names."""
+    """Return the scheme from the general derivation, with the paper's names."""
     derived = derive(pendulum(), METHOD, radicals=True)
     names = dict(
         zip((*derived.unknowns, *derived.state[0], *derived.state[1], derived.step), (new, v, q, p, h), strict=True)
@@ -79,12 +79,12 @@ def derived_scheme() -> Scheme:
 
 
 def printed_36() -> sympy.Expr:
-    """Left minus right of (36)."""
+    """Return left minus right side of (36)."""
     return new / h**2 - (-sin(new) + v / h + q / h**2)
 
 
 def printed_g() -> sympy.Expr:
-    """G_k of section 4.3.1."""
+    """Return G_k of section 4.3.1."""
     first, second = (3 + sqrt(3)) / 6, (3 - sqrt(3)) / 6
     return -(3 + sqrt(3)) * h / 12 * sin(first * q + second * new) - (3 - sqrt(3)) * h / 12 * sin(
         second * q + first * new
@@ -92,12 +92,12 @@ def printed_g() -> sympy.Expr:
 
 
 def printed_37() -> sympy.Expr:
-    """(37), with the matrix entries A_k = -1/h and A1_k = 1/h that the paper gives."""
+    """Return (37), with the matrix entries A_k = -1/h and A1_k = 1/h of the paper."""
     return -new / h + q / h + printed_g() + p
 
 
 def action() -> sympy.Expr:
-    """L_d(q_k, q_{k+1}) of (33), written here from the nodes and the rule."""
+    """Return L_d(q_k, q_{k+1}) of (33), formed here from the nodes and the quadrature rule."""
     points, weights = exact_rule(gauss_legendre(2)) or ((), ())
     curve = cardinals()[0] * q + cardinals()[1] * new
     lagrangian = (2 / h * sympy.diff(curve, tau)) ** 2 / 2 + cos(curve)
@@ -105,13 +105,13 @@ def action() -> sympy.Expr:
 
 
 def cardinals() -> tuple[sympy.Expr, ...]:
-    """l_0, l_1 on the nodes -1, 1."""
+    """Return l_0, l_1 on the nodes -1, 1."""
     left, right = exact_points(chebyshev_lobatto(1)) or ()
     return (tau - right) / (left - right), (tau - left) / (right - left)
 
 
 def printed_differentiation() -> sympy.Matrix:
-    """(11) with N = 1 on descending nodes."""
+    """Return (11) with N = 1 on descending nodes."""
     corner = Rational(2 * 1**2 + 1, 6)
     x, c = (1, -1), (2, 2)
     return sympy.Matrix(
@@ -124,7 +124,7 @@ def printed_differentiation() -> sympy.Matrix:
 
 
 def section_4_3(results: Mapping[str, Result]) -> Result:
-    """Derivation, comparison, and a test in numbers."""
+    """Return derivation, comparison, and a numerical check."""
     scheme = derived_scheme()
     rows = [_row(stepper_of(pendulum(), METHOD), *state) for state in STATES]
     return Result(
@@ -159,7 +159,7 @@ def section_4_3(results: Mapping[str, Result]) -> Result:
 
 
 def _row(stepper: Stepper, *state: float) -> tuple[float, ...]:
-    """A compiled step put into the printed formulas; v_k from (36)."""
+    """Return a compiled step substituted into the printed formulas; v_k from (36)."""
     at_q, at_p, step = state
     q1, p1 = (float(x[0]) for x in stepper.step([at_q], [at_p], step, options=ROUNDOFF))
     other = stepper_of(pendulum(), SVI(1, QUADRATURE)).step([at_q], [at_p], step, options=ROUNDOFF)
@@ -172,7 +172,7 @@ def _row(stepper: Stepper, *state: float) -> tuple[float, ...]:
 
 
 def _vanishes(expression: sympy.Expr) -> bool:
-    """Decided by expansion, also inside sines and cosines: all coefficients are numbers of the field of sqrt(3)."""
+    """Return True if an expression is 0 by expansion, also inside sines and cosines (coefficients in Q(sqrt(3)))."""
     return bool(sympy.expand(expression) == 0)
 
 
@@ -233,7 +233,7 @@ def _numerical_check(rows: Sequence[Sequence[float]]) -> Comparison:
 
 
 def _tidy(expression: sympy.Expr) -> sympy.Expr:
-    """Sines and cosines with their coefficients in front, numbers over common denominators."""
+    """Return the expression with coefficients in front of sines and cosines, over common denominators."""
     stand_ins = {function: sympy.Dummy() for function in sorted(expression.atoms(sin, cos), key=str)}
     plain = sympy.expand(expression.xreplace(stand_ins))
     terms = [sympy.factor(plain.coeff(stand_in)) * _linear(f) for f, stand_in in stand_ins.items()]
@@ -275,7 +275,7 @@ def _derivation(scheme: Scheme) -> Iterator[Block]:
 
 
 def _scaled_row() -> sympy.ImmutableMatrix:
-    """[a_0, A] from the differentiation matrix of the project, on ascending nodes."""
+    """Return [a_0, A] from the package's differentiation matrix, on ascending nodes."""
     row = differentiation_matrix(chebyshev_lobatto(1).points)[1]
     return sympy.ImmutableMatrix([[2 * sympy.nsimplify(sympy.Float(str(x), 30)) / h for x in row]])
 

@@ -1,1 +1,1 @@
-"""The paper's tables: costs, iterations, properties, tableaux."""
+"""Tables of the paper: costs, iterations, properties, tableaux."""

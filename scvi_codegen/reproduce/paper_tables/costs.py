@@ -1,4 +1,4 @@
-"""Tables 6 and 7: what SRK, SVI and SC cost at the paper's settings, and what they give for it."""
+"""Tables 6 and 7: time and accuracy of SRK, SVI and SC at the paper's settings."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ if TYPE_CHECKING:
 __all__ = ["EXPERIMENTS"]
 
 ROUNDS = 15
-"""Timed runs of each scheme, in turn with the others."""
+"""Number of timed runs of each scheme, in turn with the others."""
 
 SAME = 0.05
-"""Times that differ by less are called equal."""
+"""Relative difference below which times count as equal."""
 
 REFERENCE, FINER = SVI(12), 4
-"""What the final position is compared with, and how many of its steps make one."""
+"""Reference method for the final position, and the number of its steps per step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """What a table compares.
+    """Setting of a table.
 
     Attributes:
-        number: of the table.
-        problem: in words.
-        system, q, velocity, h, span: what is integrated.
-        methods: by scheme, SRK first.
+        number: number of the table.
+        problem: description.
+        system, q, velocity, h, span: initial value problem and step size.
+        methods: methods by scheme, SRK first.
         seconds: printed CPU times by scheme.
     """
 
@@ -72,7 +72,7 @@ class Setting:
 
     @property
     def steps(self) -> int:
-        """Steps that fill the span."""
+        """Number of steps that fill the span."""
         return steps_in(self.span, self.h)
 
 
@@ -104,7 +104,7 @@ SETTINGS: Mapping[int, Setting] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """Of one scheme: median seconds, largest relative energy error, final position error over the largest |q|."""
+    """Median seconds, largest relative energy error, and final position error over the largest |q|, of one scheme."""
 
     seconds: float
     energy: float
@@ -112,14 +112,14 @@ class Cost:
 
     @property
     def seconds_a_digit(self) -> float:
-        """Time over the correct digits of the final position, infinite where there is none."""
+        """Time per correct digit of the final position, infinite if there is none."""
         digits = -math.log10(self.position)
         return self.seconds / digits if digits > 0.0 else math.inf
 
 
 @lru_cache(maxsize=2)
 def costs(number: int) -> Mapping[str, Cost]:
-    """Time and errors by scheme."""
+    """Return time and errors by scheme."""
     setting = SETTINGS[number]
     steppers = {scheme: compile_stepper(setting.system, method) for scheme, method in setting.methods.items()}
     timed: dict[str, list[float]] = {scheme: [] for scheme in steppers}
@@ -151,7 +151,7 @@ def _errors(stepper: Stepper, setting: Setting, end: NDArray[np.float64]) -> dic
 
 
 def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
-    """The position at the end of the last step."""
+    """Return the position at the end of the last step."""
     stepper = compile_stepper(setting.system, REFERENCE)
     p, steps = stepper.momentum(setting.q, setting.velocity), setting.steps * finer
     end: NDArray[np.float64] = stepper.integrate(
@@ -161,12 +161,12 @@ def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
 
 
 def table_6(results: Mapping[str, Result]) -> Result:
-    """Planar pendulum."""
+    """Return Table 6: planar pendulum."""
     return _result(SETTINGS[6])
 
 
 def table_7(results: Mapping[str, Result]) -> Result:
-    """Duffing oscillator."""
+    """Return Table 7: Duffing oscillator."""
     return _result(SETTINGS[7])
 
 
@@ -228,7 +228,7 @@ def _table(setting: Setting, found: Mapping[str, Cost]) -> TableBlock:
 
 @dataclass(frozen=True, slots=True)
 class Bars:
-    """What the picture shows of a scheme: times over that of SRK, errors."""
+    """Data of a scheme in the picture: times relative to SRK, errors."""
 
     scheme: str
     method: str
@@ -300,7 +300,7 @@ def _of_a_digit(cost: Cost) -> str:
 
 
 def _cheaper(ratio: float) -> Verdict:
-    """Whether a ratio of times says cheaper; in part if the times are equal."""
+    """Return the verdict for a ratio of times; in part if the times are equal."""
     return Verdict.PARTLY if abs(ratio - 1.0) <= SAME else holds(ratio < 1.0)
 
 
@@ -309,7 +309,7 @@ def _both(one: bool, other: bool) -> Verdict:
 
 
 def draw_costs(bars: Sequence[Bars], figure: Figure) -> None:
-    """Times over that of SRK, here and printed; errors."""
+    """Draw times relative to SRK, measured and printed, and errors."""
     left, right = panels(figure, 1, 2)
     colors = [COLORS[one.scheme] for one in bars]
     _draw_pairs(left, [one.ratio for one in bars], [one.printed for one in bars], colors)

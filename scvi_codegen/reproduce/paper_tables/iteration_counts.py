@@ -1,4 +1,4 @@
-"""How many iterations Kepler's problem takes: as printed in Tables 8 and 9, by Picard iteration, by our solvers."""
+"""Iteration counts on Kepler's problem: as printed in Tables 8 and 9, by Picard iteration, by the package's solvers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 SPAN = 100.0
 COUNTS = (2, 5, 10, 15, 20)
-"""The values of N."""
+"""Values of N."""
 ECCENTRICITY: Mapping[int, float] = {8: 0.2, 9: 0.5}
 PRINTED: Mapping[int, Mapping[float, str]] = {
     8: {
@@ -60,12 +60,12 @@ PRINTED: Mapping[int, Mapping[float, str]] = {
         5.0: "-       -        -       -       -       15/279   -        65/433   -        114/607",
     },
 }
-"""By table and h: max/total for N = 2, 5, 10, 15, 20, SC and SVI each; a dash where the paper has none."""
+"""Counts by table and h: max/total for N = 2, 5, 10, 15, 20, SC and SVI each; a dash where the paper has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Iterations of a run: most of a step, all, and its largest relative energy error; or why it ended early."""
+    """Iterations of a run: largest per step, total, and its largest relative energy error; or why it failed."""
 
     largest: int | None
     total: int | None
@@ -74,23 +74,23 @@ class Count:
 
     @property
     def converged(self) -> bool:
-        """Whether every step did."""
+        """True if every step converged."""
         return self.total is not None
 
     @property
     def sound(self) -> bool:
-        """Whether besides the energy is not wrong by more than itself, as when the body escapes."""
+        """True if also the relative energy error is below 1; it is not if the body escapes."""
         return self.converged and self.energy < 1.0
 
 
 Setting: TypeAlias = tuple[float, int, str]
-"""Step size, N, scheme."""
+"""Step size, N and scheme."""
 
 Counts: TypeAlias = Mapping[Setting, Count]
 
 
 def printed_counts(number: int) -> Counts:
-    """The paper's table."""
+    """Return the paper's table."""
     columns = [(n, scheme) for n in COUNTS for scheme in reversed(SCHEMES)]
     return {
         (h, n, scheme): _parsed(cell)
@@ -108,12 +108,12 @@ def _parsed(cell: str) -> Count:
 
 @lru_cache(maxsize=4)
 def compiled_counts(number: int, solver: str) -> Counts:
-    """Of a solver of this project at the settings of a table, N counting points."""
+    """Return the counts of a solver of this package at the settings of a table, N counting points."""
     return {setting: compiled_count(ECCENTRICITY[number], *setting, solver) for setting in printed_counts(number)}
 
 
 def compiled_count(e: float, h: float, n: int, scheme: str, solver: str) -> Count:
-    """At one setting."""
+    """Return the count at one setting."""
     try:
         run = trajectory(SYSTEM, BY_POINTS.method(scheme, n), *perihelion(e), h=h, span=SPAN, solver=solver)
     except StepFailedError as error:
@@ -128,7 +128,7 @@ def compiled_count(e: float, h: float, n: int, scheme: str, solver: str) -> Coun
 
 @lru_cache(maxsize=16)
 def picard_counts(number: int, reading: Reading, tolerance: float = SECTION_3.tolerance) -> Counts:
-    """Of plain Picard iteration from a constant guess in every step, at the settings of a table."""
+    """Return the counts of Picard iteration from a constant guess in every step, at the settings of a table."""
     equations: Mapping[str, Callable[[int], Equations]] = {
         "SC": lambda n: spectral_collocation(reading.degree(n)),
         "SVI": lambda n: galerkin(reading.degree(n), n),
@@ -140,8 +140,8 @@ def picard_counts(number: int, reading: Reading, tolerance: float = SECTION_3.to
 
 
 def attraction(q: Array) -> Array:
-    """Accelerations of the mass at positions (n, 2)."""
-    with np.errstate(all="ignore"):  # iterates may run into the centre, or away: then they do not converge
+    """Return accelerations at positions (n, 2)."""
+    with np.errstate(all="ignore"):  # iterates that reach the centre or diverge do not converge
         found: Array = -q / np.hypot(q[:, :1], q[:, 1:]) ** 3
     return found
 
@@ -162,12 +162,12 @@ def _picard_count(e: float, h: float, equations: Equations, tolerance: float) ->
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Of counts with the printed ones: cells that converge or fail as printed, and the median ratio of all iterations.
+    """Agreement of counts with the printed ones.
 
     Attributes:
-        cells: of the table.
-        alike: that agree.
-        ratio: ours over theirs where both converge.
+        cells: number of cells of the table.
+        alike: number of cells that converge or fail as printed.
+        ratio: median ratio of all iterations, measured over printed, where both converge.
     """
 
     cells: int
@@ -176,7 +176,7 @@ class Agreement:
 
 
 def agreement(found: Counts, printed: Counts) -> Agreement:
-    """Cell by cell."""
+    """Compare counts cell by cell."""
     pairs = [(found[setting], count) for setting, count in printed.items()]
     ratios = [ours.total / theirs.total for ours, theirs in pairs if ours.total and theirs.total]
     return Agreement(len(pairs), sum(a.converged == b.converged for a, b in pairs), statistics.median(ratios))

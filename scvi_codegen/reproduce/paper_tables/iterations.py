@@ -1,4 +1,4 @@
-"""Tables 8 and 9: iterations that SC and SVI need on Kepler's problem, beside the printed numbers."""
+"""Tables 8 and 9: iterations of SC and SVI on Kepler's problem, and the printed numbers."""
 
 from __future__ import annotations
 
@@ -43,19 +43,19 @@ if TYPE_CHECKING:
 __all__ = ["EXPERIMENTS"]
 
 PICARD = "Picard, by points"
-"""What verdicts are on."""
+"""Iteration on which verdicts are based."""
 SOLVERS = ("fixed-point", "newton")
 TOLERANCES = (SECTION_3.tolerance, 1e-12, 1e-9)
 AS_PRINTED = 0.9
-"""The share of cells that converge or fail as printed from which on a table is found again."""
+"""Least share of cells that converge or fail as printed for a table to count as reproduced."""
 LARGE = 2.0
-"""From here on a step counts as large."""
+"""Least step size that counts as large."""
 EXAMPLE = (0.5, 5, "SVI")
-"""The setting that is also solved by Newton's method in full."""
+"""Setting that is also solved by Newton's method in Python."""
 
 
 def _all_counts(number: int) -> dict[str, Counts]:
-    """By what iterates."""
+    """Return the counts by iteration."""
     return {
         PICARD: picard_counts(number, BY_POINTS),
         "Picard, by degree": picard_counts(number, BY_DEGREE),
@@ -64,7 +64,7 @@ def _all_counts(number: int) -> dict[str, Counts]:
 
 
 def table(number: int, _: Mapping[str, Result]) -> Result:
-    """Table 8 or 9."""
+    """Return Table 8 or 9."""
     e, printed, found = ECCENTRICITY[number], printed_counts(number), _all_counts(number)
     return Result(
         name=f"table-{number}",
@@ -131,7 +131,7 @@ def _tolerances(number: int, printed: Counts) -> TableBlock:
 
 
 def _dashes(number: int, printed: Counts) -> Comparison:
-    """Where the iteration converges, and where the table has a dash."""
+    """Return the check of convergence: where the iteration fails, and where the table has a dash."""
     points, degree = (agreement(picard_counts(number, reading), printed) for reading in READINGS)
     others = [(t, agreement(picard_counts(number, BY_POINTS, t), printed)) for t in TOLERANCES]
     differing = [
@@ -150,7 +150,7 @@ def _dashes(number: int, printed: Counts) -> Comparison:
 
 
 def _pairs(found: Counts) -> Iterator[tuple[float, Count, Count]]:
-    """(h, SC, SVI) for every h and N."""
+    """Yield (h, SC, SVI) for every h and N."""
     for (h, n, scheme), count in found.items():
         if scheme == "SC":
             yield h, count, found[h, n, "SVI"]
@@ -186,12 +186,12 @@ def _stabler(name: str, found: Counts) -> Comparison:
 
 
 def _share(part: float) -> Verdict:
-    """Faster at nine settings of ten holds, at half of them or fewer it does not."""
+    """Return the verdict on a share: at least 0.9 holds, at most 0.5 does not."""
     return holds(part >= 0.9) if part >= 0.9 or part <= 0.5 else Verdict.PARTLY
 
 
 def _sound(found: Counts, least: float) -> tuple[int, int]:
-    """Settings with h >= least at which SC, and at which SVI stays bound."""
+    """Return the number of settings with h >= least at which SC, and at which SVI, remains bound."""
     pairs = [(sc.sound, svi.sound) for h, sc, svi in _pairs(found) if h >= least]
     return sum(sc for sc, _ in pairs), sum(svi for _, svi in pairs)
 
@@ -220,7 +220,7 @@ NOTE = "; in brackets: converged, energy error above 100 %"
 
 
 def draw_counts(tables: Mapping[str, Counts], figure: Figure) -> None:
-    """The tables one below the other: colour is iterations a step, grey is failure."""
+    """Draw the tables one below the other: colour is iterations per step, grey is failure."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
 

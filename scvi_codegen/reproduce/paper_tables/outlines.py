@@ -1,4 +1,4 @@
-"""Tables 5 and 10: the paper's algorithms beside the outline of the C that is generated for them."""
+"""Tables 5 and 10: the paper's algorithms and the outline of the C generated for them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PREFIX = "pendulum"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A step of an algorithm and where it is in the C text.
+    """Step of an algorithm and its counterpart in the C source.
 
     Attributes:
-        number: of the step.
-        text: as the paper has it.
-        counterpart: what stands for it, in a sentence.
-        evidence: fragments of text that must be found, by the function they must be in; ``""`` for the whole text.
+        number: number of the step.
+        text: text of the paper.
+        counterpart: description of its implementation, in a sentence.
+        evidence: fragments of source that must occur, by the function that contains them; ``""`` for the whole source.
     """
 
     number: int
@@ -152,12 +152,12 @@ SCVI_STEPS = (
 
 
 def table_5(results: Mapping[str, Result]) -> Result:
-    """SVI."""
+    """Return Table 5: SVI."""
     return _result("table-5", "The iterative algorithm of SVI", SVI(DEGREE), SVI_STEPS)
 
 
 def table_10(results: Mapping[str, Result]) -> Result:
-    """SCVI."""
+    """Return Table 10: SCVI."""
     remark = (
         "The multipliers, unknowns that the paper's algorithm does not have, make the derivative of L_d total: "
         "with them the step is symplectic.",
@@ -213,7 +213,7 @@ def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], rema
 
 
 def _missing(step: Step, code: str, functions: Mapping[str, Function]) -> list[str]:
-    """Fragments that are not where they should be."""
+    """Return the fragments that are not in the function where they should be."""
     return [
         fragment
         for name, fragments in step.evidence.items()

@@ -43,7 +43,7 @@ FAMILIES: Mapping[str, tuple[Callable[[int], Tableau], int, str]] = {
     "Radau IA": (radau_ia, 1, "Radau"),
     "Lobatto IIIA": (lobatto_iiia, 2, "Lobatto IIIA"),
 }
-"""Tableaux by number of stages, the smallest number, and the column of Table 4."""
+"""Tableaux as functions of the number of stages, the smallest number, and the column of Table 4."""
 
 MARKS: Mapping[str, tuple[str, ...]] = {
     "A-stable": ("Gauss", "Chebyshev", "Radau", "Lobatto IIIA"),
@@ -51,12 +51,12 @@ MARKS: Mapping[str, tuple[str, ...]] = {
     "symplectic": ("Gauss",),
     "superconvergent": ("Gauss",),
 }
-"""Table 4: the columns with a mark."""
+"""Columns with a mark in Table 4, by property."""
 
 
 @dataclass(frozen=True, slots=True)
 class Properties:
-    """Of one tableau, computed from its coefficients."""
+    """Properties of one tableau, computed from its coefficients."""
 
     family: str
     stages: int
@@ -65,7 +65,7 @@ class Properties:
 
 
 def properties(family: str, tableau: Tableau) -> Properties:
-    """A-stability by Sturm's and Routh's theorems, symmetry and symplecticity by their identities, order by B, C, D."""
+    """Return A-stability by Sturm's and Routh's theorems, symmetry, symplecticity, order by B(p), C(q), D(r)."""
     return Properties(
         family,
         tableau.stages,
@@ -91,7 +91,7 @@ def _all_properties() -> tuple[Properties, ...]:
 
 
 def table_4(results: Mapping[str, Result]) -> Result:
-    """Properties of collocation methods."""
+    """Return Table 4: properties of collocation methods."""
     found = _all_properties()
     return Result(
         name="table-4",
@@ -121,7 +121,7 @@ def _property_table(found: Sequence[Properties]) -> TableBlock:
 
 
 def _mark_check(name: str, found: Sequence[Properties]) -> Comparison:
-    """Whether the marks of one row are right for every family and number of stages."""
+    """Return the check of the marks of one row for every family and number of stages."""
     agreeing, others = 0, []
     for family, (_, _, column) in FAMILIES.items():
         expected = column in MARKS[name]
@@ -167,7 +167,7 @@ def _stability_check(found: Sequence[Properties]) -> Comparison:
 
 
 def _listed(stages: Sequence[int]) -> str:
-    """``1, 3 stages``."""
+    """Return stages as text: ``1, 3 stages``."""
     if not stages:
         return "no number of stages"
     return f"{', '.join(map(str, stages))} stage{'s' * (list(stages) != [1])}"
@@ -178,7 +178,7 @@ def _joined(names: Sequence[str]) -> str:
 
 
 def draw_marks(found: Sequence[Properties], figure: Figure) -> None:
-    """A panel a property: families down, stages across, a filled square where it holds."""
+    """Draw a panel for each property: families down, stages across, a filled square where it holds."""
     families = list(dict.fromkeys(one.family for one in found))
     for axes, name in zip(panels(figure, 2, 2), MARKS, strict=True):
         for one in found:

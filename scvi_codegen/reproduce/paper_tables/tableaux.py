@@ -1,4 +1,4 @@
-"""Tables 1 to 3: the Gauss tableaux as printed against the collocation integrals (23)."""
+"""Tables 1 to 3: the Gauss tableaux as printed, compared with the collocation integrals (23)."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ PRINTED: Mapping[int, tuple[str, ...]] = {
         "2*w1, 2*v1, 2*v1, 2*w1",
     ),
 }
-"""Rows c_i : a_i1, .., a_is and at last b_1, .., b_s, as the paper prints them; v stands for w'."""
+"""Rows c_i : a_i1, .., a_is and finally b_1, .., b_s, as the paper prints them; v denotes w'."""
 
 CORRECTED: Mapping[int, tuple[tuple[int, int, str], ...]] = {3: ((2, 3, "w1 + v3 - w4"),)}
-"""Entries of A, counted from 0, that stand here in place of the printed ones when a table is typeset."""
+"""Corrected entries of A (indices from 0), used when a table is typeset."""
 
 LETTERS: Mapping[str, str] = {
     "w1": "1/8 - sqrt(30)/144",
@@ -64,23 +64,23 @@ LETTERS: Mapping[str, str] = {
     "w5": "w2 - 2*w3",
     "v5": "v2 - 2*v3",
 }
-"""What Table 3 is written in."""
+"""Symbols in which Table 3 is written."""
 
 NAMES = {letter: sympy.Symbol(f"w_{letter[1]}" if letter[0] == "w" else f"w__'_{letter[1]}") for letter in LETTERS}
 
 
 def table_1(results: Mapping[str, Result]) -> Result:
-    """Gauss method of order 4."""
+    """Return Table 1: Gauss method of order 4."""
     return _gauss_table(1, 2)
 
 
 def table_2(results: Mapping[str, Result]) -> Result:
-    """Gauss method of order 6."""
+    """Return Table 2: Gauss method of order 6."""
     return _gauss_table(2, 3)
 
 
 def table_3(results: Mapping[str, Result]) -> Result:
-    """Gauss method of order 8."""
+    """Return Table 3: Gauss method of order 8."""
     return _gauss_table(3, 4)
 
 
@@ -107,7 +107,7 @@ def _gauss_table(number: int, s: int) -> Result:
 
 
 def _rows(number: int) -> tuple[list[str], list[list[str]]]:
-    """Texts of c, then of the rows of A and b."""
+    """Return the texts of c, then of the rows of A and b."""
     *stages, weights = PRINTED[number]
     split = [row.split(" : ") for row in stages]
     return [c for c, _ in split], [row.split(", ") for row in (*(row for _, row in split), weights)]
@@ -125,7 +125,7 @@ def _letter_values() -> dict[str, sympy.Expr]:
 
 
 def _printed(number: int, letters: Mapping[str, sympy.Expr]) -> Exact:
-    """(A, b, c) as the paper prints them."""
+    """Return (A, b, c) as the paper prints them."""
     abscissae, rows = _rows(number)
     *A, b = (tuple(_expression(text, letters) for text in row) for row in rows)
     return tuple(A), b, tuple(_expression(text, letters) for text in abscissae)
@@ -209,7 +209,7 @@ def _common(exact: bool, printed: bool) -> Verdict:
 
 
 def order_residuals(exact: Exact) -> Iterator[sympy.Expr]:
-    """What B(2s), C(s), D(s) leave, expanded; Butcher's theorem makes order 2s of them if all vanish."""
+    """Yield the residuals of B(2s), C(s), D(s), expanded; if all are 0 the order is 2s (Butcher's theorem)."""
     A, b, c = exact
     s, one = len(b), sympy.S.One
     for k in range(1, 2 * s + 1):
@@ -222,7 +222,7 @@ def order_residuals(exact: Exact) -> Iterator[sympy.Expr]:
 
 
 def symplectic_residuals(exact: Exact) -> Iterator[sympy.Expr]:
-    """b_i a_ij + b_j a_ji - b_i b_j for i <= j, expanded."""
+    """Yield b_i a_ij + b_j a_ji - b_i b_j for i <= j, expanded."""
     A, b, _ = exact
     for i in range(len(b)):
         for j in range(i, len(b)):

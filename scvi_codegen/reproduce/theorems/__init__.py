@@ -1,4 +1,4 @@
-"""The lemmas and theorems of the paper, measured."""
+"""Lemmas and theorems of the paper, checked numerically."""
 
 from __future__ import annotations
 
@@ -7,4 +7,4 @@ from scvi_codegen.reproduce.theorems import collocation, kronecker, order, rates
 __all__ = ["EXPERIMENTS"]
 
 EXPERIMENTS = (kronecker.EXPERIMENT, collocation.EXPERIMENT, order.EXPERIMENT, *rates.EXPERIMENTS)
-"""In the paper's order."""
+"""Experiments in the paper's order."""

@@ -1,11 +1,11 @@
 """Theorem 2.1: the collocation method (22) is the Runge-Kutta method with the coefficients (23).
 
-Both sides are computed from their definitions and have nothing in common. On the left the polynomial u of degree s,
+Both sides are computed from their definitions, independently. The left side is the polynomial u of degree s,
 
     u(t0) = q0,    u'(t0 + c_i h) = f(u(t0 + c_i h)),    q1 = u(t0 + h),
 
-is found by its coefficients in powers of time, of which (23) knows nothing. On the right the stage equations are solved
-with the tableau.
+determined by its coefficients in powers of time, without (23). On the right side the stage equations are solved with
+the tableau.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ STAGES = (1, 2, 3, 4, 5)
 COMPILED_STAGES = 3
 STEP = mp.mpf(1) / 10
 LEAST_STAGES = {"gauss": 1, "radau-iia": 1, "lobatto-iiia": 2, "chebyshev-gauss": 1, "chebyshev-lobatto": 2}
-"""Families of :mod:`scvi_codegen.tables.tableau`."""
+"""Smallest numbers of stages of the families of :mod:`scvi_codegen.tables.tableau`."""
 NODES = {"spectral collocation": "chebyshev-lobatto", "equispaced": "equispaced"}
-"""Nodes x_0 .. x_s of which x_1 .. x_s, moved to [0, 1], are the abscissae."""
+"""Names of nodes x_0 .. x_s whose x_1 .. x_s, mapped to [0, 1], are the abscissae."""
 FAMILIES = (*LEAST_STAGES, *NODES, "irregular")
 STATES = {
     "planar-pendulum": ("0.7", "0.4"),
@@ -67,7 +67,7 @@ FIELDS: Mapping[str, Field] = {"planar-pendulum": _pendulum, "kepler": _kepler}
 
 
 def abscissae(family: str, s: int) -> Vector:
-    """The s collocation points of a family in [0, 1]."""
+    """Return the s collocation points of a family in [0, 1]."""
     if family in LEAST_STAGES:
         return tableau_by_name(f"{family}:{s}").c
     if family == "irregular":
@@ -76,7 +76,7 @@ def abscissae(family: str, s: int) -> Vector:
 
 
 def fixed_point(step: Field, first: Array) -> Array:
-    """The limit of first, step(first), step(step(first)) ..., to 54 digits."""
+    """Return the limit of first, step(first), step(step(first)) ..., to 54 digits."""
     here = first
     for _ in range(500):
         following = step(here)
@@ -87,7 +87,7 @@ def fixed_point(step: Field, first: Array) -> Array:
 
 
 def collocation_step(f: Field, start: Array, h: Any, c: Sequence[Any]) -> Array:
-    """(22): u(t0 + h x) = start + sum_k g_k x^k with u' = f(u) at the points."""
+    """Return the step (22): u(t0 + h x) = start + sum_k g_k x^k with u' = f(u) at the points."""
     powers = np.arange(1, len(c) + 1)
     x = np.array(c, dtype=object)[:, None]
     values, slopes = x**powers, powers * x ** (powers - 1)
@@ -101,7 +101,7 @@ def collocation_step(f: Field, start: Array, h: Any, c: Sequence[Any]) -> Array:
 
 
 def tableau_step(f: Field, start: Array, h: Any, tableau: Tableau) -> Array:
-    """The Runge-Kutta step."""
+    """Return the Runge-Kutta step."""
     A, b = np.array(tableau.A, dtype=object), np.array(tableau.b, dtype=object)
 
     def step(K: Array) -> Array:
@@ -120,7 +120,7 @@ def _start(name: str) -> Array:
 
 
 def _integral_defect(tableau: Tableau) -> float:
-    """How far A and b are from the integrals of polynomials of degree below s, which (23) makes exact."""
+    """Return the error of A and b as integrals of polynomials of degree below s, for which (23) is exact."""
     c, rows = tableau.c, (*tableau.A, tableau.b)
     ends = (*c, mp.one)
     return float(
@@ -133,7 +133,7 @@ def _integral_defect(tableau: Tableau) -> float:
 
 
 def _row(family: str, tableau: Tableau) -> tuple[str, int, int, float, float, float]:
-    """Family, s, order, defect of (23), difference of both sides for each problem."""
+    """Return family, s, order, defect of (23), and the difference of both sides for each problem."""
     differences = []
     for name, f in FIELDS.items():
         both = collocation_step(f, _start(name), STEP, tableau.c), tableau_step(f, _start(name), STEP, tableau)
@@ -143,7 +143,7 @@ def _row(family: str, tableau: Tableau) -> tuple[str, int, int, float, float, fl
 
 
 def _compiled_difference(family: str, name: str) -> float:
-    """The compiled Runge-Kutta step with three stages against the collocation polynomial."""
+    """Return the difference of the compiled Runge-Kutta step of three stages and the collocation polynomial."""
     c = abscissae(family, COMPILED_STAGES)
     start = _start(name).astype(float)
     method = RungeKutta(collocation_tableau(c, f"{family.replace(' ', '-')}:{COMPILED_STAGES}"))

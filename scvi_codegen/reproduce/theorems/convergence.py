@@ -1,8 +1,8 @@
-"""Errors of discrete Lagrangians, Legendre transforms and maps against the exact ones, and their rates.
+"""Errors of discrete Lagrangians, Legendre transforms and maps relative to the exact ones, and their rates.
 
-The exact quantities come from :mod:`scvi_codegen.exact.discrete_lagrangian` with 18 digits, those of a method from its
-compiled integrator in double precision; rates are fitted to errors above :data:`PLATEAU`, below which round-off is
-seen.
+The exact quantities are computed by :mod:`scvi_codegen.exact.discrete_lagrangian` with 18 digits, those of a method by
+its compiled integrator in double precision; rates are fitted to errors above :data:`PLATEAU`, below which round-off
+dominates.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ STARTS: Mapping[str, tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]] = 
 }
 """Positions and velocities; the largest error of three trajectories does not vanish by accident."""
 QUICK_FLAGS = ("-O0", "-ffp-contract=off")
-"""For a few steps with each of a hundred integrators: the compiler takes a third of the time, results are the same."""
+"""Compiler flags for a few steps with each of a hundred integrators: compiling takes a third of the time."""
 PLATEAU = 1e-13
 DIGITS = 18
 QUANTITIES = {"action": "L_d", "legendre": "Legendre transforms", "map": "map"}
 SHOWN = QUANTITIES | {"action": "$L_d$"}
-"""As set in pictures."""
+"""Names in pictures."""
 TITLES = {"planar-pendulum": "pendulum", "kepler": "Kepler"}
 START = (
     "The theorem names no problem: the pendulum and Kepler's problem, each from three states (q; q') without symmetry: "
@@ -79,22 +79,22 @@ METHODS: Mapping[str, Callable[[int], SCVI | SVI]] = {
     FEW: lambda s: SCVI(s, gauss_legendre(max(1, s // 2))),
     PRINTED: lambda s: SCVI(s, variational=False),
 }
-"""By name, for a degree; s Gauss points where the name does not say otherwise."""
+"""Methods as functions of the degree; s Gauss points unless the name says otherwise."""
 SMALLEST = 3
-"""So many of the smallest steps above the plateau decide a slope."""
+"""Number of the smallest step sizes above the plateau that determine a slope."""
 CURVE = SVI(8)
 CURVE_STEPS = 16
-"""The exact curve inside a step, to round-off."""
+"""Number of steps for the exact curve inside a step, to round-off."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapErrors:
-    """Largest errors in one step; NaN where a method has no such thing or its equations have no solution.
+    """Largest errors in one step; NaN if a method has no such quantity or its equations have no solution.
 
     Attributes:
-        action: of L_d(q0, q1).
-        legendre: of p0 and p1 = F-, F+ L_d(q0, q1).
-        map: of (q1, p1) from (q0, p0).
+        action: error of L_d(q0, q1).
+        legendre: error of p0 and p1 = F-, F+ L_d(q0, q1).
+        map: error of (q1, p1) from (q0, p0).
     """
 
     action: float
@@ -104,7 +104,7 @@ class MapErrors:
 
 @lru_cache(maxsize=8)
 def system_named(name: str) -> LagrangianSystem:
-    """The problem's system, one object a process."""
+    """Return the problem's system, one object per process."""
     system = problem(name).system
     assert isinstance(system, LagrangianSystem)
     return system
@@ -112,19 +112,19 @@ def system_named(name: str) -> LagrangianSystem:
 
 @lru_cache(maxsize=512)
 def quick_stepper(name: str, method: Method) -> Stepper:
-    """The integrator, compiled for a few steps."""
+    """Return the integrator, compiled for a few steps."""
     return compile_stepper(system_named(name), method, flags=QUICK_FLAGS)
 
 
 @lru_cache(maxsize=256)
 def exact_steps(name: str, h: float) -> tuple[ExactStep, ...]:
-    """The exact steps from the starts of a problem (in which velocities are momenta)."""
+    """Return the exact steps from the starts of a problem (whose velocities are momenta)."""
     return tuple(exact_map(system_named(name), q, v, h, digits=DIGITS) for q, v in STARTS[name])
 
 
 @lru_cache(maxsize=4096)
 def errors(name: str, method: Method, h: float) -> MapErrors:
-    """One step of a method against the exact one, the worst of the starts."""
+    """Return the errors of one step of a method, the largest over the starts."""
     found = [_errors(quick_stepper(name, method), exact, h) for exact in exact_steps(name, h)]
     worst = np.max([(error.action, error.legendre, error.map) for error in found], axis=0)
     return MapErrors(*map(float, worst))
@@ -156,7 +156,7 @@ def _largest(*pairs: tuple[Array, Array]) -> float:
 
 @lru_cache(maxsize=256)
 def quadrature_error(name: str, rule: Quadrature, h: float) -> float:
-    """The error of (h/2) sum_n w_n L(q(t_n), q'(t_n)) with the exact solution q, the worst of the starts."""
+    """Return the error of (h/2) sum_n w_n L(q(t_n), q'(t_n)) on the exact solution q, the largest over the starts."""
     weights = np.array(rule.unit_weights, dtype=float)
     return max(
         float(abs(h * weights @ _along(name, exact, h, rule) - float(exact.action))) for exact in exact_steps(name, h)
@@ -164,7 +164,7 @@ def quadrature_error(name: str, rule: Quadrature, h: float) -> float:
 
 
 def _along(name: str, exact: ExactStep, h: float, rule: Quadrature) -> Array:
-    """L at the points of a rule, all after the start, along the exact solution."""
+    """Return L at the points of a rule, all after the start, along the exact solution."""
     stepper, values = quick_stepper(name, CURVE), []
     q0, p0 = _floats(exact.q0, exact.p0)
     for c in map(float, rule.abscissae):
@@ -175,7 +175,7 @@ def _along(name: str, exact: ExactStep, h: float, rule: Quadrature) -> Array:
 
 
 def slope(h: Sequence[float], error: Sequence[float]) -> float:
-    """The exponent r of error = C h^r at the smallest steps whose error is above the plateau; NaN if there are few."""
+    """Return the exponent r of error = C h^r at the smallest steps above the plateau; NaN if there are few."""
     seen = [(x, y) for x, y in zip(h, error, strict=True) if y > PLATEAU]
     if len(seen) < SMALLEST:
         return math.nan
@@ -184,7 +184,7 @@ def slope(h: Sequence[float], error: Sequence[float]) -> float:
 
 
 def rate(degree: Sequence[int], error: Sequence[float]) -> tuple[float, float]:
-    """(C, K) of error = C K^degree, fitted to the errors above the plateau; NaN if there are less than three."""
+    """Return (C, K) of error = C K^degree, fitted to the errors above the plateau; NaN with fewer than three."""
     seen = [(x, y) for x, y in zip(degree, error, strict=True) if y > PLATEAU]
     if len(seen) < SMALLEST:
         return math.nan, math.nan
@@ -193,5 +193,5 @@ def rate(degree: Sequence[int], error: Sequence[float]) -> tuple[float, float]:
 
 
 def cell(value: float) -> float | None:
-    """A cell of a table; NaN becomes empty."""
+    """Return a cell of a table; NaN becomes empty."""
     return None if math.isnan(value) else value

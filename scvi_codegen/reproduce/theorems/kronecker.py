@@ -1,4 +1,4 @@
-"""Section 2.1.1: spectral collocation in matrices, (18) and (21), by Lemmas 2.1 and 2.2."""
+"""Section 2.1.1: spectral collocation in matrix form, (18) and (21), by Lemmas 2.1 and 2.2."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ TITLE = "Spectral collocation with Kronecker products, (18) and (21)"
 FORMS = {"position": "18", "phase-space": "21"}
 SHOWN_DEGREE, DEGREES = 2, (1, 2, 3)
 STATES = {"planar-pendulum": (("0.7",), ("0.4",)), "double-pendulum": (("0.7", "-0.4"), ("0.3", "0.2"))}
-"""(q, p); the mass matrix of the second is full and not constant."""
+"""States (q, p); the mass matrix of the second system is full and not constant."""
 STEP = mp.mpf(1) / 10
 VANISHES = 1e-40
 
 
 def lemma_differences() -> tuple[sympy.Matrix, sympy.Matrix]:
-    """Left less right of Lemma 2.1 for matrices of letters, 2 x 3, 3 x 2 and 2 x 4, and of Lemma 2.2 for columns."""
+    """Return left less right side of Lemma 2.1 (symbolic 2 x 3, 3 x 2, 2 x 4) and of Lemma 2.2 (columns)."""
     A, B, C = _letters("a", 2, 3), _letters("b", 3, 2), _letters("c", 2, 4)
     left, right = _letters("a", 3, 1), _letters("b", 4, 1)
     first = _vec(A * B * C) - sympy.kronecker_product(A, C.T) * _vec(B)
@@ -50,12 +50,12 @@ def _letters(name: str, rows: int, columns: int) -> sympy.Matrix:
 
 
 def _vec(matrix: sympy.Matrix) -> sympy.Matrix:
-    """Definition 2.2: rows stacked atop one another."""
+    """Return the rows of a matrix stacked atop one another (Definition 2.2)."""
     return sympy.Matrix(list(matrix))
 
 
 def residual(name: str, form: str, degree: int) -> float:
-    """The largest row of (18) or (21) where the written-out equations of the step were solved, in 60 digits."""
+    """Return the largest row of (18) or (21) at the solution of the scalar equations of the step, in 60 digits."""
     system, method = problem(name).system, SpectralCollocation(degree, form=form)
     derived, (q, p) = derive(system, method), STATES[name]
     solved = derived_step(system, method)([*map(mp.mpf, q)], [*map(mp.mpf, p)], STEP)
@@ -67,7 +67,7 @@ def residual(name: str, form: str, degree: int) -> float:
 
 
 def _example() -> MatrixForm:
-    """Of two coordinates; the entries are the same for every system."""
+    """Return the matrix form for two coordinates; the entries are the same for every system."""
     return derive(problem("double-pendulum").system, SpectralCollocation(SHOWN_DEGREE)).matrix_form()
 
 
@@ -94,7 +94,7 @@ def _body() -> Iterator[Block]:
 
 
 def _scaled(matrix: sympy.Matrix, factor: sympy.Expr) -> sympy.Expr:
-    """The factor before a matrix of rationals."""
+    """Return a matrix as a factor times a matrix of rationals."""
     rational = (matrix / factor).applyfunc(lambda entry: sympy.nsimplify(sympy.simplify(entry), rational=True))
     return sympy.MatMul(factor, sympy.ImmutableMatrix(rational), evaluate=False)
 

@@ -45,7 +45,7 @@ STEPS = {
     "kepler": tuple(2 ** (-k / 2) for k in range(10)),
 }
 MISS = 0.35
-"""By which a fitted exponent may miss an integer."""
+"""Largest distance of a fitted exponent from an integer."""
 CURTIS = "Clenshaw-Curtis"
 
 
@@ -64,12 +64,12 @@ class Order:
 
     @property
     def bound(self) -> int:
-        """Theorem 4.1."""
+        """Order by Theorem 4.1."""
         return min(self.p, self.q)
 
     @property
     def expected(self) -> int:
-        """The error of L_d is quadratic in that of the curve; a Galerkin curve depends on the quadrature, too."""
+        """Order by the quadratic dependence of L_d on the curve; a Galerkin curve also depends on the quadrature."""
         galerkin = self.label.startswith(GALERKIN)
         return min(2 * self.degree, self.q, 2 * (self.q - self.degree + 1) if galerkin else self.q)
 

@@ -1,4 +1,4 @@
-"""Panels of errors on logarithmic axes, against the step or the degree."""
+"""Panels of errors on logarithmic axes, over the step size or the degree."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["Panel", "Series", "draw_panels"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """One curve.
+    """Curve of a panel.
 
     Attributes:
-        x, y: as many numbers each; NaN and 0 are left out.
-        scheme: a key of ``COLORS``.
-        label: for the legend, or ``""``.
+        x, y: coordinates, equally many; NaN and 0 are omitted.
+        scheme: key of ``COLORS``.
+        label: text for the legend, or ``""``.
         end: text at the last point, outwards, or ``""``.
-        marker, line: of Matplotlib.
+        marker, line: styles of Matplotlib.
     """
 
     x: Sequence[float]
@@ -40,7 +40,7 @@ class Series:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Panel:
-    """One pair of axes; ``steps`` says that x is a step, on a logarithmic axis, not a degree."""
+    """Pair of axes; with ``steps`` x is a step size on a logarithmic axis, otherwise a degree."""
 
     title: str
     series: tuple[Series, ...]
@@ -48,7 +48,7 @@ class Panel:
 
 
 def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel, ...], floor: float) -> None:
-    """All panels row by row; errors below ``floor`` are round-off and shaded."""
+    """Draw all panels row by row; errors below ``floor`` are round-off and shaded."""
     for index, (axes, panel) in enumerate(zip(panels(figure, rows, columns), content, strict=True)):
         for series in panel.series:
             _draw(axes, series)

@@ -1,4 +1,4 @@
-"""Theorems 4.2 and 4.3: geometric convergence in the degree, at a fixed step."""
+"""Theorems 4.2 and 4.3: geometric convergence in the degree, at a fixed step size."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _rates() -> Rates:
 
 
 def _bases(rates: Rates, label: str) -> str:
-    """The three K of a method on both problems, as text."""
+    """Return the three K of a method on both problems, as text."""
     parts = []
     for name, title in TITLES.items():
         values = ", ".join(f"{rates[name, label, key][1]:.3f}" for key in QUANTITIES)
@@ -139,13 +139,13 @@ def _run_rates(_: Mapping[str, Result]) -> Result:
 
 
 CASES = {FULL: DEGREES, FEW: (2, 4, 6, 8)}
-"""Degrees; that of the rule with few points grows with every other degree."""
+"""Degrees; with few points the rule changes with every other degree."""
 LARGEST_RATIO = 10.0
-"""Of the error of L_d to what bounds it: stands for h times the Lipschitz constant of L."""
+"""Bound on the error of L_d relative to its bound: h times the Lipschitz constant of L."""
 
 
 def _parts(name: str, label: str) -> dict[str, list[float]]:
-    """Errors by degree of the collocation method, the quadrature and L_d."""
+    """Return the errors of the collocation method, the quadrature and L_d by degree."""
     h, methods = STEP[name], [METHODS[label](s) for s in CASES[label]]
     return {
         "collocation": [errors(name, SpectralCollocation(method.degree), h).map for method in methods],
