@@ -41,7 +41,7 @@ part = np.linspace(0.0, 1.0, RODS + 1)[1:-1]
 depth = np.sqrt(LENGTH**2 - WIDTH**2) * np.minimum(part, 1.0 - part)
 q, p = stepper.project(np.column_stack([part * WIDTH, -depth]).ravel())
 began = perf_counter()
-run = stepper.integrate(q, p, h=2e-3, steps=3000, every=100)
+run = stepper.integrate(q, p, h=2e-3, steps=3000, save_every=100)
 print(f"{1e6 * (perf_counter() - began) / 3000:.0f} us a step")
 print(f"rods are off their length by {np.abs(run.constraint_values()[0]).max():.0e}")
 

@@ -14,7 +14,7 @@ sys.modules["sympy"] = None                # from here on, importing SymPy is an
 import pendulum_svi
 
 stepper = pendulum_svi.stepper
-run = stepper.integrate([2.0], [0.0], h=0.1, steps=100_000, every=100)
+run = stepper.integrate([2.0], [0.0], h=0.1, steps=100_000, save_every=100)
 print(stepper.title)
 print(f"100000 steps, energy error {abs(run.energy() / run.energy()[0] - 1).max():.1e}")
 """

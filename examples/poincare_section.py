@@ -14,7 +14,7 @@ stepper = sc.compile_stepper(problem.system, sc.SVI(8), events=sc.Event("x", dir
 
 def orbit(energy: float, y: float, p_y: float) -> sc.Trajectory:
     p_x = np.sqrt(2 * energy - p_y**2 - y**2 + 2 * y**3 / 3)
-    return stepper.integrate([0.0, y], [p_x, p_y], h=0.4, steps=40_000, every=40_000)
+    return stepper.integrate([0.0, y], [p_x, p_y], h=0.4, steps=40_000, save_every=40_000)
 
 
 for energy, name in ((1 / 12, "regular"), (1 / 8, "mixed"), (1 / 6, "chaotic")):

@@ -28,7 +28,7 @@ STEP = 4.0  # days, of ours
 
 def here(model: Model) -> np.ndarray:
     q, v = model.start
-    run = model.stepper.integrate(q, velocity=v, h=STEP, steps=round(T[-1] / STEP), every=round(T[1] / STEP))
+    run = model.stepper.integrate(q, velocity=v, h=STEP, steps=round(T[-1] / STEP), save_every=round(T[1] / STEP))
     return run.q.reshape(len(T), -1, 3)
 
 

@@ -71,7 +71,7 @@ class Model:
         seen = np.stack([asteroids.heliocentric(name) for name in self.asteroids], axis=1)
         q, v = self.state(then, sun + seen)
         steps = int(then / 2.0)
-        run = self.stepper.integrate(q, velocity=v, t=then, h=-2.0, steps=steps, every=steps)
+        run = self.stepper.integrate(q, velocity=v, t=then, h=-2.0, steps=steps, save_every=steps)
         return self.state(0.0, np.array([self.places(each[-1])[len(BODIES) :] for each in (run.q, run.velocity)]))
 
     def state(self, t: float, small: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -85,19 +85,21 @@ class Model:
         """Coordinates by bodies: (..., bodies, 3)."""
         return q[..., : 3 * len(self.bodies)].reshape(*q.shape[:-1], -1, 3)
 
-    def runs(self, h: float, every: int) -> tuple[sc.Trajectory, sc.Trajectory]:
+    def runs(self, h: float, save_every: int) -> tuple[sc.Trajectory, sc.Trajectory]:
         """Back and forth from the epoch, to the ends of the ephemeris, by steps of h days."""
         q, v = self.start
         spans = ((-h, -ephemeris.FIRST), (h, ephemeris.LAST))
         back, forth = (
-            self.stepper.integrate(q, velocity=v, h=step, steps=int(days / h / every) * every, every=every)
+            self.stepper.integrate(
+                q, velocity=v, h=step, steps=int(days / h / save_every) * save_every, save_every=save_every
+            )
             for step, days in spans
         )
         return back, forth
 
-    def motion(self, h: float, every: int) -> tuple[np.ndarray, np.ndarray]:
+    def motion(self, h: float, save_every: int) -> tuple[np.ndarray, np.ndarray]:
         """Times in ascending order, and positions (times, bodies, 3)."""
-        back, forth = self.runs(h, every)
+        back, forth = self.runs(h, save_every)
         q = np.concatenate([back.q[:0:-1], forth.q])
         return np.concatenate([back.t[:0:-1], forth.t]), self.places(q)
 

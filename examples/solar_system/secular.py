@@ -135,7 +135,7 @@ def recorded(folder: Path, steps: int, hours: float, *, plain: bool) -> sc.Recor
         masses, q, v, rings = bodies()
         stepper = stepper_of(masses, rings, pole(masses, q, v), plain=plain)
         run = sc.record_run(
-            stepper.start(q.ravel(), velocity=v.ravel(), h=STEP), folder, steps=steps, every=EVERY, stop=stop
+            stepper.start(q.ravel(), velocity=v.ravel(), h=STEP), folder, steps=steps, save_every=EVERY, stop=stop
         )
     seconds, done = time.process_time() - began, EVERY * (len(run) - before)
     each = f" ({1e6 * seconds / done:.2f} us a step)" if done else ""

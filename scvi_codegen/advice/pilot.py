@@ -163,7 +163,7 @@ class Pilot:
         """Perform one more run, sampled as often as its number of steps allows."""
         began = time.perf_counter()
         try:
-            trajectory = self.integrate(self.q, h=self.length / n, steps=n, every=n // math.gcd(n, SAMPLES))
+            trajectory = self.integrate(self.q, h=self.length / n, steps=n, save_every=n // math.gcd(n, SAMPLES))
         except StepFailedError as failure:
             self.legs[n] = Leg(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
         else:
@@ -189,7 +189,7 @@ class Pilot:
         steps = min(most, int(self.span / h))
         nudged = self.q + NUDGE * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
         try:
-            one, other = (self.integrate(q, h=h, steps=steps, every=1).q[1:] for q in (self.q, nudged))
+            one, other = (self.integrate(q, h=h, steps=steps, save_every=1).q[1:] for q in (self.q, nudged))
         except StepFailedError:
             return 0.0
         apart = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)

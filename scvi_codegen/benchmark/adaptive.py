@@ -132,7 +132,7 @@ def _by_so_many(stepper: Stepper, span: float, count: int, q: Array, p: Array) -
 
 
 def _whole(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array) -> Callable[[], Array]:
-    return lambda: stepper.integrate(q, p, every=LAST, check_growth=False, **arguments).q[-1]
+    return lambda: stepper.integrate(q, p, save_every=LAST, check_growth=False, **arguments).q[-1]
 
 
 def adaptive_reference(chosen: Case, momenta: Array | None = None) -> Reference:

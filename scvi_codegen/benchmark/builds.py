@@ -89,7 +89,7 @@ def _runner(name: str, degree: int, steps: int, command: str, flags: tuple[str, 
         stepper = compile_stepper(chosen.system, SVI(degree), flags=flags)
     stepper.prepare(adaptive=False)
     start: dict[str, Any] = {"q": chosen.q, "velocity": chosen.velocity, "p": chosen.p}
-    return lambda: stepper.integrate(**start, h=chosen.step, steps=steps, every=steps)
+    return lambda: stepper.integrate(**start, h=chosen.step, steps=steps, save_every=steps)
 
 
 @contextmanager

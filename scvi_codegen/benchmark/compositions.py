@@ -113,7 +113,7 @@ def _point(stepper: Any, chosen: Case, momenta: Any, count: int, exact: Referenc
         for _ in range(REPEATS):
             run = stepper.start(q, p, h=chosen.span / count)
             began = time.process_time()
-            trajectory = run.record(count, every=count)
+            trajectory = run.record(count, save_every=count)
             best = min(best, time.process_time() - began)
             if best > 0.01:
                 break

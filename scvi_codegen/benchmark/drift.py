@@ -54,13 +54,13 @@ def drift_rows(chosen: Case, h: float, steps: int, *, with_heyoka: bool) -> list
     """Return one row per method, from the first state of a case."""
     stepper = compile_stepper(chosen.system, SVI(8))
     q, p = chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0])
-    every = max(1, steps // SAMPLES)
+    save_every = max(1, steps // SAMPLES)
     began = time.process_time()
-    run = stepper.integrate(q, p, h=h, steps=steps, every=every)
+    run = stepper.integrate(q, p, h=h, steps=steps, save_every=save_every)
     found = [("scvi-codegen", h, time.process_time() - began, run.q, run.p)]
     if with_heyoka:
         began = time.process_time()
-        states = heyoka_states(chosen, np.linspace(0.0, h * steps, steps // every + 1))
+        states = heyoka_states(chosen, np.linspace(0.0, h * steps, steps // save_every + 1))
         half = chosen.dimension
         found.append(("heyoka", float("nan"), time.process_time() - began, states[:, :half], states[:, half:]))
     return [

@@ -134,6 +134,6 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
 
 def _generated(stepper: Stepper, chosen: Case, h: float, count: int, every: int) -> tuple[Array, int]:
     run = stepper.integrate(
-        chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0]), h=h, steps=count, every=every
+        chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0]), h=h, steps=count, save_every=every
     )
     return run.q[1:], int(run.iterations.sum())

@@ -67,7 +67,7 @@ def _row(each: Lattice, method: str, h: float, steps: int) -> dict[str, Any]:
     given: dict[str, Any] = {"parameters": each.parameters, "tables": each.tables}
     began = time.process_time()
     run = stepper.integrate(
-        each.q, velocity=each.v, h=h, steps=steps, every=steps // SAMPLES or 1, observe=lambda run: run.t, **given
+        each.q, velocity=each.v, h=h, steps=steps, save_every=steps // SAMPLES or 1, observe=lambda run: run.t, **given
     )
     seconds = time.process_time() - began
     error = (run.energy() - run.energy()[0]) / run.energies[:, 0].max()

@@ -91,7 +91,7 @@ def _table(
 def _seconds(stepper: Stepper, chosen: Case, count: int) -> float:
     run = stepper.start(chosen.q[0], chosen.velocity[0], h=chosen.span / count, options=TOLERANCE)
     began = time.process_time()
-    run.record(count, every=count)
+    run.record(count, save_every=count)
     return time.process_time() - began
 
 

@@ -22,8 +22,8 @@ Examples:
   scvi-codegen run kepler --step 0.1 -o orbit.npz --plot orbit.png
   scvi-codegen run kepler --method gauss:4 --parameter mu=2 --q 1,0 --velocity 0,1.2
   scvi-codegen systems kepler > mine.toml              a model file to start from
-  scvi-codegen run mine.toml --span 1000 --every 10 -o orbit.csv
-  scvi-codegen run mine.toml --span 1e4 --every 1000 -o long.run    a folder: the run can be interrupted
+  scvi-codegen run mine.toml --span 1000 --save-every 10 -o orbit.csv
+  scvi-codegen run mine.toml --span 1e4 --save-every 1000 -o long.run    a folder: the run can be interrupted
   scvi-codegen run --resume long.run                                and goes on where it was
   scvi-codegen derive planar-pendulum --method svi:2 --quadrature gauss-legendre:2
   scvi-codegen derive kepler --html kepler.html        from L to the C on one page

@@ -55,7 +55,7 @@ class Choices:
     step: float | None
     span: float | None
     steps: int | None
-    every: int | None
+    save_every: int | None
     monitor: str | None = None
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
@@ -67,7 +67,7 @@ class Choices:
             "system": {"monitor": self.monitor},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
             "method": {name: getattr(self, name) for name in METHOD_CHOICES},
-            "run": {name: getattr(self, name) for name in ("step", "span", "steps", "every", "controller")},
+            "run": {name: getattr(self, name) for name in ("step", "span", "steps", "save_every", "controller")},
             "parameters": dict(self.parameter),
             "inputs": dict(self.inputs or ()),
             "sizes": dict(self.size or ()),
@@ -225,7 +225,7 @@ STATE_OPTIONS = (
     _option("--step", type=float, metavar="H", help="Step size; negative to go back; with --monitor of tau."),
     _option("--span", type=float, metavar="T", help="Length of time to cover."),
     _option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
-    _option("--every", type=int, metavar="N", help="Keep each N-th state."),
+    _option("--save-every", type=int, metavar="N", help="Keep each N-th state."),
     _option(
         "--monitor",
         metavar="G",

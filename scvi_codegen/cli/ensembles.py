@@ -90,7 +90,12 @@ def _work(
 ) -> Ensemble | EnsembleToEnds:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
-    common: dict[str, Any] = {"every": model.every, "t": model.t, "parameters": states.parameters, "options": options}
+    common: dict[str, Any] = {
+        "save_every": model.save_every,
+        "t": model.t,
+        "parameters": states.parameters,
+        "options": options,
+    }
     if model.system.inputs:
         inputs = model.all_inputs()
         return driven_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)

@@ -23,7 +23,7 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
     """Reject a run whose saved states do not fit into memory.
 
     Raises:
-        StateError: with the size needed and a ``--every`` at which the states fit.
+        StateError: with the size needed and a ``--save-every`` at which the states fit.
     """
     check_room(model, 0 if model.ends_at_time else model.step_count, trajectories)
 
@@ -35,22 +35,22 @@ def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
         StateError: as :func:`check_memory`.
     """
     folder = "write them into a folder as they come (-o NAME.run)"
-    check_states(len(model.q), steps, model.every, trajectories, ways=[folder] if trajectories == 1 else [])
+    check_states(len(model.q), steps, model.save_every, trajectories, ways=[folder] if trajectories == 1 else [])
 
 
-def check_states(m: int, steps: int, every: int, trajectories: int = 1, *, ways: Sequence[str] = ()) -> None:
+def check_states(m: int, steps: int, save_every: int, trajectories: int = 1, *, ways: Sequence[str] = ()) -> None:
     """Reject a run whose states, of ``m`` coordinates each, do not fit; ``ways`` are remedies to propose.
 
     Raises:
         StateError: as :func:`check_memory`.
     """
-    kept = steps // every + 1
+    kept = steps // save_every + 1
     each = 16 * m * trajectories + 12  # q and p of each; time and iterations
     room = usable_memory() / (COPIES * each)
     if kept <= room:
         return
     states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
-    ways = [*([f"keep fewer (--every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
+    ways = [*([f"keep fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
     needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
     raise StateError(f"{states} need {needed}: {' or '.join(ways or ['run fewer'])}")
 

@@ -153,7 +153,7 @@ class Recording:
             Path(folder),
             first=0,
             steps=None if run.goal else model.step_count,
-            every=model.every,
+            save_every=model.save_every,
             model=text,
             certificate=self.certificate,
         )

@@ -128,7 +128,7 @@ class _Portions:
 
     def stretch(self, steps: int | None) -> Trajectory:
         """Advance ``steps`` steps, or up to the target time of the run (``None``), and return the states."""
-        run, pieces = self.run, [self.run.record(0, every=self.model.every)]
+        run, pieces = self.run, [self.run.record(0, save_every=self.model.save_every)]
         last = None if steps is None else run.steps + steps
         while self.failure is None and not (run.arrived if last is None else run.steps >= last):
             self.stopped = bool(self.caught)
@@ -142,7 +142,7 @@ class _Portions:
         model, run = self.model, self.run
         began = time.perf_counter()
         try:
-            piece = run.record(steps, every=model.every)
+            piece = run.record(steps, save_every=model.save_every)
         except StepFailedError as error:
             self.failure, piece = error, Trajectory.before(error)
         elapsed = time.perf_counter() - began
@@ -156,7 +156,7 @@ class _Portions:
 def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
     """Integrate with steps of tau, dt = g dtau, to the end of the model's time span."""
     end, began, failure = model.t + model.covered, time.perf_counter(), None
-    observed = Observation(run, every=model.every, end=end)
+    observed = Observation(run, save_every=model.save_every, end=end)
     with interruptions() as caught, progress_bar(PARTS) as reach:
 
         def look(_: int) -> None:
@@ -213,7 +213,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
         *([] if _by_time(model) else whole_steps(model.span, model.step, model.step_count, model.t)),
     ]
     if run.steps:
-        lines.append(f"{_speed(outcome, model.every)}; prepared in {outcome.preparation:.2f} s")
+        lines.append(f"{_speed(outcome, model.save_every)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
             lines += conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
@@ -244,10 +244,12 @@ def of_length(h: float | None, run: Run) -> str:
     return f"of their own lengths ({run.rejected} rejected)" if run.goal or h is None else f"of {h:g}"
 
 
-def _speed(outcome: RunOutcome, every: int) -> str:
+def _speed(outcome: RunOutcome, save_every: int) -> str:
     text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
     driven = bool(outcome.run.stepper.interface.inputs)  # states at breakpoints and at the end are saved, too
-    watched = outcome.run.steps if driven else (len(outcome.trajectory) - 1) * every  # steps up to the last saved state
+    watched = (
+        outcome.run.steps if driven else (len(outcome.trajectory) - 1) * save_every
+    )  # steps up to the last saved state
     if not watched:
         return text
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"

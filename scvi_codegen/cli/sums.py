@@ -98,7 +98,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
     began, controlled = time.perf_counter(), model.h is None
     steps = math.inf if controlled else model.step_count
     if not controlled:
-        check_states(sum(np.size(values) for values in model.q.values()), model.step_count, model.every)
+        check_states(sum(np.size(values) for values in model.q.values()), model.step_count, model.save_every)
     stepper = model.stepper()
     run, failure = model.start(stepper, options=options, threads=threads), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
@@ -109,7 +109,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
             reach(int(PARTS * (run.t - model.t) / model.covered) if controlled else done)
 
         try:
-            record.follow(steps, model.every, progress=told, stop=lambda: bool(caught))
+            record.follow(steps, model.save_every, progress=told, stop=lambda: bool(caught))
         except StepFailedError as error:
             failure = error
     return SumsOutcome(

@@ -17,7 +17,7 @@ ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
-def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None, hessian: bool = False) -> Any:
+def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, hessian: bool = False) -> Any:
     """Return a fixed number of steps of a stepper as a ``casadi.Function``.
 
     It is an external function in compiled C, which CasADi calls without Python, with Jacobian and adjoint in CasADi's
@@ -29,22 +29,22 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None, hessi
     Args:
         stepper: compiled stepper.
         steps: number of steps.
-        every: save the initial state and every ``every``-th one; by default only the final state.
+        save_every: save the initial state and every ``save_every``-th one; by default only the final state.
         hessian: derive and compile exact second derivatives, too.
 
     Returns:
         A ``casadi.Function`` of q (m), p (m), parameters (k), such as ``stepper.defaults``, t and h, by position or by
-        name; t defaults to 0. Its values q1 and p1 are (m), with ``every`` (m, n), states in columns. If a step fails,
-        the call fails, and solvers shorten their step. States that violate the constraints are not projected; the first
-        step moves them onto the constraint manifold.
+        name; t defaults to 0. Its values q1 and p1 are (m), with ``save_every`` (m, n), states in columns. If a step
+        fails, the call fails, and solvers shorten their step. States that violate the constraints are not projected;
+        the first step moves them onto the constraint manifold.
 
     Raises:
         MethodError: in transformed time, for steps of a time-rescaling function, and for second derivatives with
             damping.
         MissingLibraryError: without CasADi (extra ``casadi``).
-        StateError: if ``steps`` is not a multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``save_every``.
     """
-    flow = Flow.checked(stepper, steps, every)
+    flow = Flow.checked(stepper, steps, save_every)
     ca = imported("casadi", "casadi")
     derivatives = flow.second_derivatives if hessian else flow.derivatives
     source = with_casadi_flow(derivatives, flow.steps, flow.spacing, second=hessian)
@@ -53,7 +53,7 @@ def casadi_flow(stepper: Stepper, *, steps: int, every: int | None = None, hessi
     sizes = (m, m, len(stepper.parameters), 1, 1)
     given = [ca.MX.sym(word, size) for word, size in zip(ARGUMENTS, sizes, strict=True)]
     states = ca.external(name, str(library.path))(ca.vertcat(*given))
-    states = states if flow.every else states[:, -1]
+    states = states if flow.save_every else states[:, -1]
     found = [states[:m, :], states[m:, :]]
     missing = float("nan")
     defaults = [missing, missing, missing if stepper.parameters else 0.0, 0.0, missing]

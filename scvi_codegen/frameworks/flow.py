@@ -23,15 +23,15 @@ class Flow:
     Attributes:
         stepper: compiled stepper.
         steps: number of steps.
-        every: steps between saved states, the first of which is the initial one; 0 to return only the final state.
+        save_every: steps between saved states, the first of which is the initial one; 0 to return only the final state.
     """
 
     stepper: Stepper
     steps: int
-    every: int
+    save_every: int
 
     @classmethod
-    def checked(cls, stepper: Stepper, steps: int, every: int | None) -> Self:
+    def checked(cls, stepper: Stepper, steps: int, save_every: int | None) -> Self:
         """Return a flow for arguments of users.
 
         Raises:
@@ -40,13 +40,15 @@ class Flow:
         """
         stepper.check_steps_of_h("a flow")
         steps = checked_count(steps, "steps", least=1)
-        every = 0 if every is None else checked_count(every, "every", least=1)
-        if every and steps % every:
-            raise StateError(f"{steps} steps are no multiple of every={every}, so that the end would not be kept")
-        return cls(stepper, steps, every)
+        save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
+        if save_every and steps % save_every:
+            raise StateError(
+                f"{steps} steps are no multiple of save_every={save_every}, so that the end would not be kept"
+            )
+        return cls(stepper, steps, save_every)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (type(self), (self.stepper, self.steps, self.every))  # without cached libraries
+        return (type(self), (self.stepper, self.steps, self.save_every))  # without cached libraries
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>"
@@ -54,7 +56,7 @@ class Flow:
     @property
     def spacing(self) -> int:
         """Steps between saved states in C, which always saves the final one."""
-        return self.every or self.steps
+        return self.save_every or self.steps
 
     @property
     def kept(self) -> int:

@@ -42,7 +42,7 @@ class ArrayFlow(Flow):
 
     @takes(StateError)
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
-        """Return the final state, or with ``every`` all saved states.
+        """Return the final state, or with ``save_every`` all saved states.
 
         Args:
             q, p: (.., m) initial positions and momenta. Leading axes are broadcast. States that violate the constraints
@@ -52,7 +52,7 @@ class ArrayFlow(Flow):
             parameters: by name, (..) each, others keep their defaults; or (.., k) in order.
 
         Returns:
-            (q, p), (.., m) each; with ``every`` (.., n, m).
+            (q, p), (.., m) each; with ``save_every`` (.., n, m).
 
         Raises:
             StateError: for wrong shapes and names, and for anything but binary64.
@@ -67,7 +67,7 @@ class ArrayFlow(Flow):
         )
         ends = [self._number(t, "t"), self._number(h, "h")]
         found = self._along(self._beside(self._vector(q, m, "q"), self._vector(p, m, "p"), *given, *ends))
-        found = found if self.every else found[..., -1, :]
+        found = found if self.save_every else found[..., -1, :]
         return found[..., :m], found[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:

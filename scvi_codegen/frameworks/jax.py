@@ -21,7 +21,7 @@ _registered: set[str] = set()
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper))
-def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFlow:
+def jax_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> JaxFlow:
     """Return a fixed number of steps of a stepper as a function of JAX.
 
     XLA calls the compiled C directly, without Python: ``jit``, ``vmap``, ``grad``, ``jvp``, ``vjp``, ``jacfwd`` and
@@ -33,14 +33,14 @@ def jax_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> JaxFl
     Args:
         stepper: compiled stepper.
         steps: number of steps.
-        every: save the initial state and every ``every``-th one; by default only the final state.
+        save_every: save the initial state and every ``save_every``-th one; by default only the final state.
 
     Raises:
         MethodError: in transformed time, and for steps of a time-rescaling function.
         MissingLibraryError: without JAX (extra ``jax``).
-        StateError: if ``steps`` is not a multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``save_every``.
     """
-    flow = JaxFlow.checked(stepper, steps, every)
+    flow = JaxFlow.checked(stepper, steps, save_every)
     imported("jax", "jax")
     return flow
 
@@ -58,7 +58,7 @@ class JaxFlow(ArrayFlow):
         from scvi_codegen.frameworks.jax_primitives import states_along
 
         size = 2 * self.stepper.dimension
-        return states_along(x, target=self._target, steps=self.steps, every=self.spacing, size=size)
+        return states_along(x, target=self._target, steps=self.steps, save_every=self.spacing, size=size)
 
     @cached_property
     def _target(self) -> str:

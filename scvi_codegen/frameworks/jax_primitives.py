@@ -21,33 +21,33 @@ from scvi_codegen.errors import MethodError
 
 __all__ = ["states_along"]
 
-STATIC = ("target", "steps", "every", "size")
+STATIC = ("target", "steps", "save_every", "size")
 SECOND: dict[str, Callable[[], str]] = {}
 """Functions that return the target with second derivatives, by name of the target."""
 
 
-def states_along(x: Any, *, target: str, steps: int, every: int, size: int) -> Any:
+def states_along(x: Any, *, target: str, steps: int, save_every: int, size: int) -> Any:
     """Return (.., n, size) states of ``steps`` steps from (.., k) numbers (q, p, parameters, t, h).
 
     Args:
         x: initial values.
         target: name under which the C functions are registered, with the suffixes ``_states``, ``_push`` and ``_pull``.
-        steps, every: number of steps, and of steps between saved states.
+        steps, save_every: number of steps, and of steps between saved states.
         size: 2m.
     """
-    return STATES.bind(x, target=target, steps=steps, every=every, size=size)
+    return STATES.bind(x, target=target, steps=steps, save_every=save_every, size=size)
 
 
 def _primitive(part: str, shape: Callable[..., tuple[int, ...]], batched: Callable[..., Any]) -> Primitive:
     """Return a primitive that XLA calls in C on CPUs; ``shape`` is that of its result."""
     primitive = Primitive(f"scvi_flow_{part}")
 
-    def called(*arguments: Any, target: str, steps: int, every: int, size: int) -> Any:
-        result = jax.ShapeDtypeStruct(shape(*(a.shape for a in arguments), steps // every + 1, size), jnp.float64)
-        return jax.ffi.ffi_call(f"{target}_{part}", result)(*arguments, steps=steps, every=every)
+    def called(*arguments: Any, target: str, steps: int, save_every: int, size: int) -> Any:
+        result = jax.ShapeDtypeStruct(shape(*(a.shape for a in arguments), steps // save_every + 1, size), jnp.float64)
+        return jax.ffi.ffi_call(f"{target}_{part}", result)(*arguments, steps=steps, save_every=save_every)
 
-    def described(*arguments: Any, target: str, steps: int, every: int, size: int) -> Any:
-        return ShapedArray(shape(*(a.shape for a in arguments), steps // every + 1, size), jnp.float64)
+    def described(*arguments: Any, target: str, steps: int, save_every: int, size: int) -> Any:
+        return ShapedArray(shape(*(a.shape for a in arguments), steps // save_every + 1, size), jnp.float64)
 
     primitive.def_impl(jax.jit(called, static_argnames=STATIC))
     primitive.def_abstract_eval(described)

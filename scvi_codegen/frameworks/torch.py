@@ -16,7 +16,7 @@ __all__ = ["TorchFlow", "torch_flow"]
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper))
-def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> TorchFlow:
+def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> TorchFlow:
     """Return a fixed number of steps of a stepper as a differentiable function of PyTorch.
 
     It is compiled C, on CPUs and in binary64 (``dtype=torch.float64``): ``backward``, ``torch.func.grad``, ``vjp``,
@@ -26,14 +26,14 @@ def torch_flow(stepper: Stepper, *, steps: int, every: int | None = None) -> Tor
     Args:
         stepper: compiled stepper.
         steps: number of steps.
-        every: save the initial state and every ``every``-th one; by default only the final state.
+        save_every: save the initial state and every ``save_every``-th one; by default only the final state.
 
     Raises:
         MethodError: in transformed time, and for steps of a time-rescaling function.
         MissingLibraryError: without PyTorch (extra ``torch``).
-        StateError: if ``steps`` is not a multiple of ``every``.
+        StateError: if ``steps`` is not a multiple of ``save_every``.
     """
-    flow = TorchFlow.checked(stepper, steps, every)
+    flow = TorchFlow.checked(stepper, steps, save_every)
     imported("torch", "torch")
     return flow
 

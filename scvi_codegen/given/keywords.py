@@ -15,7 +15,7 @@ ELSEWHERE: Final = {
     ".drive_ensemble, and between samples by run.set_inputs(u=...)",
     "t_eval": "keep all states, and ask the run for those at times: run.at(times)",
     "events": "they are of .integrate(..., events=...) or of compile_stepper(..., events=...)",
-    "every": "it is of run.record(n, every=...), and of .integrate",
+    "save_every": "it is of run.record(n, save_every=...), and of .integrate",
     "steps": "their number goes to run.advance(n) or run.record(n)",
     "h": "steps of h are taken by a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
     "parameters": "their values go to the run, .integrate(..., parameters={...}), their names to the system",

@@ -13,7 +13,7 @@ WORDS: Final = {
     "t": "t0 time start_time t_start start",
     "t_end span": "T tf t_final t_max tmax tend t_span t_bound duration length time",
     "tolerance": "tol rtol atol eps epsilon accuracy error",
-    "every": "save_every stride output_every skip",
+    "save_every": "every stride output_every skip",
     "t_eval": "times saveat t_out",
     "q y0": "x q0 x0 position positions state coords",
     "p": "p0 momentum momenta",

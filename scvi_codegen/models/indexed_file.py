@@ -32,7 +32,7 @@
     [run]
     step = 0.1                                          # or tolerance = 1e-9 (without both: round-off): steps
     span = 100.0                                        # that choose their length; or steps of h
-    every = 10
+    save_every = 10
 
 Hamiltonians, and sections laid over others, are as there.
 """
@@ -77,7 +77,7 @@ __all__ = ["read_indexed"]
 KEYS = {
     "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "constraints"),
     "initial": ("q", "p", "q_dot", "t"),
-    "run": ("step", "tolerance", "error", "span", "steps", "every"),
+    "run": ("step", "tolerance", "error", "span", "steps", "save_every"),
 }
 SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {

@@ -48,7 +48,7 @@ class IndexedModel:
         error: in place of both, bound of the relative global error of all states, as of :class:`Model`.
         span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
         steps: number of steps, or ``None`` if ``span`` is given.
-        every: distance between kept states in steps.
+        save_every: distance between kept states in steps.
         t: initial time.
         parameters: numbers, and arrays of them, by name; others keep their defaults.
         tables: whole numbers, (rows, columns), by name.
@@ -69,7 +69,7 @@ class IndexedModel:
     velocity: Mapping[str, Any] | None = None
     span: float | None = None
     steps: int | None = None
-    every: int = 1
+    save_every: int = 1
     t: float = 0.0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
@@ -92,7 +92,7 @@ class IndexedModel:
             check_step(self.h, self.span)
         if self.steps is not None:
             checked_count(self.steps, "steps", least=0, error=ModelFileError)
-        checked_count(self.every, "every", least=1, error=ModelFileError)
+        checked_count(self.save_every, "save_every", least=1, error=ModelFileError)
 
     def __repr__(self) -> str:
         steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"
@@ -151,7 +151,7 @@ class IndexedModel:
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """All of it; raises as :meth:`IndexedStepper.integrate`."""
         lengths = self._lengths if self.h is None else {**self._lengths, "steps": self.step_count}
-        return self.stepper().integrate(**self._beginning, **lengths, every=self.every, progress=progress)
+        return self.stepper().integrate(**self._beginning, **lengths, save_every=self.save_every, progress=progress)
 
     @property
     def _lengths(self) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class Model:
         steps: number of steps of h, or ``None`` if ``span`` is given.
         monitor: of the reversible controller, as text, see :func:`~scvi_codegen.compile_stepper`; its runs have a span.
             A system in transformed time has its own.
-        every: distance between kept states in steps.
+        save_every: distance between kept states in steps.
         t: initial time.
         inputs: of a system that has any, by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as
             :meth:`Stepper.drive` takes it; all of them for a run.
@@ -83,7 +83,7 @@ class Model:
     span: float | None = None
     steps: int | None = None
     monitor: str | None = None
-    every: int = 1
+    save_every: int = 1
     t: float = 0.0
     inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
 
@@ -102,7 +102,9 @@ class Model:
         self._check_length()
         if self.steps is not None:
             object.__setattr__(self, "steps", checked_count(self.steps, "steps", least=0, error=ModelFileError))
-        object.__setattr__(self, "every", checked_count(self.every, "every", least=1, error=ModelFileError))
+        object.__setattr__(
+            self, "save_every", checked_count(self.save_every, "save_every", least=1, error=ModelFileError)
+        )
         if self.inputs:
             from scvi_codegen.models.input_tables import checked_tables  # here: reading a model does not wait for NumPy
 

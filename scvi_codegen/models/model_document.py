@@ -58,7 +58,7 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     fields = {"step": model.h, "tolerance": model.tolerance, "error": model.error}
     step = {key: value for key, value in fields.items() if value is not None}
     controller = {"controller": "reversible"} if model.monitor else {}
-    run = {**step, **controller, **length, "every": model.every}
+    run = {**step, **controller, **length, "save_every": model.save_every}
     return {"initial": {"t": model.t, **initial}, "method": method_section(model.method), "run": run}
 
 

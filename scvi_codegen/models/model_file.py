@@ -42,7 +42,7 @@
                                                         # or tolerance = 1e-9 (without both: round-off): steps
                                                         # choose their length; then a negative span goes back
     # controller = "reversible"                         # of a monitor: time as it is, steps whose density it carries
-    every = 1                                           # distance between kept states; left out: 1
+    save_every = 1                                      # distance between kept states; left out: 1
 
 A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
 the names ``p_q``; with constraints the model is that of its Lagrangian.
@@ -115,7 +115,7 @@ Kind = TypeVar("Kind")
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
-RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "every")
+RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ARRAY_SECTIONS = ("sizes", "tables")

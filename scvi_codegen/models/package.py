@@ -221,7 +221,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
     else:
         steps = OUTPUTS if model.h is None or model.monitor is not None else max(1, model.step_count)
-    every = max(1, steps // OUTPUTS)
+    save_every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,
         p=momenta,
@@ -231,8 +231,8 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
         span=model.covered,
         tolerance=_chosen_by(model),
         controlled=controlled,
-        every=every,
-        outputs=steps // every,
+        save_every=save_every,
+        outputs=steps // save_every,
         to_end=bool(clock) and model.ends_at_time,
         inputs=inputs,
         end=model.end if inputs else 0.0,
@@ -326,7 +326,7 @@ Inputs ($inputs) are tables, `${prefix}_input` each. Steps end at their breakpoi
 
 ```c
 for (long long steps; (steps = ${prefix}_next_steps(&run, t_end, h, inputs, parameters)) > 0;)
-  status = ${prefix}_advance(&run, steps, every, parameters, NULL, t, q, p, iterations, &report, workspace);
+  status = ${prefix}_advance(&run, steps, save_every, parameters, NULL, t, q, p, iterations, &report, workspace);
 ```
 """
 

@@ -164,5 +164,5 @@ def read_run(section: Section) -> dict[str, Any]:
         raise ModelFileError("[run] has steps and no step, which says how long they are")
     if "steps" in section:
         found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
-    found["every"] = checked_count(section.get("every", 1), "[run] every", least=1, error=ModelFileError)
+    found["save_every"] = checked_count(section.get("save_every", 1), "[run] save_every", least=1, error=ModelFileError)
     return found

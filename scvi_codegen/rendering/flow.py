@@ -59,16 +59,16 @@ def casadi_name(prefix: str) -> str:
     return f"{prefix}_flow"
 
 
-def with_casadi_flow(derivatives: Source, steps: int, every: int, *, second: bool = False) -> Source:
+def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second: bool = False) -> Source:
     """A text with derivatives of steps, and the flow of so many, with its own, by CasADi's naming convention.
 
     Args:
         derivatives: the text.
-        steps: how many; every: so many from one kept state to the next.
+        steps: how many; save_every: so many from one kept state to the next.
         second: whether the text has second derivatives, for the Jacobian of the adjoint.
     """
     name = casadi_name(derivatives.prefix)
-    fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {every}\n}};\n\n"
+    fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"
     headers = ("flow", "casadi_flow", *(("flow_second", "casadi_second") if second else ()))
     return _behind(derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "")
 

@@ -90,7 +90,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
     Args:
         prefix: of the C names.
         start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
-            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, every).
+            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
     """
     environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
     templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}

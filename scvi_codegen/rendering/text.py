@@ -90,7 +90,7 @@ class ExampleRun:
     span: float
     tolerance: float
     controlled: bool
-    every: int
+    save_every: int
     outputs: int
     to_end: bool = False
     inputs: tuple[ExampleInput, ...] = ()

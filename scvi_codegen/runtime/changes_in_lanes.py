@@ -34,7 +34,7 @@ def in_lanes(
     *,
     t: Array,
     h: float,
-    every: int,
+    save_every: int,
     options: SolverOptions | None,
     heed: Callable[[int], None],
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -52,12 +52,12 @@ def in_lanes(
     motions = _Motions(binding, q, p, parameters, changes.shape[1], t=float(t[0]), h=h, options=options)
     frame, triangle = (np.broadcast_to(part, (len(q), *part.shape)) for part in np.linalg.qr(changes))
     with np.errstate(divide="ignore"):  # directions that depend on each other span nothing
-        growth = Growth(t[::every], np.log(np.abs(np.diagonal(triangle, axis1=1, axis2=2))))
+        growth = Growth(t[::save_every], np.log(np.abs(np.diagonal(triangle, axis1=1, axis2=2))))
     done, steps, size, most = 0, len(t) - 1, FIRST, MOST
     motions.take(frame)
     while done < steps:
         heed(done)
-        size = min(size, most, every - done % every, steps - done)
+        size = min(size, most, save_every - done % save_every, steps - done)
         before = motions.save()
         images = motions.advance(size)
         running = motions.running
@@ -69,7 +69,7 @@ def in_lanes(
         done += size
         sizes = _lengths(images, triangle)
         numbers = np.full(size, -1)
-        numbers[-1] = done // every if done % every == 0 else -1
+        numbers[-1] = done // save_every if done % save_every == 0 else -1
         with np.errstate(divide="ignore"):
             diagonals = np.log(np.abs(np.diagonal(last, axis1=1, axis2=2)))
             stretched = np.broadcast_to(diagonals, (size, *diagonals.shape))
@@ -119,11 +119,11 @@ class _Motions:
         for k in range(blocks):
             binding.function("start")(self.memory + k, t, h)
         self.lanes = binding.records(self.memory)
-        every = np.arange(blocks * self.width)
-        self.places = np.minimum(every, self.size - 1)
+        save_every = np.arange(blocks * self.width)
+        self.places = np.minimum(save_every, self.size - 1)
         self.lanes["q"][:, : self.dimension], self.lanes["p"][:, : self.dimension] = map(self._across, (q, p))
         self.lanes["parameters"][:, : parameters.shape[1]] = self._across(parameters)
-        self.lanes["active"] = (every < self.size).reshape(blocks, self.width)
+        self.lanes["active"] = (save_every < self.size).reshape(blocks, self.width)
 
     def _across(self, rows: Array) -> Array:
         """(blocks, n, lanes) from (K, n)."""

@@ -53,7 +53,7 @@ class DeviationsEnsemble:
         steps: int,
         count: int | None,
         directions: ArrayLike | None,
-        every: int | None,
+        save_every: int | None,
         t: float,
         parameters: EnsembleParameters,
         options: SolverOptions | None,
@@ -61,15 +61,17 @@ class DeviationsEnsemble:
         stepper.check_steps_of_h("a motion of an ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
-        self.every = steps if every is None else checked_count(every, "every", least=1)
-        if steps % self.every:
-            raise StateError(f"steps={steps} is no multiple of every={self.every}: the last would not be kept")
+        self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
+        if steps % self.save_every:
+            raise StateError(
+                f"steps={steps} is no multiple of save_every={self.save_every}: the last would not be kept"
+            )
         start = checked_number(t, "the time t")
         self.t = times_after(start, self.h, np.arange(steps + 1))[0]
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
         self.changes = Changes.checked(stepper, count, directions)
         self.status = np.full(len(self.q), OK, dtype="<U16")
-        self.found = np.full((len(SERIES), len(self.t[:: self.every]), len(self.q), self._width()), np.nan)
+        self.found = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> Deviations:
         """Follow all motions; ``progress`` is called with the number of those done, and may raise to stop them.
@@ -90,7 +92,7 @@ class DeviationsEnsemble:
                 threads=threads,
             )
         self._warn_of_long_steps()
-        return Deviations.of(self.t[:: self.every], self.found, self.status)
+        return Deviations.of(self.t[:: self.save_every], self.found, self.status)
 
     def _warn_of_long_steps(self) -> None:
         """Of one motion in so many, which is run once more by itself: steps in lanes tell no error."""
@@ -101,7 +103,7 @@ class DeviationsEnsemble:
                 self.stepper, *start, h=self.h, t=self.t[0], parameters=self.parameters[j], options=self.options
             )
             with suppress(StepFailedError):
-                runs[j] = record(memory, steps, every=steps)
+                runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
         if worst is not None:
             warn_of_long_steps(runs[worst], remedy=f" (motion {worst} of {len(self.q)})")
@@ -128,7 +130,7 @@ class DeviationsEnsemble:
                 self.parameters[part],
                 t=self.t,
                 h=self.h,
-                every=self.every,
+                save_every=self.save_every,
                 options=self.options,
                 heed=heed,
             )
@@ -156,7 +158,7 @@ class DeviationsEnsemble:
             self.parameters[j],
             t=self.t,
             h=self.h,
-            every=self.every,
+            save_every=self.save_every,
             options=self.options,
             heed=heed,
         )

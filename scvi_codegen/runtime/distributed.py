@@ -48,7 +48,7 @@ def integrate_ensemble(
     steps: int | None = None,
     t_end: ArrayLike | None = None,
     tolerance: float | None = None,
-    every: int = 1,
+    save_every: int = 1,
     t: float = 0.0,
     t_eval: ArrayLike | None = None,
     parameters: EnsembleParameters = None,
@@ -64,7 +64,7 @@ def integrate_ensemble(
         stepper: compiled here; its source is compiled again by each worker, which needs this package and a C compiler.
         q, p: (k, m) initial positions and momenta.
         velocity: (k, m) initial velocities, in place of p.
-        h, steps, t_end, tolerance, every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
+        h, steps, t_end, tolerance, save_every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
         inputs: then as ``stepper.drive_ensemble``; without ``t_eval``.
         progress: called now and then with the number of trajectories done.
         address: of a scheduler, as in ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
@@ -78,7 +78,13 @@ def integrate_ensemble(
         StateError: on wrong shapes, names or numbers, before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
-    start: dict[str, Any] = {"velocity": velocity, "t": t, "parameters": parameters, "options": options, "every": every}
+    start: dict[str, Any] = {
+        "velocity": velocity,
+        "t": t,
+        "parameters": parameters,
+        "options": options,
+        "save_every": save_every,
+    }
     way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
     work: Ensemble | EnsembleToEnds
     if inputs is None:

@@ -184,7 +184,7 @@ def drive(
     inputs: Mapping[str, Input],
     t_end: float,
     *,
-    every: int,
+    save_every: int,
     values: Callable[[float], Array],
     progress: Callable[[int], None] | None,
 ) -> DrivenTrajectory:
@@ -194,7 +194,7 @@ def drive(
         run: at its start, with a goal where steps choose their length.
         inputs: by name.
         t_end: the time to reach.
-        every: steps between kept states; those at breakpoints are kept, too.
+        save_every: steps between kept states; those at breakpoints are kept, too.
         values: the parameters of the piece in which a time lies.
         progress: called with the steps done.
     """
@@ -202,7 +202,7 @@ def drive(
     first, run._crossed = run.steps, (0,) * len(run.stepper.events)
     told = None if progress is None else lambda _: progress(run.steps - first)
     for steps in stretches(run, inputs, t_end, values):
-        piece = run.record(steps, every=every, progress=told)
+        piece = run.record(steps, save_every=save_every, progress=told)
         run._crossed = tuple(n + len(found) for n, found in zip(run._crossed, piece.events, strict=True))
         terminal = [int(found.event.terminal) for found in piece.events]
         ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))

@@ -57,7 +57,7 @@ class DrivenEnsemble(Ensemble):
         *,
         h: float,
         t_end: float,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
@@ -65,9 +65,14 @@ class DrivenEnsemble(Ensemble):
         self.data, self.t_end = data, checked_number(t_end, "t_end")
         self.stretches = planned(checked_number(t, "the time t"), checked_number(t_end, "t_end"), checked_step(h), data)
         self.ends = list(accumulate(stretch.steps for stretch in self.stretches))
-        steps, every = sum(stretch.steps for stretch in self.stretches), checked_count(every, "every", least=1)
-        self.numbers = sorted({*range(0, steps + 1, every), *self.ends})
-        super().__init__(stepper, q, p, h=h, steps=steps, every=every, t=t, parameters=parameters, options=options)
+        steps, save_every = (
+            sum(stretch.steps for stretch in self.stretches),
+            checked_count(save_every, "save_every", least=1),
+        )
+        self.numbers = sorted({*range(0, steps + 1, save_every), *self.ends})
+        super().__init__(
+            stepper, q, p, h=h, steps=steps, save_every=save_every, t=t, parameters=parameters, options=options
+        )
         self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
 
     def part(self, part: slice) -> dict[str, object]:
@@ -86,10 +91,10 @@ class DrivenEnsemble(Ensemble):
         while step < end:
             k = bisect_right(self.ends, step)
             last, entering = self.ends[k], step == self._first(k)
-            odd = last % self.every != 0
+            odd = last % self.save_every != 0
             until = min(end, last - 1 if odd and step < last - 1 else last)
-            every = last if odd and until == last else self.every
-            yield Portion(until - step, every, self._change(self.stretches[k]) if entering else None)
+            save_every = last if odd and until == last else self.save_every
+            yield Portion(until - step, save_every, self._change(self.stretches[k]) if entering else None)
             step = until
 
     def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:

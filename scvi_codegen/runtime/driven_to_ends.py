@@ -52,7 +52,7 @@ class DrivenToEnds(EnsembleToEnds):
         *,
         t_end: ArrayLike,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
@@ -64,7 +64,7 @@ class DrivenToEnds(EnsembleToEnds):
             p,
             t_end=t_end,
             tolerance=tolerance,
-            every=every,
+            save_every=save_every,
             t=t,
             parameters=parameters,
             options=options,
@@ -91,7 +91,7 @@ class DrivenToEnds(EnsembleToEnds):
         pieces: list[Trajectory] = []
         try:
             way = stretches(run, self.data, self.goals[j].t_end, partial(self._values, j))
-            pieces.extend(record(run, steps, every=self.every, progress=heed) for steps in way)
+            pieces.extend(record(run, steps, save_every=self.save_every, progress=heed) for steps in way)
         except StepFailedError as failure:
             return DrivenTrajectory((*pieces, Trajectory.before(failure))), failure.status
         return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK

@@ -58,12 +58,12 @@ class Portion(NamedTuple):
     """Steps of one call.
 
     Attributes:
-        every: distance between the states kept.
+        save_every: distance between the states kept.
         change: before them, or ``None``.
     """
 
     steps: int
-    every: int
+    save_every: int
     change: Change | None = None
 
 
@@ -78,7 +78,7 @@ class Ensemble:
         *,
         h: float,
         steps: int,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
@@ -86,7 +86,7 @@ class Ensemble:
         self.stepper, self.options = stepper, checked_options(options)
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
         self.steps = checked_count(steps, "steps", least=0)
-        self.every = checked_count(every, "every", least=1)
+        self.save_every = checked_count(save_every, "save_every", least=1)
         start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.count = len(start_q)
         if not stepper.has_energy(parameters):
@@ -114,11 +114,11 @@ class Ensemble:
 
     def row(self, step: int) -> int:
         """Of the first state kept that comes after ``step``."""
-        return step // self.every + 1
+        return step // self.save_every + 1
 
     def portions(self, begin: int, size: int) -> Iterator[Portion]:
         """What leads ``size`` steps on, in as many calls of C as are needed."""
-        yield Portion(size, self.every)
+        yield Portion(size, self.save_every)
 
     def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
         """H, time and parameters of trajectory j after ``step`` steps."""
@@ -127,7 +127,7 @@ class Ensemble:
 
     def kept_times(self) -> Array:
         """(n,) of the states, by steps of h."""
-        number = self.every * np.arange(len(self.q), dtype=np.float64)
+        number = self.save_every * np.arange(len(self.q), dtype=np.float64)
         return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
 
     call: ClassVar[str] = "integrate_ensemble"
@@ -140,7 +140,7 @@ class Ensemble:
             "p": self.p[0, part],
             "h": self.h,
             "steps": self.steps,
-            "every": self.every,
+            "save_every": self.save_every,
             "t": self.t0,
             "parameters": self.parameters[part],
             "options": self.options,
@@ -267,7 +267,7 @@ class LaneBlock:
         for portion in self.work.portions(self.step, size):
             if portion.change is not None:
                 self._change(portion.change.h, portion.change.parameters(slice(self.first, self.first + self.count)))
-            self._advance(portion.steps, portion.every)
+            self._advance(portion.steps, portion.save_every)
 
     def _change(self, h: float, own: Array) -> None:
         """Another step, before which what the curve of the last one says of the next is forgotten, and parameters."""
@@ -292,7 +292,7 @@ class LaneBlock:
             except StateError:
                 self.active[lane] = 0.0
 
-    def _advance(self, size: int, every: int) -> None:
+    def _advance(self, size: int, save_every: int) -> None:
         work, begin, self.step = self.work, self.step, self.step + size
         if len(self.left) < self.count:
             row = work.row(begin)
@@ -302,7 +302,7 @@ class LaneBlock:
                 self.memory,
                 self.count,
                 size,
-                every,
+                save_every,
                 self.binding.options(work.options),
                 self.binding.pointer(work.q) + place,
                 self.binding.pointer(work.p) + place,
@@ -311,9 +311,9 @@ class LaneBlock:
         running = self.active[: self.count] > 0.0
         work.done[self.first : self.first + self.count][running] = self.step
         for lane in np.flatnonzero(~running):
-            self._leave(int(lane), begin, every)
+            self._leave(int(lane), begin, save_every)
 
-    def _leave(self, lane: int, begin: int, every: int) -> None:
+    def _leave(self, lane: int, begin: int, save_every: int) -> None:
         """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""
         work, j = self.work, self.first + lane
         if lane not in self.left:
@@ -323,7 +323,7 @@ class LaneBlock:
             begin = step
         rows = slice(work.row(begin), work.row(self.step))
         work.q[rows, j] = work.p[rows, j] = np.nan
-        self.left[lane].advance_to(self.step, every)
+        self.left[lane].advance_to(self.step, save_every)
 
 
 class _SingleBlock:
@@ -338,7 +338,7 @@ class _SingleBlock:
             self.step += portion.steps
             if portion.change is not None:
                 self.run.update(portion.change.h, portion.change.parameters(slice(self.run.j, self.run.j + 1))[0])
-            self.run.advance_to(self.step, portion.every)
+            self.run.advance_to(self.step, portion.save_every)
 
 
 class _Alone:
@@ -365,14 +365,14 @@ class _Alone:
         if self.run is not None:
             self.run.update(h=h, parameters=parameters)
 
-    def advance_to(self, step: int, every: int) -> None:
+    def advance_to(self, step: int, save_every: int) -> None:
         """On to ``step``, unless it failed before."""
         work, j, run = self.work, self.j, self.run
         if run is None:
             return
         row = work.row(run.steps)
         try:
-            trajectory = record_states(run, step - run.steps, every=every)
+            trajectory = record_states(run, step - run.steps, save_every=save_every)
         except StepFailedError as failure:
             work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
         work.done[j] = run.steps

@@ -68,7 +68,7 @@ class EnsembleToEnds:
         *,
         t_end: ArrayLike,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
         parameters: EnsembleParameters = None,
@@ -77,13 +77,15 @@ class EnsembleToEnds:
         if stepper.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h and steps")
         self.stepper, self.options = stepper.controlled(), checked_options(options)
-        self.t0, self.every = checked_number(t, "the time t"), checked_count(every, "every", least=1)
+        self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.goals = self._goals(t_end, tolerance)
         self.t_eval = None
         if t_eval is not None:
-            if self.every != 1:
-                raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
+            if self.save_every != 1:
+                raise StateError(
+                    f"states are kept at t_eval or every so many steps (save_every={save_every}), not both"
+                )
             farthest = max((goal.t_end for goal in self.goals), key=lambda end: abs(end - self.t0))
             self.t_eval = times_of_run(t_eval, self.t0, farthest)
         self.kept: dict[int, KeptLane] = {}
@@ -117,7 +119,7 @@ class EnsembleToEnds:
             "p": self.p[part],
             "t_end": [goal.t_end for goal in self.goals[part]],
             "tolerance": self.goals[0].tolerance or None,
-            "every": self.every,
+            "save_every": self.save_every,
             "t": self.t0,
             "t_eval": self.t_eval,
             "parameters": self.parameters[part],
@@ -164,7 +166,7 @@ class EnsembleToEnds:
         """What is kept of trajectory j, and why it ended."""
         try:
             if self.t_eval is None:
-                return record(run, None, every=self.every, progress=heed), OK
+                return record(run, None, save_every=self.save_every, progress=heed), OK
             reached = np.abs(self.t_eval - self.t0) <= abs(self.goals[j].t_end - self.t0)
             return Observation(run, times=self.t_eval[reached]).advance(None, heed), OK
         except StepFailedError as failure:

@@ -35,7 +35,7 @@ class Ensembles(ConstrainedStates):
         steps: int | None = None,
         t_end: ArrayLike | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         t_eval: ArrayLike | None = None,
         parameters: EnsembleParameters = None,
@@ -48,10 +48,10 @@ class Ensembles(ConstrainedStates):
         Args:
             q, p: (k, m) initial positions and momenta.
             velocity: (k, m) initial velocities, in place of p.
-            h, steps, every, t, options, progress: as in :meth:`integrate`.
+            h, steps, save_every, t, options, progress: as in :meth:`integrate`.
             t_end: instead of h and steps: one time or (k,) times to go to, by steps that choose their length in each
-                trajectory. Every ``every``-th state of each is kept, and the last: ``times`` says when. ``progress`` is
-                then called with the number of trajectories done.
+                trajectory. Every ``save_every``-th state of each is kept, and the last, at the ``times`` of the
+                result. ``progress`` is then called with the number of trajectories done.
             tolerance: relative error of the end of such a step; by default round-off.
             t_eval: (n,) times: keep the states of all trajectories at these instead; NaN beyond their ends.
             parameters: by name, one number or k each; or (k, number of parameters).
@@ -74,7 +74,7 @@ class Ensembles(ConstrainedStates):
             t_end=t_end,
             tolerance=tolerance,
             t_eval=t_eval,
-            every=every,
+            save_every=save_every,
             t=t,
             parameters=parameters,
             options=options,
@@ -96,7 +96,7 @@ class Ensembles(ConstrainedStates):
         steps: int | None = None,
         t_end: ArrayLike | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
@@ -109,7 +109,7 @@ class Ensembles(ConstrainedStates):
             inputs: as of :meth:`drive`, the same for all trajectories; with values of shape (k, n) each has its own.
             h: of common steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``, one time or (k,).
-            q, p, velocity, tolerance, every, t, parameters, options, progress, threads: as of
+            q, p, velocity, tolerance, save_every, t, parameters, options, progress, threads: as of
                 :meth:`integrate_ensemble`.
 
         Returns:
@@ -128,7 +128,7 @@ class Ensembles(ConstrainedStates):
             steps=steps,
             t_end=t_end,
             tolerance=tolerance,
-            every=every,
+            save_every=save_every,
             t=t,
             parameters=parameters,
             options=options,
@@ -147,7 +147,7 @@ class Ensembles(ConstrainedStates):
         velocity: ArrayLike | None = None,
         count: int | None = None,
         directions: ArrayLike | None = None,
-        every: int | None = None,
+        save_every: int | None = None,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
@@ -163,7 +163,7 @@ class Ensembles(ConstrainedStates):
         Args:
             q, p, velocity: (K, m) initial states, as of :meth:`integrate_ensemble`.
             count, directions: of changes, as of :meth:`Trajectory.deviations`; 1 is enough for MEGNO.
-            every: steps between what is kept of each motion; by default the last alone.
+            save_every: steps between what is kept of each motion; by default the last alone.
             t, parameters, options, threads: as of :meth:`integrate_ensemble`.
             progress: called now and then with the number of motions done.
 
@@ -185,7 +185,7 @@ class Ensembles(ConstrainedStates):
             steps=steps,
             count=count,
             directions=directions,
-            every=every,
+            save_every=save_every,
             t=t,
             parameters=parameters,
             options=options,

@@ -207,7 +207,7 @@ class IndexedStepper:
         steps: int | None = None,
         t_end: float | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
@@ -219,13 +219,13 @@ class IndexedStepper:
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> IndexedTrajectory:
-        """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
+        """Run ``steps`` steps of h, or to t_end, and keep every ``save_every``-th state, the initial one first.
 
         Args:
             q: initial positions: an array of the declared shape, or several by name. Their lengths are the sizes.
             p, velocity: momenta, or velocities in their place, in the same way; by default 0.
             h: step, negative to go back.
-            steps, every: numbers of steps.
+            steps, save_every: numbers of steps.
             t_end: in place of ``steps``: where to go. Without h by adaptive steps; the last ends there exactly. With h
                 by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
             tolerance: error of the end of such a step, relative to the largest coordinate; by default round-off.
@@ -253,7 +253,7 @@ class IndexedStepper:
             MethodError: where steps have no error that would choose their length.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
-        every = checked_count(every, "every", least=1)
+        save_every = checked_count(save_every, "save_every", least=1)
         check_inputs_given(self.interface, parameters)
         if h is not None and t_end is not None:
             if steps is not None:
@@ -273,19 +273,19 @@ class IndexedStepper:
                 self.integrate,
                 (q, p, velocity),
                 beside,
-                {"t_end": t_end, "every": every, "progress": progress},
+                {"t_end": t_end, "save_every": save_every, "progress": progress},
             )
         adaptive = t_end if h is None else None
         run = self.start(q, p, velocity=velocity, h=h, t_end=adaptive, tolerance=tolerance, **beside)
         check = GrowthCheck(run, check_growth)
         record = IndexedRecord(run, observe, as_events(events))
         if h is None or t_end is None:
-            record.follow(count, every, progress=progress)
+            record.follow(count, save_every, progress=progress)
             return _said(record, check)
         record.take(keep=True)
         for part in planned(run.t, t_end, h, {}):
             run.update(h=part.h)
-            record.go_on(run.steps + part.steps, every, progress=progress, to_end=True)
+            record.go_on(run.steps + part.steps, save_every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
         return _said(record, check)
@@ -302,7 +302,7 @@ class IndexedStepper:
         steps: int | None = None,
         t_end: float | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
@@ -320,7 +320,7 @@ class IndexedStepper:
             inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
             h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``.
-            q, p, velocity, tolerance, every, t, parameters, tables: as of :meth:`integrate`.
+            q, p, velocity, tolerance, save_every, t, parameters, tables: as of :meth:`integrate`.
             observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are kept, too.
             error, check_growth: as of :meth:`integrate`.
 
@@ -328,7 +328,7 @@ class IndexedStepper:
             StateError: for inputs that are not given for all of the run, or make no function of time.
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
-        every = checked_count(every, "every", least=1)
+        save_every = checked_count(save_every, "save_every", least=1)
         data, end = checked_inputs(self.interface, inputs), end_of(t, h, steps, t_end)
         check_left_to_inputs(self.interface, parameters)
         controlled = {"t_end": end, "tolerance": tolerance} if h is None else {"h": h}
@@ -341,7 +341,7 @@ class IndexedStepper:
                 self.drive,
                 (q, p, velocity),
                 beside | {"inputs": inputs},
-                {"t_end": t_end, "every": every, "progress": progress},
+                {"t_end": t_end, "save_every": save_every, "progress": progress},
             )
         run = self.start(q, p, velocity=velocity, **controlled, **beside)
         numbers = np.array(run.problem.arrays.numbers)
@@ -351,7 +351,7 @@ class IndexedStepper:
         record = IndexedRecord(run, observe, as_events(events))
         record.take(keep=True)
         for count in stretches(run, data, end, values):
-            record.go_on(np.inf if count is None else run.steps + count, every, progress=progress, to_end=True)
+            record.go_on(np.inf if count is None else run.steps + count, save_every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
         return _said(record, check)

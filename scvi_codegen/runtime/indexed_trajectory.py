@@ -180,7 +180,7 @@ class IndexedRecord:
     def follow(
         self,
         steps: float,
-        every: int,
+        save_every: int,
         *,
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
@@ -191,12 +191,12 @@ class IndexedRecord:
             StepFailedError: if one fails; its ``trajectory`` holds the states before.
         """
         self.take(keep=True)
-        self.go_on(steps, every, progress=progress, stop=stop)
+        self.go_on(steps, save_every, progress=progress, stop=stop)
 
     def go_on(
         self,
         steps: float,
-        every: int,
+        save_every: int,
         *,
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
@@ -207,13 +207,13 @@ class IndexedRecord:
         self.departures[-1] = Departure.of(run)
         while run.steps < steps and not self.ended and not (stop and stop()):
             try:
-                self._advance(int(min(every - run.steps % every, steps - run.steps)), progress, stop)
+                self._advance(int(min(save_every - run.steps % save_every, steps - run.steps)), progress, stop)
             except StepFailedError as error:
                 error.trajectory = self.trajectory()
                 raise
             arrived = self.ended or (to_end and run.steps >= steps)
-            if run.steps % every == 0 or arrived:
-                self.take(keep=arrived or run.steps + every > steps)
+            if run.steps % save_every == 0 or arrived:
+                self.take(keep=arrived or run.steps + save_every > steps)
                 last = run.steps
         if to_end and last != run.steps:
             self.take(keep=True)

@@ -109,7 +109,7 @@ def _pilot(run: Run, end: float) -> _Pilot:
     while done < PILOT_STEPS and not run.arrived and (run.goal or (end - run.t) * run.h > 0.0):
         size = max(1, done)
         try:
-            error = run.record(size, every=size).step_error
+            error = run.record(size, save_every=size).step_error
         except StepFailedError:
             return _Pilot(math.inf, done + 1)
         if math.isnan(error):

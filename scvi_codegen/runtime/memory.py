@@ -277,11 +277,11 @@ class Memory(OneThread):
         while not self.arrived:
             self.advance(UNHEARD_STEPS)
 
-    def _advance(self, steps: int, every: int, places: tuple[Any, ...]) -> int:
-        """The status of so many in one call of C, which writes the states whose numbers ``every`` divides to places."""
+    def _advance(self, steps: int, save_every: int, places: tuple[Any, ...]) -> int:
+        """Return the status of one call of C for ``steps`` steps, which writes every ``save_every``-th state."""
         if self._awaited and steps:
             self.check_inputs()
-        status: int = self._go(*self._way, steps, every, *self._given, *places, self._report, self._workspace)
+        status: int = self._go(*self._way, steps, save_every, *self._given, *places, self._report, self._workspace)
         return status
 
     @property
@@ -318,9 +318,9 @@ class Memory(OneThread):
 
 
 def fill(
-    memory: Memory, steps: int, every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
+    memory: Memory, steps: int, save_every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
 ) -> tuple[int, Any]:
-    """Advance by ``steps`` in one call of C, which fills the arrays with each state whose number ``every`` divides.
+    """Advance by ``steps`` in one call of C, which fills the arrays with every ``save_every``-th state.
 
     With a goal, by no more steps than lead there; the state there is stored whatever its number, and the report
     says how many are ``stored``.
@@ -329,7 +329,7 @@ def fill(
         The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
     """
     pointer = memory.stepper.binding.pointer
-    status = memory._advance(steps, every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
+    status = memory._advance(steps, save_every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
     return status, memory._report
 
 

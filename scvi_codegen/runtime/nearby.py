@@ -53,7 +53,7 @@ class NearbyMotions(KeptStates):
         """The gradient of a function of the states by the initial state, the parameters, the initial time and h.
 
         One pass back along the run, whatever the number of parameters: the adjoint, exact to round-off of the computed
-        states. Where not all states are kept (``every``) the steps between them are taken again.
+        states. Where not all states are kept (``save_every``) the steps between them are taken again.
 
         Args:
             cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions. In

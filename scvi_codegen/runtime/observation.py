@@ -36,13 +36,15 @@ class Observation:
 
     Args:
         run: to be advanced.
-        every: keep the present state and each whose step number is a multiple of this, if no times are given.
+        save_every: keep the present state and each whose step number is a multiple of this, if no times are given.
         times: (n,) sorted as the run goes; keep the states at these.
         end: of steps of h, also in transformed time, where the run ends, by a last step that is shorter.
     """
 
-    def __init__(self, run: Memory, *, every: int = 1, times: Array | None = None, end: float | None = None) -> None:
-        self.run, self.every, self.times = run, checked_count(every, "every", least=1), times
+    def __init__(
+        self, run: Memory, *, save_every: int = 1, times: Array | None = None, end: float | None = None
+    ) -> None:
+        self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
         self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
         self.end, self.arrived = end, False
         self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
@@ -170,7 +172,7 @@ class Observation:
             self._keep_times(part, total, first=first)
             return
         number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part))
-        wanted = number % self.every == 0
+        wanted = number % self.save_every == 0
         wanted[0] = first
         wanted[-1] |= self.ended or self.run.arrived
         q, p = part.q[wanted], part.p[wanted]
@@ -203,7 +205,7 @@ def observed_until(
     run: Memory,
     t_end: float,
     steps: int | None,
-    every: int,
+    save_every: int,
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,
 ) -> Trajectory:
@@ -214,4 +216,4 @@ def observed_until(
     if (end - run.t) * run.h < 0.0:
         raise StateError(f"steps of h = {run.h:g} do not lead from t = {run.t:g} to t_end = {end:g}")
     times = None if t_eval is None else times_of_run(t_eval, run.t, end)
-    return Observation(run, every=every, times=times, end=end).advance(None, progress)
+    return Observation(run, save_every=save_every, times=times, end=end).advance(None, progress)

@@ -50,14 +50,14 @@ class PeriodicOrbit:
     stepper: Stepper = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
 
-    def run(self, *, every: int = 1) -> Trajectory:
-        """The motion of a period, ``every``-th state."""
+    def run(self, *, save_every: int = 1) -> Trajectory:
+        """The motion of a period, ``save_every``-th state."""
         return self.stepper.integrate(
             self.q,
             self.p,
             h=self.period / self.steps,
             steps=self.steps,
-            every=every,
+            save_every=save_every,
             t=self.t,
             parameters=self.parameters,
             options=self.options,

@@ -27,48 +27,53 @@ SLICE_SECONDS = 0.1
 
 
 def record(
-    memory: Memory, steps: int | None, *, every: int = 1, progress: Callable[[int], None] | None = None
+    memory: Memory, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
     """The states of ``steps``, or of fewer if they lead to the goal of the run; all that do where left out."""
     if memory.goal is None:
-        return record_states(memory, checked_count(steps, "steps", least=0), every=every, progress=progress)
+        return record_states(memory, checked_count(steps, "steps", least=0), save_every=save_every, progress=progress)
     count = None if steps is None else checked_count(steps, "steps", least=0)
-    return record_until(memory, count, every=every, progress=progress)
+    return record_until(memory, count, save_every=save_every, progress=progress)
 
 
 def record_states(
-    memory: Memory, steps: int, *, every: int = 1, progress: Callable[[int], None] | None = None
+    memory: Memory, steps: int, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
+    """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``save_every``.
 
     Raises:
         StepFailedError: with the states kept so far as ``trajectory``; the memory stands before the failing step.
     """
     steps = checked_count(steps, "steps", least=0)
-    every = checked_count(every, "every", least=1)
+    save_every = checked_count(save_every, "save_every", least=1)
     first = memory.steps
-    capacity = (first + steps) // every - first // every
+    capacity = (first + steps) // save_every - first // save_every
     m = memory.stepper.dimension
     t, q, p = (empty_array((capacity + 1, *shape)) for shape in ((), (m,), (m,)))
     iterations = np.zeros(capacity + 1, dtype=np.int32)
     t[0], q[0], p[0] = memory.t, memory.q, memory.p
-    filled, done, portion = 1, 0, every * max(1, 256 // every)
+    filled, done, portion = 1, 0, save_every * max(1, 256 // save_every)
     while done < steps:
         size = min(portion, steps - done)
         began = time.perf_counter()
-        status, report = fill(memory, size, every, t[filled:], q[filled:], p[filled:], iterations[filled:])
+        status, report = fill(memory, size, save_every, t[filled:], q[filled:], p[filled:], iterations[filled:])
         done += report.steps
-        filled = 1 + (first + done) // every - first // every
+        filled = 1 + (first + done) // save_every - first // save_every
         if status:
             kept = trajectory_of(
-                memory, t[:filled], q[:filled], p[:filled], iterations[:filled], tau=_tau(memory, first, every, filled)
+                memory,
+                t[:filled],
+                q[:filled],
+                p[:filled],
+                iterations[:filled],
+                tau=_tau(memory, first, save_every, filled),
             )
             raise step_failure(status, report, step=memory.steps, h=memory.h, kept=kept)
         if progress is not None:
             progress(done)
         elapsed = max(time.perf_counter() - began, 1e-6)
-        portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-    found = trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, every, len(t)))
+        portion = save_every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / save_every))
+    found = trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, save_every, len(t)))
     memory.longest = float(np.abs(np.diff(found.t)).max(initial=memory.longest))
     if found.tau is not None and (failure := lost_level(found, memory.longest)):
         failure.trajectory = found
@@ -76,42 +81,42 @@ def record_states(
     return found
 
 
-def _tau(memory: Memory, first: int, every: int, count: int) -> Array | None:
-    """Of the state after ``first`` steps and those after it that ``every`` divides; 0 before the first step."""
+def _tau(memory: Memory, first: int, save_every: int, count: int) -> Array | None:
+    """Of the state after ``first`` steps and those after it that ``save_every`` divides; 0 before the first step."""
     if not memory.stepper.interface.energy_parameter:
         return None
-    numbers = np.append(first, every * (first // every + np.arange(1, count)))
+    numbers = np.append(first, save_every * (first // save_every + np.arange(1, count)))
     return times_after(0.0, memory.h, numbers)[0]
 
 
 def record_until(
-    memory: Memory, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
+    memory: Memory, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
     """Advance to the goal, or by ``steps``; keep the present state, every so many-th, and the one at the goal.
 
     Raises:
         StepFailedError: with the states kept so far as ``trajectory``, where steps shrink to nothing.
     """
-    every = checked_count(every, "every", least=1)
+    save_every = checked_count(save_every, "save_every", least=1)
     pieces = [_Piece.of(memory)]
-    done, portion = 0, 256 * every
+    done, portion = 0, 256 * save_every
     watch = Watch(memory.stepper, memory.goal.t_end if memory.goal and memory.goal.tau else None)
     while not memory.arrived and (steps is None or done < steps):
         size, began, before = portion if steps is None else min(portion, steps - done), time.perf_counter(), memory.t
-        piece = _Piece.empty(memory, size // every + 2)
-        status, report = fill(memory, size, every, *piece)
+        piece = _Piece.empty(memory, size // save_every + 2)
+        status, report = fill(memory, size, save_every, *piece)
         pieces.append(piece.first(report.stored))
         done += report.steps
         if status:
-            raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, every))
+            raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, save_every))
         if failure := watch.halt(before, memory.t, report.steps, memory.steps):
-            failure.trajectory = _joined(memory, pieces, every)
+            failure.trajectory = _joined(memory, pieces, save_every)
             raise failure
         if progress is not None:
             progress(done)
         elapsed = max(time.perf_counter() - began, 1e-6)
-        portion = every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / every))
-    return _joined(memory, pieces, every)
+        portion = save_every * max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed) / save_every))
+    return _joined(memory, pieces, save_every)
 
 
 class _Piece(NamedTuple):
@@ -137,11 +142,11 @@ class _Piece(NamedTuple):
         return cls(np.array([memory.t]), memory.q[np.newaxis], memory.p[np.newaxis], np.zeros(1, dtype=np.int32))
 
 
-def _joined(memory: Memory, pieces: Sequence[_Piece], every: int) -> Trajectory:
+def _joined(memory: Memory, pieces: Sequence[_Piece], save_every: int) -> Trajectory:
     """The trajectory of a run to its goal; with each state there, the steps between them have their lengths."""
     t, q, p, iterations = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     lengths = np.full(len(t), np.nan)
-    if every == 1:
+    if save_every == 1:
         lengths[:-1] = np.diff(t)
     return trajectory_of(memory, t, q, p, iterations, lengths=lengths)
 

@@ -52,10 +52,10 @@ def retaken(
 def steps_between(length: float, span: float) -> int:
     """How many steps of a length; 1 for a last one that an event or the end cut short."""
     if np.isnan(length):
-        raise StateError("this is known of whole steps: integrate without t_eval, and with every=1")
+        raise StateError("this is known of whole steps: integrate without t_eval, and with save_every=1")
     count = int(whole_steps(np.array([span]), np.array([length]), slack=ON_GRID)[0])
     if count > 1 and abs(span - count * length) > ON_GRID * abs(length):
-        raise StateError("this is known of whole steps: keep all states (every=1)")
+        raise StateError("this is known of whole steps: keep all states (save_every=1)")
     return max(1, count)
 
 
@@ -79,5 +79,5 @@ def refuse_strays(t: Array, found: Array, known: Array, before: Array) -> None:
         raise StateError(
             f"what begins at t = {t[strays[0]]:g}, taken again, does not lead where it led in the run: the equations "
             "of a step have several solutions (take shorter steps), or the motion is too sensitive between the kept "
-            "states (keep all, every=1)"
+            "states (keep all, save_every=1)"
         )

@@ -36,9 +36,9 @@ class Run(Memory):
 
     @alone
     def record(
-        self, steps: int | None = None, *, every: int = 1, progress: Callable[[int], None] | None = None
+        self, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
     ) -> Trajectory:
-        """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``every``.
+        """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``save_every``.
 
         Where steps choose their length, by no more than lead to the goal, whose state is kept, too; all of them where
         ``steps`` is left out.
@@ -54,9 +54,9 @@ class Run(Memory):
         """
         before = 0.0 if self.leaving else self.step_error[0]
         if self.stepper.events:
-            trajectory = Observation(self, every=every).advance(steps, progress)
+            trajectory = Observation(self, save_every=save_every).advance(steps, progress)
         else:
-            trajectory = record(self, steps, every=every, progress=progress)
+            trajectory = record(self, steps, save_every=save_every, progress=progress)
         if not self.leaving:
             warn_of_long_steps(trajectory, before=before)
         warn_of_lost_energy(trajectory)

@@ -120,7 +120,7 @@ def ahead(
     *,
     t: Array,
     h: float,
-    every: int,
+    save_every: int,
     options: SolverOptions | None,
     heed: Callable[[int], None],
 ) -> tuple[Array | None, StepFailedError | None]:
@@ -144,12 +144,12 @@ def ahead(
             last = min(first + MOST, steps)
             starts = Starts.chain(*now, t[first:last], np.full(last - first, h))
             at = np.arange(first, last + 1)
-            yield starts, np.where(at % every, -1, at // every)
+            yield starts, np.where(at % save_every, -1, at // save_every)
             now = starts.q[-1], starts.p[-1]
 
     spreading = None
     try:
-        spreading = _Spreading(changes.at(q, p, h, float(t[0]), parameters, options), stepper.given, t[::every])
+        spreading = _Spreading(changes.at(q, p, h, float(t[0]), parameters, options), stepper.given, t[::save_every])
         spreading.follow(stretches(), carried)
     except StepFailedError as failure:
         return spreading.growth.found if spreading else None, failure

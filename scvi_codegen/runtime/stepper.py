@@ -56,7 +56,7 @@ class Stepper(Ensembles):
         steps: int | None = None,
         t_end: float | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
@@ -66,7 +66,7 @@ class Stepper(Ensembles):
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> Trajectory:
-        """Run ``steps`` steps of h, or to t_end, and keep every ``every``-th state, the initial one first.
+        """Run ``steps`` steps of h, or to t_end, and keep every ``save_every``-th state, the initial one first.
 
         Args:
             q, p: (m,) initial positions and momenta.
@@ -77,7 +77,7 @@ class Stepper(Ensembles):
                 also in transformed time and where a monitor chooses the steps (:func:`~scvi_codegen.compile_stepper`),
                 by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
             tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
-            every: steps between kept states; the one at t_end is kept, too.
+            save_every: steps between kept states; the one at t_end is kept, too.
             t: initial time.
             parameters, options: as in :meth:`step`; an energy that transformed time needs is that of (q, p).
             progress: called now and then with the number of steps done.
@@ -105,8 +105,8 @@ class Stepper(Ensembles):
             StepFailedError: if a step fails; its ``trajectory`` holds the states before.
         """
         stepper = self if events is None else self.with_events(events)
-        if t_eval is not None and every != 1:
-            raise StateError(f"states are kept at t_eval or every so many steps (every={every}), not both")
+        if t_eval is not None and save_every != 1:
+            raise StateError(f"states are kept at t_eval or every so many steps (save_every={save_every}), not both")
         clocked = bool(self.interface.energy_parameter)
         if error is not None:
             return confirmed_run(
@@ -115,7 +115,7 @@ class Stepper(Ensembles):
                 stepper.with_events(()).integrate,
                 (q, p, velocity),
                 {"t": t, "parameters": parameters, "options": options},
-                {"t_end": t_end, "every": every, "progress": progress, "t_eval": t_eval},
+                {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
         run = stepper.start(
             q,
@@ -131,12 +131,12 @@ class Stepper(Ensembles):
         check = GrowthCheck(run, check_growth)
         if h is not None and t_end is not None and not self.interface.monitor:
             whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
-            if whole is None or whole % checked_count(every, "every", least=1):
-                return _said(observed_until(run, t_end, steps, every, t_eval, progress))
+            if whole is None or whole % checked_count(save_every, "save_every", least=1):
+                return _said(observed_until(run, t_end, steps, save_every, t_eval, progress))
             steps = whole
         _check_number(run, steps)
         if t_eval is None:
-            found = run.record(steps, every=every, progress=progress)
+            found = run.record(steps, save_every=save_every, progress=progress)
             if run.leaving:
                 warn_of_long_steps(found)
         elif clocked:
@@ -201,7 +201,7 @@ class Stepper(Ensembles):
         steps: int | None = None,
         t_end: float | None = None,
         tolerance: float | None = None,
-        every: int = 1,
+        save_every: int = 1,
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
@@ -218,7 +218,7 @@ class Stepper(Ensembles):
                 degree 3 at most.
             h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
             steps, t_end: with h one of both; without it ``t_end``.
-            q, p, velocity, tolerance, every, t, parameters, options, progress, events: as of :meth:`integrate`.
+            q, p, velocity, tolerance, save_every, t, parameters, options, progress, events: as of :meth:`integrate`.
             error, check_growth: as of :meth:`integrate`.
 
         Raises:
@@ -234,7 +234,7 @@ class Stepper(Ensembles):
                 stepper.with_events(()).drive,
                 (q, p, velocity),
                 {"t": t, "parameters": parameters, "options": options, "inputs": inputs},
-                {"t_end": t_end, "every": every, "progress": progress},
+                {"t_end": t_end, "save_every": save_every, "progress": progress},
             )
         end = end_of(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
@@ -250,8 +250,8 @@ class Stepper(Ensembles):
             options=options,
         )
         check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
-        every = checked_count(every, "every", least=1)
-        found = drive(run, data, end, every=every, values=values, progress=progress)
+        save_every = checked_count(save_every, "save_every", least=1)
+        found = drive(run, data, end, save_every=save_every, values=values, progress=progress)
         check.warn(found)
         return found
 

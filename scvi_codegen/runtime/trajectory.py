@@ -210,7 +210,7 @@ class Trajectory(NearbyMotions, Confirmed):
         return q.reshape(*times.shape, self.stepper.dimension), p.reshape(*times.shape, self.stepper.dimension)
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
-        """Zero crossings of functions along the trajectory, looked for now; it needs all states (``every=1``).
+        """Zero crossings of functions along the trajectory, looked for now; it needs all states (``save_every=1``).
 
         Args:
             events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
@@ -220,9 +220,9 @@ class Trajectory(NearbyMotions, Confirmed):
         return crossings_of(self.stepper.with_events(asked), self)
 
     def _repr_html_(self) -> str:
-        every = max(1, -(-len(self) // MOST_DRAWN))
-        series = list(zip(self.stepper.coordinates, self.q[::every].T, strict=True))[:MOST_CURVES]
-        energies = self._energies(every)
+        save_every = max(1, -(-len(self) // MOST_DRAWN))
+        series = list(zip(self.stepper.coordinates, self.q[::save_every].T, strict=True))[:MOST_CURVES]
+        energies = self._energies(save_every)
         rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
         if energies is not None:
             rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
@@ -246,10 +246,12 @@ class Trajectory(NearbyMotions, Confirmed):
         said = f"about {self.step_error:.1e} relative in the step from t = {self.step_error_t:g}, the worst"
         return f"{said}; too long" if self.step_error > TOLERABLE_ERROR else said
 
-    def _energies(self, every: int) -> Array | None:
+    def _energies(self, save_every: int) -> Array | None:
         """Of each so many states, ``None`` where a state has no energy."""
         try:
-            energies: Array = self.stepper.energy(self.q[::every], self.p[::every], self.t[::every], self.parameters)
+            energies: Array = self.stepper.energy(
+                self.q[::save_every], self.p[::save_every], self.t[::save_every], self.parameters
+            )
         except StateError:
             return None
         return energies

@@ -182,7 +182,7 @@ def _as_near(pace: Pace, start: State, steps: int, q: Array, p: Array, span: Any
 
 def _there_and_back(pace: Pace) -> Finding:
     first = pace.subject.states[0]
-    how: dict[str, Any] = {"steps": THERE_AND_BACK, "every": THERE_AND_BACK, "parameters": pace.at_level(first)}
+    how: dict[str, Any] = {"steps": THERE_AND_BACK, "save_every": THERE_AND_BACK, "parameters": pace.at_level(first)}
     there = pace.stepper.integrate(first.q, first.p, h=first.h, t=first.t, **how)
     back = pace.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
     change = np.abs(np.concatenate([back.q[-1], back.p[-1]]) - first.z) / pace.subject.rounding(first)

@@ -304,7 +304,7 @@ def _drift_of_lanes(subject: Subject) -> Finding | None:
     def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
         given = subject.given
         runs = subject.stepper.integrate_ensemble(
-            q, p, h=given.h, steps=steps, every=steps, t=given.t, parameters=subject.parameters, options=TO_REST
+            q, p, h=given.h, steps=steps, save_every=steps, t=given.t, parameters=subject.parameters, options=TO_REST
         )
         return runs.q[-1], runs.p[-1]
 

@@ -62,7 +62,9 @@ def name(value: object) -> str:
 def achieved(
     system: LagrangianSystem, advice: Advice, q: list[float], p: list[float], exact: np.ndarray, size: float
 ) -> float:
-    run = compile_stepper(system, advice.method).integrate(q, p, h=advice.h, steps=advice.steps, every=advice.steps)
+    run = compile_stepper(system, advice.method).integrate(
+        q, p, h=advice.h, steps=advice.steps, save_every=advice.steps
+    )
     return float(np.linalg.norm(run.q[-1] - exact)) / size
 
 
@@ -206,7 +208,7 @@ class TestHonesty:
         swept = compile_stepper(chosen.system, SVI(8), solver="fixed-point")
         p = swept.momentum(chosen.q, chosen.velocity)
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
-        swept.integrate(chosen.q, p, h=advice.h, steps=advice.steps, every=advice.steps)
+        swept.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
     def test_the_same_question_has_the_same_answer(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)

@@ -30,7 +30,7 @@ method = "svi:4"
 [run]
 step = 0.1
 steps = 70
-every = 7
+save_every = 7
 """
 
 
@@ -49,7 +49,7 @@ def output_of(model, *words):
 def test_it_is_that_of_the_run():
     text = output_of(MODEL)
     model = load_model("model.toml")
-    run = model.stepper().integrate(model.q, velocity=model.velocity, h=0.1, steps=70, every=7)
+    run = model.stepper().integrate(model.q, velocity=model.velocity, h=0.1, steps=70, save_every=7)
     energy, work = run.energy(), run.work()
     error = np.abs(energy - energy[0] - work).max()
     assert work[-1] < -0.01

@@ -196,9 +196,9 @@ class TestChoices:
         assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
 
     def test_states_and_lengths(self):
-        model = chosen(q=(1.0, 0.0), p=(0.0, 1.0), time=2.0, step=-0.5, steps=7, every=2, parameter=(("mu", 3.0),))
+        model = chosen(q=(1.0, 0.0), p=(0.0, 1.0), time=2.0, step=-0.5, steps=7, save_every=2, parameter=(("mu", 3.0),))
         assert (model.q, model.p, model.velocity, model.t) == ((1.0, 0.0), (0.0, 1.0), None, 2.0)
-        assert (model.h, model.steps, model.span, model.every) == (-0.5, 7, None, 2)
+        assert (model.h, model.steps, model.span, model.save_every) == (-0.5, 7, None, 2)
         assert model.system.defaults == (3.0,)
         assert chosen(step=0.5).step_count == 400
 
@@ -240,8 +240,8 @@ class TestChoices:
             ("kepler --parameter nu=1", "has no parameter 'nu'"),
             ("kepler --step 0", "the step is 0"),
             ("kepler --steps -1", "steps must be at least 0"),
-            ("kepler --every 0", "every must be at least 1"),
-            ("kepler --span 1e15", "GB of memory: keep fewer (--every "),
+            ("kepler --save-every 0", "save_every must be at least 1"),
+            ("kepler --span 1e15", "GB of memory: keep fewer (--save-every "),
             ("kepler --span 1e15", "or write them into a folder as they come (-o NAME.run)"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
             ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .nc, .zarr or into a folder .run, not as 'orbit.txt'"),
@@ -344,12 +344,12 @@ class TestRun:
     def test_energy_of_driven_systems_is_not_called_an_error(self):
         assert "L depends on time" in output_of("run", "duffing", "--parameter", "gamma=0.3")
 
-    @pytest.mark.parametrize("every", [1, 7])
-    def test_writes_the_trajectory_that_integrate_gives(self, every):
+    @pytest.mark.parametrize("save_every", [1, 7])
+    def test_writes_the_trajectory_that_integrate_gives(self, save_every):
         for name in ("orbit.npz", "orbit.csv"):
-            output_of("run", "kepler", "--steps", "500", "--every", str(every), "-o", name)
+            output_of("run", "kepler", "--steps", "500", "--save-every", str(save_every), "-o", name)
         model = chosen(steps=500)
-        expected = model.start(compile_stepper(model.system, model.method)).record(500, every=every)
+        expected = model.start(compile_stepper(model.system, model.method)).record(500, save_every=save_every)
         written, table = arrays("orbit.npz"), np.loadtxt("orbit.csv", delimiter=",", skiprows=1)
         for key in ("t", "q", "p", "iterations"):
             assert np.array_equal(written[key], getattr(expected, key))
@@ -358,16 +358,16 @@ class TestRun:
 
     def test_steps_fewer_than_every_and_none_at_all(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state kept" in output_of(
-            "run", "kepler", "--steps", "3", "--every", "5", "-o", "a.npz"
+            "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"
         )
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
 
     def test_states_that_do_not_fit_are_kept_as_advised(self, monkeypatch):
         monkeypatch.setattr("scvi_codegen.cli.memory.usable_memory", lambda: 20_000.0)
-        every = re.search(r"--every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
-        assert 1 < int(every) < 10
-        assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--every", every)
+        save_every = re.search(r"--save-every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
+        assert 1 < int(save_every) < 10
+        assert "1000 steps" in output_of("run", "kepler", "--steps", "1000", "--save-every", save_every)
 
     def test_draws_a_picture(self):
         assert "wrote orbit.svg" in output_of("run", "kepler", "--steps", "50", "--plot", "orbit.svg")

@@ -55,9 +55,9 @@ def output_of(*words):
 
 
 def test_a_run_is_that_of_drive_and_its_file_too(model):
-    text = output_of("-o", "run.npz", "--plot", "run.png", "--every", "2")
+    text = output_of("-o", "run.npz", "--plot", "run.png", "--save-every", "2")
     expected = compile_stepper(model.system, model.method).drive(
-        model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, every=2
+        model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, save_every=2
     )
     with np.load("run.npz") as file:
         assert (file["t"] == expected.t).all()

@@ -47,9 +47,9 @@ class Kind:
     energy: Callable[..., Array]
     maps: Mapping[str, Callable[..., tuple[Array, Array]]] = field(default_factory=dict)
     drawn: str = ""
-    words: tuple[str, ...] = ("--step", "0.125", "--steps", "90", "--every", "3")
+    words: tuple[str, ...] = ("--step", "0.125", "--steps", "90", "--save-every", "3")
     steps: int | None = 90
-    every: int = 3
+    save_every: int = 3
     h: float | None = 0.125
     method: tuple[str, str, int] = ("svi:2", "svi-2-gauss-legendre-2", 4)
     coordinates: tuple[str, ...] = ("x", "y")
@@ -177,9 +177,9 @@ constraints = ["x**2 + y**2 = 1"]
         rates=lambda t, q, p: (p / M, spring(t, q, p), none(q)),
         energy=spring_energy,
         maps={"angular momentum": angular},
-        words=("--tolerance", "1e-5", "--span", "11.25", "--every", "2"),
+        words=("--tolerance", "1e-5", "--span", "11.25", "--save-every", "2"),
         steps=None,
-        every=2,
+        save_every=2,
         h=None,
         symplectic="symplectic where steps have one length",
     ),
@@ -269,7 +269,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
     change = largest(energy - energy[0])
     dust = 1e-14 * largest(energy)
     end_q, end_p, work = exact_end(done)
-    count = (len(done.t) - 1) * kind.every
+    count = (len(done.t) - 1) * kind.save_every
     errors = step_errors(done)
 
     def named(x: Array) -> dict[str, float]:
@@ -291,7 +291,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         "system": lambda x: f'name = "{x}"' in kind.system,
         "method": lambda x: x == kind.method[1],
         "order": lambda x: x == kind.method[2],
-        "steps": lambda x: x == kind.steps if kind.steps else count - x + kind.every >= 0 and x <= count,
+        "steps": lambda x: x == kind.steps if kind.steps else count - x + kind.save_every >= 0 and x <= count,
         "rejected": lambda x: x == 0 if kind.h else 0 <= x < count,
         "h": lambda x: x == kind.h,
         "states": lambda x: x == len(done.t),
@@ -304,7 +304,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         ),
         "work": lambda x: abs(x - work) < 2e-3 * abs(work) if kind.accounted else x is None,
         "energy_balance": lambda x: balance_fits(done, x) if kind.accounted else x is None,
-        "step_error": lambda x: errors.max() / 100 / kind.every < x < kind.pessimism * errors.max(),
+        "step_error": lambda x: errors.max() / 100 / kind.save_every < x < kind.pessimism * errors.max(),
         "step_error_t": worst_found,
         "final": lambda x: x["q"] == named(done.q[-1]) and x["p"] == named(done.p[-1]) and x["t"] == done.t[-1],
         "final_error": near_truth,
@@ -319,7 +319,7 @@ def balance_fits(done: Done, found: float) -> bool:
     """Held against the work that the library integrates along the steps' own curves, which has tests of its own."""
     model = sc.load_model(done.model)
     run = model.stepper().integrate(
-        done.q[0], done.p[0], h=done.kind.h, steps=done.kind.steps, every=done.kind.every, t=T,
+        done.q[0], done.p[0], h=done.kind.h, steps=done.kind.steps, save_every=done.kind.save_every, t=T,
         parameters={"m": M, "k": K, "c": C},
     )  # fmt: skip
     energy = done.kind.energy(done.t, done.q, done.p)
@@ -357,7 +357,7 @@ def first_lines(done: Done, lines: list[str]) -> None:
     speed = re.fullmatch(r"(\S+) s, (\S+) (\w+) a step, (\S+) iterations a step; prepared in (\S+) s", lines[3])
     a_step = float(speed[2]) * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[speed[3]]
     assert a_step * numbers["steps"] == pytest.approx(float(speed[1]), rel=0.01)
-    watched = (len(done.t) - 1) * kind.every
+    watched = (len(done.t) - 1) * kind.save_every
     assert float(speed[4]) == pytest.approx(done.iterations.sum() / watched, abs=0.006)
     assert 0.0 <= float(speed[5]) < done.most
 
@@ -534,7 +534,7 @@ method = "svi:2"
 def test_every_field_and_line_of_an_array_system(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("ring.toml").write_text(RING)
-    words = ("run", "ring.toml", "--step", "0.25", "--steps", "60", "--every", "4", "--parameter", "k=0.75")
+    words = ("run", "ring.toml", "--step", "0.25", "--steps", "60", "--save-every", "4", "--parameter", "k=0.75")
     numbers = document(*words, "-o", "ring.npz")
     with np.load("ring.npz") as saved:
         t, q, p = saved["t"], saved["q_q"], saved["p_q"]

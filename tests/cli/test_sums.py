@@ -38,7 +38,7 @@ method = "svi:4"
 [run]
 step = 0.1
 steps = 20
-every = 5
+save_every = 5
 """
 
 NEWTON = ("--solver", "newton")

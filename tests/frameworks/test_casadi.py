@@ -36,12 +36,12 @@ def symbols(flow):
     return [ca.MX.sym(flow.name_in(i), flow.size1_in(i)) for i in range(flow.n_in())]
 
 
-def run(every):
-    return kepler().integrate(Q, P, h=H, steps=90, every=every, t=0.0, parameters={"mu": 1.1})
+def run(save_every):
+    return kepler().integrate(Q, P, h=H, steps=90, save_every=save_every, t=0.0, parameters={"mu": 1.1})
 
 
 def test_states_are_those_of_integrate():
-    flow = casadi_flow(kepler(), steps=90, every=30)
+    flow = casadi_flow(kepler(), steps=90, save_every=30)
     found = flow(Q, P, 1.1, 0.0, H)
     assert_allclose(found[0].full().T, run(30).q, rtol=0, atol=1e-13)
     assert_allclose(found[1].full().T, run(30).p, rtol=0, atol=1e-13)
@@ -51,7 +51,7 @@ def test_states_are_those_of_integrate():
 
 
 def test_derivatives_forward_and_back_are_those_of_runs():
-    flow = casadi_flow(kepler(), steps=90, every=30)
+    flow = casadi_flow(kepler(), steps=90, save_every=30)
     given = symbols(flow)
     x, states = ca.vertcat(*given), ca.vertcat(*flow(*given))
     at = (Q, P, 1.1, 0.0, H)
@@ -104,7 +104,7 @@ def test_ipopt_finds_the_hohmann_transfer():
 
 def test_second_derivatives_are_those_of_runs():
     """The Hessian of a function of kept states, and the Jacobian of the adjoint by the slopes it is given."""
-    flow = casadi_flow(kepler(), steps=90, every=30, hessian=True)
+    flow = casadi_flow(kepler(), steps=90, save_every=30, hessian=True)
     given, weights = symbols(flow), np.random.default_rng(3).normal(size=(4, 4))
     x, states = ca.vertcat(*given), ca.vertcat(*flow(*given))
     bent = ca.dot(states, weights) + ca.sumsqr(states[:, 1])
@@ -175,7 +175,7 @@ def test_what_there_is_not_is_refused():
 
 
 def test_time_and_parameters_of_a_flow_of_several_pieces():
-    flow = casadi_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+    flow = casadi_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
     given = symbols(flow)
     values = ca.vec(ca.vertcat(*flow(*given)))
     jacobian = ca.Function("J", given, [ca.jacobian(values, ca.vertcat(*given))])

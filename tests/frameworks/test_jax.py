@@ -74,8 +74,8 @@ def leapfrog(x):
     return jnp.concatenate([jnp.stack([q, p])[:, None], found.T], axis=1)
 
 
-def by_c(x, every=1):
-    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, every=every)
+def by_c(x, save_every=1):
+    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, save_every=save_every)
     q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
     return jnp.concatenate([q, p], axis=-1).T
 
@@ -87,9 +87,9 @@ def given():
 
 def test_values_are_those_of_leapfrog_and_of_integrate():
     assert_allclose(by_c(given()), leapfrog(given()), atol=1e-12)
-    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=H, steps=40, every=8, parameters={"mu": 1.1})
+    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=H, steps=40, save_every=8, parameters={"mu": 1.1})
     start = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.7])
-    q, p = jax_flow(kepler(), steps=40, every=8)(*start, h=H, parameters={"mu": 1.1})
+    q, p = jax_flow(kepler(), steps=40, save_every=8)(*start, h=H, parameters={"mu": 1.1})
     assert_allclose(q, run.q, rtol=0, atol=1e-13)
     assert_allclose(p, run.p, rtol=0, atol=1e-13)
     q, p = jax_flow(kepler(), steps=40)(*start, h=H, parameters=jnp.array([1.1]))
@@ -97,10 +97,10 @@ def test_values_are_those_of_leapfrog_and_of_integrate():
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("every", [1, 50])
-def test_derivatives_by_all_that_is_given_are_those_of_leapfrog(derivative, every):
-    found = derivative(partial(by_c, every=every))(given())
-    expected = jax.jacfwd(leapfrog)(given())[:, ::every]
+@pytest.mark.parametrize("save_every", [1, 50])
+def test_derivatives_by_all_that_is_given_are_those_of_leapfrog(derivative, save_every):
+    found = derivative(partial(by_c, save_every=save_every))(given())
+    expected = jax.jacfwd(leapfrog)(given())[:, ::save_every]
     assert_allclose(found, expected, rtol=0, atol=1e-12 * float(abs(expected).max()))
 
 
@@ -141,18 +141,18 @@ def test_transformations_apply_in_any_order():
     assert_allclose(along, together[0][0] @ jnp.array([0.3, 0.4]), rtol=1e-11)
 
 
-@pytest.mark.parametrize("every", [None, 50])
-def test_second_derivatives_are_those_of_leapfrog(every):
+@pytest.mark.parametrize("save_every", [None, 50])
+def test_second_derivatives_are_those_of_leapfrog(save_every):
     """Which JAX differentiates twice itself; forward and back over a gradient, compiled, of batches, times vectors."""
-    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, every=every)
+    flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, save_every=save_every)
 
     def along(x):
         q, p = flow(x[:1], x[1:2], parameters=x[2:6], t=x[6], h=x[7])
         return (q**2 * p + jnp.sin(p)).sum()
 
     def expected_along(x):
-        q, p = leapfrog(x)[:, :: every or STEPS]
-        q, p = (q, p) if every else (q[-1:], p[-1:])
+        q, p = leapfrog(x)[:, :: save_every or STEPS]
+        q, p = (q, p) if save_every else (q[-1:], p[-1:])
         return (q**2 * p + jnp.sin(p)).sum()
 
     x = given()
@@ -241,8 +241,8 @@ def test_what_there_is_not_is_refused():
         flow(jnp.zeros((3, 2)), jnp.zeros((4, 2)), h=H)
     with pytest.raises(StateError, match="did you mean 'mu'"):
         flow(q, p, h=H, parameters={"Mu": 1.0})
-    with pytest.raises(StateError, match="no multiple of every=3"):
-        jax_flow(kepler(), steps=10, every=3)
+    with pytest.raises(StateError, match="no multiple of save_every=3"):
+        jax_flow(kepler(), steps=10, save_every=3)
     with pytest.raises(MethodError, match="monitor"):
         jax_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
     clocked = compile_stepper(reparametrise(problem("kepler").system, "q1**2 + q2**2"), SVI(2))
@@ -266,7 +266,7 @@ def test_without_binary64_it_says_how_to_have_it():
 
 
 def test_time_and_parameters_of_a_flow_of_several_pieces():
-    flow = jax_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+    flow = jax_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
 
     def along(x):
         q, p = flow(x[:2], x[2:4], h=x[9], t=x[8], parameters=x[4:8])

@@ -31,8 +31,8 @@ def numbers(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def by_c(x, every=None):
-    q, p = torch_flow(galaxy(), steps=STEPS, every=every)(x[..., :2], x[..., 2:4], h=x[..., 4])
+def by_c(x, save_every=None):
+    q, p = torch_flow(galaxy(), steps=STEPS, save_every=save_every)(x[..., :2], x[..., 2:4], h=x[..., 4])
     return torch.cat([q, p], dim=-1)
 
 
@@ -51,8 +51,8 @@ def leapfrog(x):
 
 
 def test_values_are_those_of_runs():
-    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=0.05, steps=40, every=8, parameters={"mu": 1.1})
-    flow = torch_flow(kepler(), steps=40, every=8)
+    run = kepler().integrate([0.5, 0.0], [0.0, 1.7], h=0.05, steps=40, save_every=8, parameters={"mu": 1.1})
+    flow = torch_flow(kepler(), steps=40, save_every=8)
     q, p = flow(numbers([0.5, 0.0]), numbers([0.0, 1.7]), h=0.05, parameters={"mu": 1.1})
     assert_allclose(q.numpy(), run.q, atol=1e-13)
     assert_allclose(p.numpy(), run.p, atol=1e-13)
@@ -78,12 +78,12 @@ def test_second_derivatives_are_those_of_leapfrog():
     assert_allclose(beside[1], expected, atol=1e-10)
 
 
-@pytest.mark.parametrize("every", [None, 4])
-def test_gradcheck_passes(every):
+@pytest.mark.parametrize("save_every", [None, 4])
+def test_gradcheck_passes(save_every):
     """PyTorch's own, by differences, back and forward, of batches, and of gradients."""
     x = torch.stack([numbers(X), 0.9 * numbers(X)]).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: by_c(x, every), x, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(lambda x: by_c(x, every), x)
+    assert torch.autograd.gradcheck(lambda x: by_c(x, save_every), x, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(lambda x: by_c(x, save_every), x)
 
 
 def test_parameters_are_learned():
@@ -106,7 +106,7 @@ def test_parameters_are_learned():
 
 
 def test_many_motions_have_shapes_that_fit():
-    flow = torch_flow(kepler(), steps=5, every=1)
+    flow = torch_flow(kepler(), steps=5, save_every=1)
     q, p = flow(numbers([[[0.5, 0.0]], [[0.6, 0.0]]]), numbers([[0.0, 1.7]] * 3), h=0.05)
     assert q.shape == p.shape == (2, 3, 6, 2)
     slope = torch.func.vmap(
@@ -130,7 +130,7 @@ def test_what_there_is_not_is_refused():
 
 
 def test_time_and_parameters_of_a_flow_of_several_pieces():
-    flow = torch_flow(pumped.stepper(), steps=pumped.STEPS, every=pumped.EVERY)
+    flow = torch_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
 
     def along(x):
         return torch.cat(flow(x[:2], x[2:4], h=x[9], t=x[8], parameters=x[4:8]), dim=-1)

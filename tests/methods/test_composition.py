@@ -64,7 +64,7 @@ def test_the_force_at_the_end_is_used_again_without_a_trace():
 def test_energy_does_not_drift():
     entry = problem("kepler")
     stepper = compile_stepper(entry.system, Composition(8))
-    run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.05, steps=100_000, every=10)
+    run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=0.05, steps=100_000, save_every=10)
     error = np.abs(run.energy() + 0.5)
     assert error[-2000:].max() < 1.5 * error[:2000].max()
 

@@ -149,7 +149,7 @@ def test_energy_is_bounded_and_momenta_are_kept():
     assert [each.name for each in symmetries(system)] == ["angular momentum z"]
     stepper = compile_stepper(system, lobatto(3))
     run = stepper.integrate(
-        [0.6, 0, -0.8, 1.2, 0, -1.6], velocity=[0, 0.9, 0, 0, 1.5, 0], h=0.05, steps=20000, every=20
+        [0.6, 0, -0.8, 1.2, 0, -1.6], velocity=[0, 0.9, 0, 0, 1.5, 0], h=0.05, steps=20000, save_every=20
     )
     energy = run.energy() - run.energy()[0]
     assert np.abs(energy).max() < 1e-7

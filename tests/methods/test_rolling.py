@@ -96,7 +96,7 @@ def test_energy_does_not_drift():
     """Not because areas are kept, which they are not: steps are symmetric, and the motion is reversible."""
     system = sleigh()
     assert not is_symplectic(lobatto(2), system)
-    run = compile_stepper(system, lobatto(3)).integrate(START[0], velocity=START[1], h=0.2, steps=50_000, every=10)
+    run = compile_stepper(system, lobatto(3)).integrate(START[0], velocity=START[1], h=0.2, steps=50_000, save_every=10)
     energy = run.energy() - run.energy()[0]
     assert np.abs(energy).max() < 5e-8
     assert abs(energy[-500:].mean() - energy[:500].mean()) < 1e-8

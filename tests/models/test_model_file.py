@@ -42,7 +42,7 @@ degree = 3
 [run]
 step = 0.25
 span = 10
-every = 4
+save_every = 4
 """
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -59,7 +59,7 @@ def test_reads_what_the_file_says():
     assert model.system.defaults == (2.0,)
     assert model.method == SVI(3)
     assert (model.q, model.p, model.velocity, model.t) == ((0.5,), None, (0.0,), 1.5)
-    assert (model.h, model.span, model.steps, model.every, model.step_count) == (0.25, 10.0, None, 4, 40)
+    assert (model.h, model.span, model.steps, model.save_every, model.step_count) == (0.25, 10.0, None, 4, 40)
 
 
 def test_the_layout_described_in_the_module_is_read():
@@ -107,11 +107,11 @@ def test_every_kind_of_method_survives_a_round_trip(method):
     h=st.floats(min_value=1e-3, max_value=1e3),
     back=st.booleans(),
     steps=st.integers(0, 10**12),
-    every=st.integers(1, 10**6),
+    save_every=st.integers(1, 10**6),
     mu=finite,
 )
-def test_every_number_survives_a_round_trip(q, p, t, h, back, steps, every, mu):
-    model = kepler(q=q, p=p, velocity=None, t=t, h=-h if back else h, span=None, steps=steps, every=every)
+def test_every_number_survives_a_round_trip(q, p, t, h, back, steps, save_every, mu):
+    model = kepler(q=q, p=p, velocity=None, t=t, h=-h if back else h, span=None, steps=steps, save_every=save_every)
     model = replace(model, system=model.system.with_parameters(mu=mu))
     again = parse_model(dump_model(model))
     assert again == model
@@ -167,15 +167,15 @@ def test_a_catalogue_reference_may_be_changed():
         ("[method]", "[zzz]", "Known: system, forces, inputs, parameters, initial, method, run"),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
-        ("every", "evry", "unknown key 'evry' in [run]; did you mean 'every'?"),
-        ("every", "h", "unknown key 'h' in [run]; did you mean 'step'?"),
-        ("every", "dt", "unknown key 'dt' in [run]; did you mean 'step'?"),
-        ("every", "T", "unknown key 'T' in [run]; did you mean 'span'?"),
-        ("every", "t_end", "unknown key 't_end' in [run]; did you mean 'span'?"),
-        ("every", "n", "unknown key 'n' in [run]; did you mean 'steps'?"),
-        ("every", "rtol", "unknown key 'rtol' in [run]; did you mean 'tolerance'?"),
-        ("every", "solver", "unknown key 'solver' in [run]; 'method' belongs in [method]."),
-        ("every", "degree", "unknown key 'degree' in [run]; 'degree' belongs in [method]."),
+        ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),
+        ("save_every", "h", "unknown key 'h' in [run]; did you mean 'step'?"),
+        ("save_every", "dt", "unknown key 'dt' in [run]; did you mean 'step'?"),
+        ("save_every", "T", "unknown key 'T' in [run]; did you mean 'span'?"),
+        ("save_every", "t_end", "unknown key 't_end' in [run]; did you mean 'span'?"),
+        ("save_every", "n", "unknown key 'n' in [run]; did you mean 'steps'?"),
+        ("save_every", "rtol", "unknown key 'rtol' in [run]; did you mean 'tolerance'?"),
+        ("save_every", "solver", "unknown key 'solver' in [run]; 'method' belongs in [method]."),
+        ("save_every", "degree", "unknown key 'degree' in [run]; 'degree' belongs in [method]."),
         ("degree", "n", "unknown key 'n' in [method] for svi; did you mean 'degree'?"),
         ("lagrangian", "L", "unknown key 'L' in [system]; did you mean 'lagrangian'?"),
         ("[parameters]", "[constants]", "unknown section 'constants' in the file; did you mean 'parameters'?"),
@@ -210,8 +210,8 @@ def test_a_catalogue_reference_may_be_changed():
         ("step = 0.25", "step = 0", "the step is 0"),
         ("step = 0.25", "step = 1e-300", "fewer than 2^53 steps"),
         ("span = 10", "span = -10", "a positive length of time"),
-        ("every = 4", "every = 0", "[run] every must be at least 1"),
-        ("every = 4", "every = 1.5", "[run] every must be a whole number, not 1.5"),
+        ("save_every = 4", "save_every = 0", "[run] save_every must be at least 1"),
+        ("save_every = 4", "save_every = 1.5", "[run] save_every must be a whole number, not 1.5"),
         ("span = 10", "steps = -1", "[run] steps must be at least 0"),
         ('"svi"', '"svj"', "there is no method 'svj'"),
         ('"svi"', "3", "[method] method must be text between quotes, not 3"),
@@ -286,7 +286,7 @@ def test_sections_laid_over_a_file_supply_and_replace():
     model = parse_model(PENDULUM, {**given, "parameters": {"m": 7.0}})
     assert (model.p, model.velocity, model.steps, model.span) == ((0.0,), None, 3, None)
     assert model.system.defaults[0] == 7.0
-    assert (model.t, model.every) == (1.5, 4)
+    assert (model.t, model.save_every) == (1.5, 4)
     with pytest.raises(ModelFileError, match="no parameter 'nu'"):
         parse_model(PENDULUM, {"parameters": {"nu": 1.0}})
 

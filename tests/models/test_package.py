@@ -130,7 +130,7 @@ def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compil
     assert header.split() == ["#", "t", *names, *(f"p_{name}" for name in names), "energy_error"]
     table = np.array([line.split() for line in lines], dtype=float)
     stepper = compile_stepper(model.system, method)
-    trajectory = model.start(stepper).record(model.step_count, every=model.step_count // 20)
+    trajectory = model.start(stepper).record(model.step_count, save_every=model.step_count // 20)
     assert np.array_equal(table[:, 0], trajectory.t)
     states = np.hstack([trajectory.q, trajectory.p])
     assert np.abs(table[:, 1:-1] - states).max() < 1e-8 * np.abs(states).max()

@@ -42,7 +42,7 @@ def test_its_runs_are_saved_and_restored_where_they_stand(stepper):
 
 
 def test_there_are_states_between_and_crossings(stepper):
-    run = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5, every=4)
+    run = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5, save_every=4)
     assert run.at(float(END[0]))[0] == pytest.approx(END[1], rel=1e-13)
     crossings = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5, events="q").events[0]
     assert np.abs(crossings.q).max() < 1e-12

@@ -35,8 +35,8 @@ class TestShapes:
         (places,) = shape.points(np.array([[np.pi / 2, 0.0]]), np.zeros((1, 2)))
         assert np.allclose(places, [[0.0, 0.0], [2.0, 0.0], [2.0, -0.5]])
         assert shape.joined
-        every = shape.points(run.q, run.p)
-        assert np.allclose(np.linalg.norm(np.diff(every, axis=1), axis=2), [2.0, 0.5])
+        save_every = shape.points(run.q, run.p)
+        assert np.allclose(np.linalg.norm(np.diff(save_every, axis=1), axis=2), [2.0, 0.5])
 
     def test_a_pendulum_measured_from_above_stands_at_zero(self):
         run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)

@@ -194,7 +194,7 @@ STATE = ([0.5, 0.0], [0.0, 1.7])
 
 def final(stepper: Stepper, p: float = 1.7) -> bytes:
     """The last state of a run from a momentum, to the bit."""
-    run = stepper.integrate([0.5, 0.0], [0.0, p], h=0.05, steps=2000, every=2000)
+    run = stepper.integrate([0.5, 0.0], [0.0, p], h=0.05, steps=2000, save_every=2000)
     return run.q[-1].tobytes() + run.p[-1].tobytes()
 
 

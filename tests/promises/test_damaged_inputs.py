@@ -103,7 +103,7 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "velocity": lambda x: stepper().integrate([1.0], velocity=x, **STEP),
     "h": lambda x: stepper().integrate([1.0], [0.0], h=x, steps=2, parameters=INPUT),
     "steps": lambda x: stepper().integrate([1.0], [0.0], h=0.1, steps=2 if _is_huge(x) else x, parameters=INPUT),
-    "every": lambda x: stepper().integrate([1.0], [0.0], every=x, **STEP),
+    "save_every": lambda x: stepper().integrate([1.0], [0.0], save_every=x, **STEP),
     "t": lambda x: stepper().integrate([1.0], [0.0], t=x, **STEP),
     "t_end": lambda x: stepper().integrate([1.0], [0.0], t_end=2 if _is_huge(x) else x, parameters=INPUT),
     "t_eval": lambda x: stepper().integrate([1.0], [0.0], t_end=2.0, t_eval=x, parameters=INPUT),

@@ -101,7 +101,7 @@ def test_model_files_run_and_keep_their_energy(name, tmp_path):
     assert float(found[1]) < ENERGY_ERRORS[name]
     model = load_model(EXAMPLES / f"{name}.toml")
     with np.load(output) as written:
-        assert len(written["t"]) == model.step_count // model.every + 1
+        assert len(written["t"]) == model.step_count // model.save_every + 1
 
 
 def test_the_ring_keeps_its_energy_and_momentum(tmp_path):

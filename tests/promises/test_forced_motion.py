@@ -80,7 +80,7 @@ def slope(stepper, build, counts):
     q, v = STATES[build]
     errors = []
     for count in counts:
-        run = stepper.integrate(q, velocity=v, h=SPAN / count, steps=count, every=count, t=0.3)
+        run = stepper.integrate(q, velocity=v, h=SPAN / count, steps=count, save_every=count, t=0.3)
         errors.append(float(np.linalg.norm(run.q[-1] - reference(build))))
     return np.log2(errors[0] / errors[1]), errors
 

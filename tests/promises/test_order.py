@@ -44,7 +44,7 @@ def reference(compiled, sample, name, span):
 
 
 def global_error(compiled, sample, name, method, span, count):
-    run = compiled(name, method).integrate(*sample(name).state, h=span / count, steps=count, every=count, t=0.3)
+    run = compiled(name, method).integrate(*sample(name).state, h=span / count, steps=count, save_every=count, t=0.3)
     return np.linalg.norm(np.concatenate([run.q[-1], run.p[-1]]) - reference(compiled, sample, name, span))
 
 

@@ -215,7 +215,9 @@ def test_free_bodies_keep_linear_and_angular_momentum_to_round_off(sample, compi
 def check_solar_system(compiled, method, steps):
     entry = problem("outer-solar-system")
     stepper = compiled("outer-solar-system", method)
-    run = stepper.integrate(entry.q, stepper.momentum(entry.q, entry.velocity), h=entry.step, steps=steps, every=10)
+    run = stepper.integrate(
+        entry.q, stepper.momentum(entry.q, entry.velocity), h=entry.step, steps=steps, save_every=10
+    )
     q, p = (x.reshape(len(run), 6, 3) for x in (run.q, run.p))
     linear, angular = p.sum(axis=1), np.cross(q, p).sum(axis=1)
     scale = np.abs(np.cross(q[0], p[0])).sum(axis=0).max()

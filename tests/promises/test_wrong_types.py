@@ -73,7 +73,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "Splines": {"pieces": 2, "breakpoints": ()},
     "SolverOptions": {"tolerance": 1e-9, "max_iterations": 5, "absolute": False},
     "Event": {"function": "q1", "direction": 0, "terminal": False},
-    "Model": {"system": SYSTEM, "method": "svi", **STATE, "h": 0.1, "steps": 3, "every": 1, "t": 0.0},
+    "Model": {"system": SYSTEM, "method": "svi", **STATE, "h": 0.1, "steps": 3, "save_every": 1, "t": 0.0},
     "gauss_legendre": {"n": 2},
     "gauss_radau": {"n": 2, "side": "left"},
     "hermite": {"n": 2, "derivatives": 1},
@@ -82,8 +82,8 @@ PLAIN: dict[str, dict[str, Any]] = {
     "HamiltonianSystem.from_text": NAMED | {"hamiltonian": "p**2", "momenta": ["p"]},
 }
 OF_STEPPERS: dict[str, dict[str, Any]] = {
-    "integrate": MOVED | {"steps": 3, "every": 1, "progress": None, "t_eval": None, "events": None},
-    "integrate_ensemble": MOVED | {"q": [Q], "p": [P], "steps": 3, "every": 1, "threads": 1},
+    "integrate": MOVED | {"steps": 3, "save_every": 1, "progress": None, "t_eval": None, "events": None},
+    "integrate_ensemble": MOVED | {"q": [Q], "p": [P], "steps": 3, "save_every": 1, "threads": 1},
     "start": MOVED,
     "step": MOVED,
     "jacobian": MOVED,
@@ -149,7 +149,7 @@ def test_trajectories_refuse_wrong_types_by_name(run, tmp_path):
     span = {"t_span": (0.0, 1.0), "y0": [*Q, *P], "method": None, "h": 0.1, "t_eval": None, "dense_output": False}
     refused(sc.solve_motion, {"system": run.stepper} | span)
     fresh = {"run": run.stepper.start(Q, P, h=0.1), "folder": tmp_path / "a.run", "checkpoint_seconds": 1.0}
-    refused(sc.record_run, fresh | {"steps": 3, "every": 1, "model": None, "progress": None})
+    refused(sc.record_run, fresh | {"steps": 3, "save_every": 1, "model": None, "progress": None})
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_generated_folders_meet_constraints_and_compute_what_python_does(precisi
     states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
     stepper = compile_stepper(LINKAGE, "svi:3", solver="newton")
     with pytest.warns(AccuracyWarning, match="moved to the nearest"):
-        run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, every=2)
+        run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, save_every=2)
     assert "(relative) off the constraints" in found.stderr
     assert len(states) == len(run)
     bound = 2e-4 if precision == "single" else 2e-13

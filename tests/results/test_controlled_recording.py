@@ -48,19 +48,22 @@ def controlled(stepper: Stepper, folder: str, t_end: float = END, **settings: ob
     return record_run(run, folder, **{"rows": 64} | settings)
 
 
-@pytest.mark.parametrize("every", [1, 7, 5000])
-def test_it_is_the_run_in_memory_in_full_files(kepler, every):
-    found, run = controlled(kepler, "a.run", every=every), kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE)
-    assert_same(found, kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE, every=every))
+@pytest.mark.parametrize("save_every", [1, 7, 5000])
+def test_it_is_the_run_in_memory_in_full_files(kepler, save_every):
+    found, run = (
+        controlled(kepler, "a.run", save_every=save_every),
+        kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE),
+    )
+    assert_same(found, kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE, save_every=save_every))
     assert found.finished
     assert found.steps == run.steps > 300
     assert [len(piece) for piece in found.pieces()][:-1] == [64] * ((len(found) - 1) // 64)
 
 
-@pytest.mark.parametrize("every", [1, 9])
-def test_interrupted_it_has_the_bytes_of_one_that_was_not(kepler, every):
-    whole = controlled(kepler, "whole.run", every=every)
-    found, looks = controlled(kepler, "a.run", every=every, stop=StopsAfter(0), checkpoint_steps=31), 1
+@pytest.mark.parametrize("save_every", [1, 9])
+def test_interrupted_it_has_the_bytes_of_one_that_was_not(kepler, save_every):
+    whole = controlled(kepler, "whole.run", save_every=save_every)
+    found, looks = controlled(kepler, "a.run", save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
     while not found.finished:
         assert found.t[-1] < END
         found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
@@ -82,7 +85,7 @@ def test_a_part_is_a_trajectory_that_knows_states_between(kepler):
 
 @pytest.mark.parametrize("t_end", [END, -END])
 def test_it_may_be_made_longer_and_shorter_but_not_turned(kepler, t_end):
-    controlled(kepler, "a.run", t_end, every=3)
+    controlled(kepler, "a.run", t_end, save_every=3)
     longer = resume_run("a.run", t_end=1.5 * t_end)
     assert longer.finished
     assert t_end in longer.t
@@ -147,5 +150,5 @@ def test_a_run_that_outgrows_the_memory_is_ended_with_advice(monkeypatch):
     monkeypatch.setattr(memory, "usable_memory", lambda: 8000.0)
     done = invoke("k.toml")
     assert done.exit_code != 0
-    assert "keep fewer (--every" in done.output
+    assert "keep fewer (--save-every" in done.output
     assert "-o NAME.run" in done.output

@@ -18,7 +18,7 @@ def ensemble() -> sc.EnsembleTrajectory:
     """Three orbits about three masses, the last into the centre, which fails."""
     stepper = compile_quickly(sc.problem("kepler").system, sc.SVI(2))
     q, p = np.array([[1.0, 0.0], [0.8, 0.1], [0.5, 0.0]]), np.array([[0.0, 1.0], [0.1, 1.2], [0.0, 0.0]])
-    return stepper.integrate_ensemble(q, p, h=0.05, steps=60, every=3, parameters={"mu": [1.0, 1.1, 1.2]})
+    return stepper.integrate_ensemble(q, p, h=0.05, steps=60, save_every=3, parameters={"mu": [1.0, 1.1, 1.2]})
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.nc", "a.zarr"])

@@ -47,7 +47,7 @@ if Path("a.run/manifest.json").exists():
     resume_run("a.run", **settings)
 else:
     run = stepper.start([0.5, 0.0], [0.0, 1.7], h=0.05)
-    record_run(run, "a.run", steps=10**12, every=20, rows={rows}, **settings)
+    record_run(run, "a.run", steps=10**12, save_every=20, rows={rows}, **settings)
 """
 
 
@@ -63,7 +63,7 @@ def assert_whole(stepper: Stepper, *, further: int = 1000) -> None:
     steps, rows = load_run("a.run").steps + further, load_run("a.run").manifest.rows
     resume_run("a.run", steps=steps)
     shutil.rmtree("whole.run", ignore_errors=True)
-    record_run(start(stepper), "whole.run", steps=steps, every=20, rows=rows)
+    record_run(start(stepper), "whole.run", steps=steps, save_every=20, rows=rows)
     assert digests("a.run") == digests("whole.run")
     assert {path.name for path in Path("a.run").iterdir()} == {path.name for path in Path("whole.run").iterdir()}
 
@@ -167,7 +167,7 @@ if os.geteuid() == 0:  # give up CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, with 
 
 
 def test_a_folder_that_cannot_be_written_is_told_at_once(kepler, tmp_path):
-    recorded(kepler, 100, every=20, rows=5000)
+    recorded(kepler, 100, save_every=20, rows=5000)
     before = digests("a.run")
     try:
         with child(kepler, before=WITHOUT_RIGHTS) as process:
@@ -224,14 +224,14 @@ class TestCommandLine:
         return result.output
 
     def test_a_run_into_a_folder_and_further_and_out(self):
-        text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --every 10 -o a.run")
+        text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --save-every 10 -o a.run")
         assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states kept in 'a.run'" in text
         assert "relative energy error" in text
         assert "wrote a.run" in text
         assert "holds a run already" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
         text = self.invoke("run --resume a.run --span 20")
         assert "2000 steps (all)" in text
-        self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --every 10 -o whole/")
+        self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --save-every 10 -o whole/")
         assert digests("a.run") == digests("whole")
         assert "201 states kept in 'a.run'" in self.invoke("export a.run")
         assert "wrote a.csv" in self.invoke("export a.run -o a.csv")
@@ -257,7 +257,7 @@ class TestCommandLine:
         assert message in self.invoke(words, status)
 
     def test_ctrl_c_says_how_to_go_on(self):
-        words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --every 100000 -o a.run"
+        words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --save-every 100000 -o a.run"
         command = [sys.executable, "-m", "scvi_codegen", *words.split(), "--checkpoint", "0.1"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             while not Path("a.run/manifest.json").exists():

@@ -44,11 +44,11 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 class TestRecording:
-    @pytest.mark.parametrize("every", [1, 7, 5000])
-    def test_a_recorded_run_is_the_one_in_memory(self, kepler, every):
-        found = recorded(kepler, 1001, every=every)
-        assert_same(found, kepler.integrate(**STATE, h=H, steps=1001, every=every))
-        assert (found.steps, found.finished, len(found)) == (1001, True, 1001 // every + 1)
+    @pytest.mark.parametrize("save_every", [1, 7, 5000])
+    def test_a_recorded_run_is_the_one_in_memory(self, kepler, save_every):
+        found = recorded(kepler, 1001, save_every=save_every)
+        assert_same(found, kepler.integrate(**STATE, h=H, steps=1001, save_every=save_every))
+        assert (found.steps, found.finished, len(found)) == (1001, True, 1001 // save_every + 1)
         assert len(list(Path("a.run").iterdir())) == 1 + -(-len(found) // 64)
 
     def test_files_are_full_but_the_last(self, kepler):
@@ -56,20 +56,20 @@ class TestRecording:
         assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
 
     @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
-    @pytest.mark.parametrize("every", [1, 40, 400])
-    def test_an_interrupted_run_has_the_bytes_of_one_that_was_not(self, compiled, method, every):
+    @pytest.mark.parametrize("save_every", [1, 40, 400])
+    def test_an_interrupted_run_has_the_bytes_of_one_that_was_not(self, compiled, method, save_every):
         stepper = compiled("kepler", method)
-        recorded(stepper, 600, every=every, folder="whole.run")
-        found, looks = recorded(stepper, 600, every=every, stop=StopsAfter(0), checkpoint_steps=31), 1
+        recorded(stepper, 600, save_every=save_every, folder="whole.run")
+        found, looks = recorded(stepper, 600, save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
         while not found.finished:
             found, looks = resume_run("a.run", stop=StopsAfter(looks), checkpoint_steps=37), looks + 1
         assert looks > 3
         assert digests("a.run") == digests("whole.run")
 
-    @pytest.mark.parametrize("every", [1, 7])
-    def test_steps_that_nobody_kept_are_made_again(self, kepler, every, monkeypatch):
+    @pytest.mark.parametrize("save_every", [1, 7])
+    def test_steps_that_nobody_kept_are_made_again(self, kepler, save_every, monkeypatch):
         """Ctrl-C within a portion: the run stands beyond the last state that was kept, and so does its memory."""
-        recorded(kepler, 600, every=every, folder="whole.run")
+        recorded(kepler, 600, save_every=save_every, folder="whole.run")
         left = iter([*[False] * 5, True])
 
         def interrupted(run: Run, steps: int | None = None, **settings: object) -> Trajectory:
@@ -81,7 +81,7 @@ class TestRecording:
         with monkeypatch.context() as patch:
             patch.setattr(writing, "record", interrupted)
             with pytest.raises(KeyboardInterrupt):
-                recorded(kepler, 600, every=every, checkpoint_seconds=1e9)
+                recorded(kepler, 600, save_every=save_every, checkpoint_seconds=1e9)
         found = load_run("a.run")
         assert 0 < found.resumed().steps == found.steps < 600
         assert resume_run("a.run").finished
@@ -122,6 +122,16 @@ class TestRecording:
         assert (about["model"], about["steps"], about["builds"][0]["step"]) == (text, 10, 0)
         assert found.manifest.about()["method"] == kepler.interface.method
 
+    def test_a_manifest_with_the_keys_of_version_0_1_is_read(self, kepler):
+        text = dump_model(Model.from_problem(problem("kepler")))
+        found = recorded(kepler, 10, save_every=5, model=text)
+        path = Path("a.run/manifest.json")
+        former = json.loads(path.read_text().replace("save_every", "every"))
+        assert "every" in former
+        assert "save_every" not in former["model"]
+        path.write_text(json.dumps(former))
+        assert load_run("a.run").manifest == found.manifest
+
     def test_a_certificate_is_a_file_or_an_object_too(self, kepler):
         Path("c.json").write_text('{"order": 8}')
         assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
@@ -155,7 +165,7 @@ class TestRecording:
     @pytest.mark.parametrize(
         ("settings", "message"),
         [
-            ({"every": 0}, "every must be at least 1"),
+            ({"save_every": 0}, "save_every must be at least 1"),
             ({"steps": -1}, "steps must be at least 0"),
             ({"rows": 0}, "rows must be at least 1"),
             ({"checkpoint_seconds": float("nan")}, "checkpoint_seconds"),

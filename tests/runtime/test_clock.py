@@ -106,7 +106,7 @@ def _exact_time(form: str, h: float) -> float:
 
 def test_a_run_of_many_orbits_keeps_its_time_and_energy() -> None:
     """Time is summed in two pieces: over a thousand orbits nothing but the method's phase error is left."""
-    run = stepper().integrate(*START, h=0.25, steps=30_000, every=1_000)
+    run = stepper().integrate(*START, h=0.25, steps=30_000, save_every=1_000)
     energies = run.energy()
     assert np.abs(energies - energies[0]).max() < 1e-12
     parts = [stepper().integrate(*START, h=0.25, steps=15_000)]
@@ -167,7 +167,7 @@ def test_states_between_are_at_times() -> None:
         assert asked.tau[k] == pytest.approx(ended.tau[-1], abs=1e-12)
     whole = stepper().integrate(*START, h=0.1, t_end=9.0)
     assert np.array_equal(whole.at(times)[0], asked.q)
-    seldom = stepper().integrate(*START, h=0.1, t_end=9.0, every=7)
+    seldom = stepper().integrate(*START, h=0.1, t_end=9.0, save_every=7)
     assert len(seldom) == (len(whole) - 2) // 7 + 2
     assert np.abs(seldom.at(times)[0] - asked.q).max() < 1e-13
     q, p = seldom.at(seldom.t[3])
@@ -227,7 +227,7 @@ def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
     recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
     assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
     assert np.array_equal(recorded[20:].tau, made.integrate(*START, h=0.1, steps=40).tau[20:])
-    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, every=4)
+    seldom = sc.record_run(made.start(*START, h=0.1), tmp_path / "seldom", steps=40, save_every=4)
     assert np.array_equal(seldom[1:].tau, made.integrate(*START, h=0.1, steps=40).tau[4::4])
 
 

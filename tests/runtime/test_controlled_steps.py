@@ -96,7 +96,7 @@ def test_the_end_of_a_step_is_as_accurate_as_wanted(tolerance, degree):
     run = stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance)
     worst = 0.0
     for q, p, end, h in zip(run.q[:-1], run.p[:-1], run.q[1:], np.diff(run.t), strict=True):
-        exact = reference.integrate(q, p, h=h / 8, steps=8, every=8).q[-1]
+        exact = reference.integrate(q, p, h=h / 8, steps=8, save_every=8).q[-1]
         worst = max(worst, np.max(np.abs(end - exact) / (np.abs(q) + np.abs(end - q))))
     assert worst < 3.0 * tolerance
     assert worst < run.step_error < 30.0 * tolerance
@@ -186,7 +186,7 @@ def test_states_in_between_and_at_given_times(kepler):
     times = np.linspace(0.0, 20.0, 13)
     there, _ = run.at(times)
     asked = kepler.integrate(q, p, t_end=20.0, t_eval=times)
-    thinned = kepler.integrate(q, p, t_end=20.0, every=7)
+    thinned = kepler.integrate(q, p, t_end=20.0, save_every=7)
     assert np.array_equal(asked.t, times)
     assert np.array_equal(asked.q, there)
     assert thinned.t[-1] == 20.0
@@ -254,7 +254,7 @@ def test_what_rests_or_moves_freely_needs_few_steps():
             "tolerance must be positive and below 1 .*, not 0: leave it out for round-off",
         ),
         ({"t_end": 1.0, "tolerance": 2.0}, "and below 1 .*, not 2: leave it out for round-off"),
-        ({"t_end": 1.0, "every": 0}, "every"),
+        ({"t_end": 1.0, "save_every": 0}, "save_every"),
         ({"t_end": 1.0, "t_eval": [2.0]}, "outside"),
     ],
 )
@@ -502,10 +502,10 @@ class TestStepsOfHLeadToAnEnd:
         assert np.array_equal(run.t, same.t)
         assert np.array_equal(self.positions(run), self.positions(same))
 
-    @pytest.mark.parametrize("every", [1, 4])
-    def test_the_last_is_shorter_where_h_does_not_divide(self, oscillators, name, sign, every):
-        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, every=every, t=0.0)
-        times = sign * np.array([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0] if every == 1 else [0.0, 1.2, 2.0])
+    @pytest.mark.parametrize("save_every", [1, 4])
+    def test_the_last_is_shorter_where_h_does_not_divide(self, oscillators, name, sign, save_every):
+        run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, save_every=save_every, t=0.0)
+        times = sign * np.array([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0] if save_every == 1 else [0.0, 1.2, 2.0])
         assert np.abs(run.t[[*range(len(times) - 1), -1]] - times).max() < 1e-15
         assert run.t[-1] == sign * 2.0
         assert np.abs(self.positions(run) - np.cos(run.t)).max() < 1e-10

@@ -102,8 +102,8 @@ def test_any_order_any_shape_and_any_distance_of_kept_states(kepler):
     single = [every_one.at(time) for time in t[:20]]
     assert np.array_equal([state[0] for state in single], q[:20])
     assert single[0][0].shape == (2,)
-    for every in (7, 100):
-        few = kepler.integrate(**START, h=0.1, steps=100, every=every)
+    for save_every in (7, 100):
+        few = kepler.integrate(**START, h=0.1, steps=100, save_every=save_every)
         inside = t <= few.t[-1]
         assert np.abs(few.at(t[inside])[0] - q[inside]).max() < 1e-13
 
@@ -148,7 +148,7 @@ def test_states_at_given_times_are_those_of_the_dense_output(kepler, h):
         ({"t_eval": [0.3, 2.2]}, "outside"),
         ({"t_eval": [[0.3]]}, "shape"),
         ({"t_eval": []}, "t_eval is empty"),
-        ({"t_eval": [0.3], "every": 2}, "not both"),
+        ({"t_eval": [0.3], "save_every": 2}, "not both"),
     ],
 )
 def test_given_times_are_checked(kepler, arguments, words):

@@ -161,7 +161,7 @@ def test_steps_are_symplectic_with_time_and_its_momentum(form):
 
 WAYS = {
     "all": {"steps": 12},
-    "checkpoints": {"steps": 12, "every": 4},
+    "checkpoints": {"steps": 12, "save_every": 4},
     "to a time": {"t_end": 2.7},
     "backward": {"t_end": -1.5, "h": -H},
     "to an event": {"t_end": 9.0, "events": Event(KEPLER.coordinates[1].name, terminal=1)},
@@ -241,7 +241,7 @@ def test_what_is_not_told_in_transformed_time():
     with pytest.raises(StateError, match=r"shape \(4, 4\), or \(4, 5\) with those by t, or"):
         run.pullback(np.zeros((4, 6)))
     with pytest.raises(StateError, match="keep all states"):
-        made.integrate(Q, P, h=H, t_end=2.7, every=4).tangent()
+        made.integrate(Q, P, h=H, t_end=2.7, save_every=4).tangent()
 
 
 def test_a_hamiltonian_that_is_linear_in_momenta_has_a_level():

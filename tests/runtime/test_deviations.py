@@ -58,7 +58,7 @@ def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
     q[:, 1] += 1e-6 * np.arange(12)
     found = galaxy.deviations_ensemble(q, p, h=0.2, steps=20_000, count=1)
     assert found.lyapunov_exponents()[-1].mean() == pytest.approx(0.047, abs=0.01)
-    regular = galaxy.integrate(*REGULAR, h=0.2, steps=20_000, every=2000).lyapunov_exponents(history=True)
+    regular = galaxy.integrate(*REGULAR, h=0.2, steps=20_000, save_every=2000).lyapunov_exponents(history=True)
     assert regular[-1, 0] < 2 * np.log(4000.0) / 4000.0
     assert regular[-1, 0] < 0.25 * regular[1, 0]
 
@@ -141,7 +141,7 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
 
 def test_states_left_out_change_nothing(galaxy):
     whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
-    some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, every=50)
+    some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, save_every=50)
     for name in SERIES:
         assert_allclose(getattr(some.deviations(), name), getattr(whole.deviations(), name)[::50], rtol=1e-9, atol=1e-9)
     back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
@@ -153,7 +153,7 @@ def test_a_length_is_greatest_wherever_it_was(galaxy):
     run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
     greatest = run.deviations(1).lengths.max()
     assert run.deviations(1).lengths[-1, 0] < greatest - 0.01
-    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, every=60).deviations(1)
+    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, save_every=60).deviations(1)
     assert some.fli()[-1] == pytest.approx(greatest, abs=1e-12)
     many = galaxy.deviations_ensemble(*start, h=0.2, steps=60, count=1)
     assert many.fli()[-1, 0] == pytest.approx(greatest, abs=1e-12)
@@ -197,13 +197,13 @@ def test_ensembles_are_the_same_as_runs(galaxy):
     q, p = np.array([REGULAR[0], CHAOTIC[0], [0.0, 0.95]]), np.array([REGULAR[1], CHAOTIC[1], [0.4, 0.4]])
     done = []
     with np.errstate(all="ignore"):
-        found = galaxy.deviations_ensemble(q, p, h=0.2, steps=1200, every=200, threads=2, progress=done.append)
+        found = galaxy.deviations_ensemble(q, p, h=0.2, steps=1200, save_every=200, threads=2, progress=done.append)
     assert list(found.status) == ["ok", "ok", found.status[2]]
     assert found.status[2] != "ok"
     assert np.isnan(found.megno()[-1, 2])
     assert done[-1] == 3
     for j, start in enumerate((REGULAR, CHAOTIC)):
-        alone = galaxy.integrate(*start, h=0.2, steps=1200, every=200).deviations()
+        alone = galaxy.integrate(*start, h=0.2, steps=1200, save_every=200).deviations()
         assert_array_equal(found.t, alone.t)
         assert_allclose(found.lengths[:, j], alone.lengths, rtol=1e-5)
         assert_allclose(found.megno()[:, j], alone.megno(), rtol=1e-5)
@@ -248,7 +248,7 @@ OPEN = HamiltonianSystem.from_text(
         (FORCED, SVI(3), {"count": 1, "parameters": {"u_0": 0.3, "m": np.linspace(0.5, 2.0, 11)}}),
         (FORCED, Gauss(2), {"h": -0.1, "t": 3.0, "parameters": {"u_0": 0.3}}),
         (FORCED, SpectralCollocation(4), {"directions": np.ones((4, 2)), "parameters": {"u_0": 0.3}}),
-        (OPEN, SVI(3), {"count": 3, "every": 1, "steps": 20}),
+        (OPEN, SVI(3), {"count": 3, "save_every": 1, "steps": 20}),
         (OPEN, SVI(2, "gauss-lobatto:3"), {"directions": [1.0, 0.0, 2.0, 0.0]}),
     ],
 )
@@ -257,7 +257,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     start = 0.4 * np.random.default_rng(1).normal(size=(2, 11, 2))
     stepper = compile_stepper(system, method)
     alone = by_derivatives(stepper)
-    options = {"h": 0.1, "steps": 120, "every": 40} | options
+    options = {"h": 0.1, "steps": 120, "save_every": 40} | options
     found = stepper.deviations_ensemble(*start, **options)
     assert stepper.changes(found.lengths.shape[-1]) is not None
     same(found, alone.deviations_ensemble(*start, **options), 1e-12)
@@ -268,10 +268,10 @@ def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
     saddle = LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
     stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
     alone = by_derivatives(stepper)
-    found = stepper.deviations_ensemble(*start, h=0.1, steps=300, every=100)
+    found = stepper.deviations_ensemble(*start, h=0.1, steps=300, save_every=100)
     assert_allclose(found.stretches.sum(axis=-1), 0.0, atol=1e-10)
     assert_allclose(found.lyapunov_exponents()[-1], [[10.0, -10.0]] * 2, atol=0.05)
-    same(found, alone.deviations_ensemble(*start, h=0.1, steps=300, every=100), 1e-10)
+    same(found, alone.deviations_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
 
 
 def test_a_motion_that_leaves_its_lane_is_followed_alone():
@@ -280,7 +280,7 @@ def test_a_motion_that_leaves_its_lane_is_followed_alone():
     stepper, done = compile_stepper(away, SVI(3)), []
     alone = by_derivatives(stepper)
     start = np.linspace(0.0, 0.8, 20)[:, np.newaxis], np.zeros((20, 1))
-    options = {"h": 0.1, "steps": 60, "every": 20, "count": 1}
+    options = {"h": 0.1, "steps": 60, "save_every": 20, "count": 1}
     found = stepper.deviations_ensemble(*start, **options, progress=done.append)
     assert 2 < sum(found.status == "ok") < 15
     assert done[-1] == 20
@@ -371,8 +371,8 @@ def test_what_is_refused(galaxy):
         run.deviations(directions=np.zeros(4))
     with pytest.raises(StateError, match="there are 2 changes here"):
         run.deviations(2).gali(3)
-    with pytest.raises(StateError, match="no multiple of every=3"):
-        galaxy.deviations_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, every=3)
+    with pytest.raises(StateError, match="no multiple of save_every=3"):
+        galaxy.deviations_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
 
 
 def test_steps_too_long_are_said_of_an_ensemble():

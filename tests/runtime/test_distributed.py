@@ -66,7 +66,7 @@ class TestCluster:
     def test_in_this_process_by_default(self, distributed: Any, kepler: Stepper):
         q, p = states()
         mu = np.linspace(0.9, 1.1, COUNT)
-        arguments = {"h": 0.05, "steps": 100, "every": 30, "t": 1.0, "parameters": {"mu": mu}}
+        arguments = {"h": 0.05, "steps": 100, "save_every": 30, "t": 1.0, "parameters": {"mu": mu}}
         here = kepler.integrate_ensemble(q, p, **arguments)
         done: list[int] = []
         result = integrate_ensemble(kepler, q, p, **arguments, progress=done.append)
@@ -105,7 +105,7 @@ class TestCluster:
 
     def test_a_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
         q, p = states()
-        arguments = {"h": 0.05, "steps": 15_000, "every": 5_000}
+        arguments = {"h": 0.05, "steps": 15_000, "save_every": 5_000}
         here = kepler.integrate_ensemble(q, p, **arguments)
         pids = [worker.pid for worker in cluster.workers.values()]
         killed: list[int] = []

@@ -25,7 +25,7 @@ def start(eccentricity: float) -> tuple[np.ndarray, np.ndarray]:
 def test_the_energy_does_not_drift(eccentricity, h, flags):
     """Tables of 53 bits, or small terms rounded away, give 5e-13 to 7e-12 here."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8), flags=flags)
-    energy = stepper.integrate(*start(eccentricity), h=h, steps=STEPS, every=STEPS // 200).energy()
+    energy = stepper.integrate(*start(eccentricity), h=h, steps=STEPS, save_every=STEPS // 200).energy()
     assert abs(energy / energy[0] - 1).max() < 3e-13
 
 
@@ -33,7 +33,11 @@ def test_ensembles_do_not_drift():
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
     q, p = start(0.2)
     runs = stepper.integrate_ensemble(
-        np.tile(q, (8, 1)) + [[1e-3 * k, 0.0] for k in range(8)], np.tile(p, (8, 1)), h=0.35, steps=STEPS, every=STEPS
+        np.tile(q, (8, 1)) + [[1e-3 * k, 0.0] for k in range(8)],
+        np.tile(p, (8, 1)),
+        h=0.35,
+        steps=STEPS,
+        save_every=STEPS,
     )
     energy = runs.energy()
     assert abs(np.mean(energy[-1] / energy[0] - 1)) < 2e-13
@@ -46,7 +50,7 @@ def test_steps_that_choose_their_length_do_not_drift(angle):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     q, p = start(0.9)
     run = stepper.start(turn @ q, turn @ p, t_end=30_000 * 2 * np.pi, tolerance=1e-20)
-    energy = run.record(every=STEPS // 200).energy()
+    energy = run.record(save_every=STEPS // 200).energy()
     assert abs(energy / energy[0] - 1).max() < 6e-13
 
 
@@ -94,5 +98,5 @@ def test_energies_of_a_million_steps_walk_at_random(name):
     given = OWN[system] if system in OWN else sc.problem(system).system
     method = sc.methods.method_from_specification(method) if isinstance(method, dict) else method
     stepper = sc.compile_stepper(given, method, solver=solver)
-    energy = stepper.integrate(*state, h=h, steps=MILLION, every=MILLION // 200).energy()
+    energy = stepper.integrate(*state, h=h, steps=MILLION, save_every=MILLION // 200).energy()
     assert abs(energy - energy[0]).max() < part * 2.0**-52 * np.sqrt(MILLION) * max(1.0, abs(energy[0]))

@@ -145,7 +145,7 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     full = stepper.drive([0.3], [0.1], **given, progress=told.append)
     assert told[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
     assert told == sorted(told)
-    fewer = stepper.drive([0.3], [0.1], **given, every=3)
+    fewer = stepper.drive([0.3], [0.1], **given, save_every=3)
     assert {0.0, *KNOTS[1:5][KNOTS[1:5] <= t_end].tolist(), t_end} <= set(np.round(fewer.t, 14))
     assert len(fewer) < len(full) / 1.5
     kept = np.isin(full.t, fewer.t)
@@ -153,7 +153,7 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     assert (fewer.q == full.q[kept]).all()
     assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
     assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
-    watched = stepper.drive([0.3], [0.1], **given, every=3, events="q")
+    watched = stepper.drive([0.3], [0.1], **given, save_every=3, events="q")
     assert (watched.iterations == fewer.iterations).all()
     assert (np.diff(np.cumsum(full.iterations)[kept]) == fewer.iterations[1:]).all()
     assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1

@@ -52,7 +52,7 @@ def slope(function, x, width=1e-4):
     return np.array(columns)
 
 
-@pytest.mark.parametrize("options", [{}, {"every": 3}], ids=["all", "some"])
+@pytest.mark.parametrize("options", [{}, {"save_every": 3}], ids=["all", "some"])
 def test_gradients_by_the_start_by_parameters_and_by_the_data(stepper, options):
     run = run_from(stepper, START, **options)
     weights = np.random.default_rng(1).normal(size=(len(run), 2))

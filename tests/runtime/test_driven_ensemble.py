@@ -74,7 +74,7 @@ def test_each_trajectory_is_that_of_drive(pendulum, method, kind):
     assert stepper.ensemble is not None
     inputs = {"u": (KNOTS, own_values()[0], kind), "w": ([0.0, 3.0], [0.0, 0.3])}
     check_against_drive(stepper, starts(1), inputs, 2e-15, h=0.1, t_end=2.3)
-    check_against_drive(stepper, starts(1), inputs, 2e-15, h=-0.1, t=2.55, t_end=0.02, every=3)
+    check_against_drive(stepper, starts(1), inputs, 2e-15, h=-0.1, t=2.55, t_end=0.02, save_every=3)
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
@@ -90,7 +90,7 @@ def test_methods_without_lanes_are_equal_to_the_bit(pendulum):
     stepper = compile_stepper(pendulum, SCVI(2), solver="newton")
     assert stepper.ensemble is None
     inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
-    check_against_drive(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, every=4)
+    check_against_drive(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, save_every=4)
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
@@ -109,7 +109,7 @@ def test_by_steps_of_their_own_each_is_that_of_drive_to_the_bit(pendulum, tolera
             assert np.array_equal(found, expected)
         assert np.array_equal(there.energy()[: len(t), j], run.energy())
     back = stepper.drive_ensemble(
-        there.ends[1], there.ends[2], inputs=inputs, t=2.5, t_end=0.0, parameters={"c": c}, every=5
+        there.ends[1], there.ends[2], inputs=inputs, t=2.5, t_end=0.0, parameters={"c": c}, save_every=5
     )
     assert_allclose(back.ends[1][-1], q[-1], atol=1e-4 if tolerance else 1e-11)
     assert len(pickle.loads(pickle.dumps(back))) == COUNT
@@ -187,7 +187,7 @@ def test_threads_portions_and_every_change_nothing(pendulum):
     inputs, told = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     given = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
     full = stepper.drive_ensemble(*starts(1), **given, progress=told.append)
-    fewer = stepper.drive_ensemble(*starts(1), **given, every=100, threads=1)
+    fewer = stepper.drive_ensemble(*starts(1), **given, save_every=100, threads=1)
     assert told[-1] == full.steps[0]
     rows = np.isin(full.t, fewer.t)
     assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
@@ -217,7 +217,7 @@ def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
         ({"inputs": {"u": (KNOTS, VALUES)}}, "the input w is not given"),
         ({"t_end": 4.0}, "is given from t = 0 to 2.6"),
         ({"t_end": None}, "t_end"),
-        ({"every": 0}, "every"),
+        ({"save_every": 0}, "save_every"),
         ({"h": 0.0}, "h"),
     ],
 )

@@ -70,22 +70,22 @@ class TestEqualsSingleTrajectories:
     def test_for_systems_and_methods(self, kind: str, method: Method):
         stepper = stepper_for(KINDS[kind], method)
         q, p = states(KINDS[kind], 3)
-        result = stepper.integrate_ensemble(q, p, h=0.02, steps=60, every=20, t=0.3)
+        result = stepper.integrate_ensemble(q, p, h=0.02, steps=60, save_every=20, t=0.3)
         assert result.q.shape == (4, *q.shape)
         assert result.steps.tolist() == [60, 60, 60]
         # measured 2e-14: rounding of 60 steps, magnified by the motion
-        assert_equals_single_runs(stepper, result, 3e-13, steps=60, every=20, t=0.3)
+        assert_equals_single_runs(stepper, result, 3e-13, steps=60, save_every=20, t=0.3)
 
     @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
     def test_for_any_number_with_their_own_parameters(self, count: int):
         stepper = stepper_for("kepler", SVI(5))
         q, p = states("kepler", count)
         result = stepper.integrate_ensemble(
-            q, p, h=0.05, steps=40, every=3, parameters={"mu": np.linspace(0.8, 1.2, count)}
+            q, p, h=0.05, steps=40, save_every=3, parameters={"mu": np.linspace(0.8, 1.2, count)}
         )
         assert len(result) == count
         assert len(result.t) == 14
-        assert_equals_single_runs(stepper, result, 3e-13, steps=40, every=3)
+        assert_equals_single_runs(stepper, result, 3e-13, steps=40, save_every=3)
 
     def test_parameters_come_by_name_as_a_row_or_a_row_each(self):
         stepper = stepper_for("planar-pendulum", SVI(5))
@@ -131,7 +131,7 @@ class TestEqualsSingleTrajectories:
         stepper = stepper_for("kepler", SVI(5))
         q, p = states("kepler", 9)
         assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
-        result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, every=5)
+        result = stepper.integrate_ensemble(q, p, h=0.1, steps=3, save_every=5)
         assert result.q.shape == (1, 9, 2)
         assert result.steps.tolist() == [3] * 9
 
@@ -183,11 +183,11 @@ class TestFailures:
         stepper = stepper_for("harmonic-oscillator", SVI(5))
         q, p = states("harmonic-oscillator", 9)
         stiffness = {"k": np.where(np.arange(9) % 4 == 1, 1e6, 1.0)}
-        result = stepper.integrate_ensemble(q, p, h=0.5, steps=50, every=7, parameters=stiffness)
+        result = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7, parameters=stiffness)
         assert result.steps.tolist() == [50] * 9
-        assert_equals_single_runs(stepper, result, 1e-10, steps=50, every=7)
+        assert_equals_single_runs(stepper, result, 1e-10, steps=50, save_every=7)
         others = stiffness["k"] == 1.0
-        calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, every=7)
+        calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7)
         assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
 
     def test_a_block_without_trajectories_left_stops(self):
@@ -201,7 +201,7 @@ class TestFailures:
             assert len(reports) < 100  # an empty block that went on would report for minutes
 
         settings = {"parameters": nothing, "progress": report}
-        result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, every=10**8, **settings)
+        result = stepper.integrate_ensemble(q, p, h=0.05, steps=10**9, save_every=10**8, **settings)
         assert set(result.steps) == {0}
 
     @pytest.mark.parametrize("method", [SVI(5), SCVI(3), StoermerVerlet()], ids=lambda method: method.name)
@@ -229,13 +229,13 @@ class TestThreadsAndInterruption:
         stepper = stepper_for("kepler", method)
         q, p = states("kepler", 32)
         calls: list[int] = []
-        stepper.integrate_ensemble(q, p, h=0.05, steps=4000, every=4000, progress=calls.append, threads=2)
+        stepper.integrate_ensemble(q, p, h=0.05, steps=4000, save_every=4000, progress=calls.append, threads=2)
         assert calls == sorted(calls)
         assert calls[-1] == 4000
 
     def test_an_interruption_leaves_no_thread_and_keeps_what_was_done(self, kepler: Stepper):
         q, p = states("kepler", 64)
-        work = Ensemble(kepler, q, p, h=0.05, steps=10**9, every=10**7)
+        work = Ensemble(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
 
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt
@@ -262,7 +262,7 @@ class TestThreadsAndInterruption:
         gc.collect()
         tracemalloc.start()
         try:
-            kepler.integrate_ensemble(q, p, h=0.05, steps=20_000, every=2000)
+            kepler.integrate_ensemble(q, p, h=0.05, steps=20_000, save_every=2000)
             peak = tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
@@ -284,7 +284,7 @@ class TestArguments:
             ({"h": np.inf}, "the step h is inf"),
             ({"steps": 1.5}, "steps must be a whole number"),
             ({"steps": -1}, "steps must be at least 0"),
-            ({"every": 0}, "every must be at least 1"),
+            ({"save_every": 0}, "save_every must be at least 1"),
             ({"t": "noon"}, "the time t must be real numbers"),
             ({"threads": -1}, "threads must be at least 1"),
             ({"threads": 1.5}, "threads must be a whole number"),
@@ -309,7 +309,7 @@ class TestFiles:
     @pytest.fixture
     def result(self, kepler: Stepper) -> EnsembleTrajectory:
         values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
-        return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, every=10, parameters=values)
+        return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, save_every=10, parameters=values)
 
     def test_npz(self, result: EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.npz")
@@ -344,7 +344,7 @@ mu = 1.5
 
 def model(**changes: object) -> Model:
     entry = Model.from_problem(problem("kepler"), SVI(4))
-    return replace(entry, h=0.1, span=None, steps=50, every=10, **changes)  # type: ignore[arg-type]
+    return replace(entry, h=0.1, span=None, steps=50, save_every=10, **changes)  # type: ignore[arg-type]
 
 
 class TestEnsembleFiles:
@@ -451,7 +451,7 @@ class TestCommandLine:
     @pytest.mark.parametrize("suffix", ["npz", "csv"])
     def test_sums_up_and_writes(self, suffix: str):
         result = self.invoke(
-            f"kepler --degree 4 --step 0.1 --steps 50 --every 10 --ensemble grid.toml -o runs.{suffix}"
+            f"kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
         )
         assert result.exit_code == 0, result.output
         assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states kept of each" in result.stdout
@@ -490,7 +490,7 @@ class TestCommandLine:
             ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
-                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: keep fewer (--every ",
+                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: keep fewer (--save-every ",
             ),
         ],
     )
@@ -506,7 +506,7 @@ class TestCommandLine:
 
         monkeypatch.setattr("scvi_codegen.cli.ensembles.progress_bar", once_some_have_begun)
         result = self.invoke(
-            "kepler --degree 4 --step 0.05 --steps 10000000000 --every 1000000000 --ensemble grid.toml -o runs.npz"
+            "kepler --degree 4 --step 0.05 --steps 10000000000 --save-every 1000000000 --ensemble grid.toml -o runs.npz"
         )
         assert result.exit_code == 130
         assert "0 ok, 6 interrupted" in result.stdout
@@ -530,8 +530,8 @@ def test_the_absolute_rule_is_that_of_single_trajectories(name):
     stepper = compile_stepper(chosen.system, SVI(4))
     p = stepper.momentum(chosen.q, chosen.velocity)
     options = SolverOptions(tolerance=1e-6, absolute=True)
-    single = stepper.integrate(chosen.q, p, h=0.05, steps=20, every=20, options=options)
-    many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, every=20, options=options)
-    exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, every=20)
+    single = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20, options=options)
+    many = stepper.integrate_ensemble([chosen.q] * 8, [p] * 8, h=0.05, steps=20, save_every=20, options=options)
+    exact = stepper.integrate(chosen.q, p, h=0.05, steps=20, save_every=20)
     np.testing.assert_allclose(many.q[-1, 0], single.q[-1], rtol=1e-13, atol=1e-13)
     assert not np.allclose(exact.q[-1], single.q[-1], rtol=1e-14, atol=1e-14)

@@ -30,12 +30,12 @@ def alone(kepler, j, **settings):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("every", [1, 7])
-def test_each_is_the_trajectory_alone(kepler, threads, every):
-    runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, every=every, threads=threads)
+@pytest.mark.parametrize("save_every", [1, 7])
+def test_each_is_the_trajectory_alone(kepler, threads, save_every):
+    runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, save_every=save_every, threads=threads)
     assert runs.ok.all()
     for j, (t, q, p, status, steps) in enumerate(runs.each()):
-        run = alone(kepler, j, every=every)
+        run = alone(kepler, j, save_every=save_every)
         assert (status, steps) == ("ok", run.steps)
         assert np.array_equal(t, run.t)
         assert np.array_equal(q, run.q)
@@ -104,7 +104,7 @@ def test_an_interruption_keeps_what_was_done(kepler):
         ({"t_end": [1.0, 2.0, -1.0, 3.0]}, "two ensembles"),
         ({"t_end": 1.0, "tolerance": 2.0}, "must be positive and below 1"),
         ({"t_end": 1.0, "t_eval": [0.5, 1.5]}, "outside"),
-        ({"t_end": 1.0, "t_eval": [0.5], "every": 2}, "not both"),
+        ({"t_end": 1.0, "t_eval": [0.5], "save_every": 2}, "not both"),
     ],
 )
 def test_a_wrong_argument_is_named(kepler, settings, words):
@@ -124,7 +124,7 @@ def test_over_a_cluster(kepler):
 
 
 def test_files_hold_the_times_of_each(kepler, tmp_path):
-    runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, every=5)
+    runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, save_every=5)
     runs.save(tmp_path / "e.csv")
     table = np.genfromtxt(tmp_path / "e.csv", delimiter=",", names=True)
     assert [table["t"][table["trajectory"] == j].max() for j in range(4)] == ENDS

@@ -240,17 +240,19 @@ def test_directions_are_those_of_the_run(pendulum):
     assert (back.events[0].p < 0).all()  # rises as the run goes
 
 
-@pytest.mark.parametrize("every", [1, 7, 1000])
-def test_a_terminal_event_ends_the_run_at_its_crossing(pendulum, every):
+@pytest.mark.parametrize("save_every", [1, 7, 1000])
+def test_a_terminal_event_ends_the_run_at_its_crossing(pendulum, save_every):
     plain = pendulum.integrate([0.5], [0.0], h=0.1, steps=400)
-    run = pendulum.integrate([0.5], [0.0], h=0.1, steps=400, every=every, events=["p_q", Event("q", terminal=3)])
+    run = pendulum.integrate(
+        [0.5], [0.0], h=0.1, steps=400, save_every=save_every, events=["p_q", Event("q", terminal=3)]
+    )
     last = run.events[1]
     assert len(last) == 3
     assert run.t[-1] == last.t[-1]
     assert np.array_equal(run.q[-1], last.q[-1])
     assert run.ended_by == Event("q", terminal=3)
-    assert np.array_equal(run.q[:-1], plain.q[: len(run) * every : every][: len(run) - 1])
-    assert run.t[-2] < run.t[-1] < run.t[-2] + 0.1 * every
+    assert np.array_equal(run.q[:-1], plain.q[: len(run) * save_every : save_every][: len(run) - 1])
+    assert run.t[-2] < run.t[-1] < run.t[-2] + 0.1 * save_every
     assert run.events[0].t[-1] < last.t[-1]
 
 
@@ -286,12 +288,12 @@ def test_states_are_the_same_bits_with_events_and_without(kepler):
     plain, watched = kepler.integrate(**start), kepler.integrate(**start, events="q1")
     for name in ("t", "q", "p", "iterations"):
         assert np.array_equal(getattr(plain, name), getattr(watched, name))
-    every = kepler.integrate(**start, every=9), kepler.integrate(**start, every=9, events="q1")
+    sparse = kepler.integrate(**start, save_every=9), kepler.integrate(**start, save_every=9, events="q1")
     for name in ("t", "q", "p", "iterations"):
-        assert np.array_equal(getattr(every[0], name), getattr(every[1], name))
+        assert np.array_equal(getattr(sparse[0], name), getattr(sparse[1], name))
     assert np.array_equal(plain.crossings("q1")[0].t, watched.events[0].t)
-    with pytest.raises(StateError, match="every > 1"):
-        every[0].crossings("q1")
+    with pytest.raises(StateError, match="save_every > 1"):
+        sparse[0].crossings("q1")
 
 
 def test_crossings_are_found_afterwards_up_to_the_event_that_ended_the_run(kepler):

@@ -83,13 +83,15 @@ def test_hamiltonians_sweeps_and_parameters(thrown):
 def test_steps_between_and_steps_that_choose_their_length(thrown):
     stepper = compile_stepper(thrown, SVI(4))
     start = ([1.0, 0.0], [0.0, 1.1])
-    every, some = (stepper.integrate(*start, h=0.05, steps=40, every=n) for n in (1, 8))
-    assert np.abs(some.work() - every.work()[::8]).max() < 1e-13
-    later = [stepper.integrate(*start, h=0.1, steps=140, every=n, t=1e6) for n in (1, 7)]  # where times are rounded
+    save_every, some = (stepper.integrate(*start, h=0.05, steps=40, save_every=n) for n in (1, 8))
+    assert np.abs(some.work() - save_every.work()[::8]).max() < 1e-13
+    later = [
+        stepper.integrate(*start, h=0.1, steps=140, save_every=n, t=1e6) for n in (1, 7)
+    ]  # where times are rounded
     assert np.abs(later[1].work() - later[0].work()[::7]).max() < 1e-8  # of forces of time
     free = stepper.integrate(*start, t_end=2.0)
     assert np.abs(free.energy() - free.energy()[0] - free.work()).max() < 1e-12
-    with pytest.raises(StateError, match="every=1"):
+    with pytest.raises(StateError, match="save_every=1"):
         stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
 
 

@@ -206,7 +206,7 @@ def test_steps_that_tell_an_unknown_are_too_long():
         parameters={"a": 1.0, "b": 1.0},
     )
     times = np.linspace(0.0, 20.0, 101)
-    exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, every=2)
+    exact = compile_stepper(soft, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], h=0.1, steps=200, save_every=2)
     noisy = exact.q[:, 0] + 1e-3 * np.random.default_rng(0).normal(size=101)
     coarse, given = compile_stepper(soft, SVI(1), flags=QUICK_FLAGS), {"q": [0.9], "p": [0.1]}
     with pytest.warns(AccuracyWarning, match=r"h is too long for this fit: .* b is \S+ standard errors away"):
@@ -294,7 +294,7 @@ def two_rods():
         parameters={"m": 1.0, "l": 1.0},
     )
     stepper = compile_stepper(system, SVI(6), flags=QUICK_FLAGS)
-    run = stepper.integrate([2.0, 2.5], [0.0, 0.0], h=0.02, steps=600, every=2, parameters=CHAOTIC)
+    run = stepper.integrate([2.0, 2.5], [0.0, 0.0], h=0.02, steps=600, save_every=2, parameters=CHAOTIC)
     return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
 
 

@@ -308,7 +308,7 @@ class TestChaos:
         assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
         assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
 
-    @pytest.mark.parametrize("more", [{}, {"every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
+    @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
     def test_a_default_run_warns(self, burrau_stepper, more):
         with pytest.warns(sc.AccuracyWarning, match="magnifies errors: a run from an initial state changed by 8.9e-16"):
             burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
@@ -392,7 +392,7 @@ class TestOtherRuns:
         assert ended.confirmed_until == ended.t[-1] < 50.0
         exact = on_an_ellipse(start["q"], start["p"], [0.0, *ended.t[1:]])
         assert np.abs(exact[:, :2] - ended.q).max() <= 1.6 * ended.global_error
-        kept = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, every=10)
+        kept = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, save_every=10)
         assert len(kept) == -(-kept.steps // 10) + 1
         assert kept.global_error <= 1e-9
 
@@ -461,7 +461,7 @@ class TestOtherRuns:
             lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))",
         )
         stepper = sc.compile_indexed(system, "svi:8")
-        for more in ({}, {"every": 5}):
+        for more in ({}, {"save_every": 5}):
             with pytest.warns(sc.AccuracyWarning, match="magnifies errors"):
                 stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
         with warnings.catch_warnings():

@@ -47,10 +47,10 @@ def square(count, seed=0):
     return weights, bends + bends.transpose(0, 2, 1)
 
 
-@pytest.mark.parametrize("every", [1, 12])
-def test_the_hessian_of_a_function_of_all_states(stepper, every):
+@pytest.mark.parametrize("save_every", [1, 12])
+def test_the_hessian_of_a_function_of_all_states(stepper, save_every):
     """Against differences of exact gradients, of fourth order; also where steps between are taken again."""
-    run = run_from(stepper, START, every=every)
+    run = run_from(stepper, START, save_every=save_every)
     weights, bends = square(len(run))
 
     def slopes(run):
@@ -60,7 +60,7 @@ def test_the_hessian_of_a_function_of_all_states(stepper, every):
     for unit in np.eye(len(START)):
         ends = [
             stacked(r.pullback(slopes(r)))
-            for r in (run_from(stepper, START + s * 1e-4 * unit, every=every) for s in (1, -1, 2, -2))
+            for r in (run_from(stepper, START + s * 1e-4 * unit, save_every=save_every) for s in (1, -1, 2, -2))
         ]
         columns.append((8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4)
     expected = np.array(columns).T
@@ -104,7 +104,7 @@ def test_a_long_run_has_the_hessian_of_its_pieces(stepper):
     weights, bends = square(2501, 3)
     weights[np.arange(2501) % 500 > 0] = 0.0
     bends[np.arange(2501) % 500 > 0] = 0.0
-    whole, some = run_from(stepper, START, steps=2500), run_from(stepper, START, steps=2500, every=500)
+    whole, some = run_from(stepper, START, steps=2500), run_from(stepper, START, steps=2500, save_every=500)
     expected = stacked(whole.hessian_product(weights, [1.0, 0.5], bends))
     found = stacked(some.hessian_product(weights[::500], [1.0, 0.5], bends[::500]))
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())

@@ -101,12 +101,18 @@ def test_as_written_out(name: str, method: str) -> None:
     """States, energies, momentum maps and errors of steps are those of the system written out, to round-off."""
     each = CASES[name]
     own = sc.compile_indexed(each.system, method).integrate(
-        each.q, velocity=each.velocity, h=each.h, steps=40, every=10, tables=each.tables, parameters=each.parameters
+        each.q,
+        velocity=each.velocity,
+        h=each.h,
+        steps=40,
+        save_every=10,
+        tables=each.tables,
+        parameters=each.parameters,
     )
     written = sc.expand_sums(each.system, each.sizes, tables=each.tables, parameters=each.parameters)
     stepper = sc.compile_stepper(written, method)
     velocity = np.zeros(each.q.size) if each.velocity is None else each.velocity.reshape(-1)
-    other = stepper.integrate(each.q.reshape(-1), velocity=velocity, h=each.h, steps=40, every=10)
+    other = stepper.integrate(each.q.reshape(-1), velocity=velocity, h=each.h, steps=40, save_every=10)
     array = each.system.coordinates[0].name
     assert own.t == pytest.approx(other.t, abs=1e-15)
     assert own.q[array].reshape(5, -1) == pytest.approx(other.q, rel=1e-12, abs=1e-12)
@@ -131,9 +137,9 @@ def test_a_hamiltonian_as_written_out(method: str) -> None:
     bonds = {"bonds": [[0, 1], [1, 2], [2, 0], [2, 3]]}
     q, p = 0.5 * random(2, 4)
     stepper = sc.compile_indexed(field, method)
-    run = stepper.integrate(q, p, h=0.05, steps=100, every=25, tables=bonds)
+    run = stepper.integrate(q, p, h=0.05, steps=100, save_every=25, tables=bonds)
     written = sc.expand_sums(field, {"N": 4, "B": 4}, tables=bonds)
-    other = sc.compile_stepper(written, method).integrate(q, p, h=0.05, steps=100, every=25)
+    other = sc.compile_stepper(written, method).integrate(q, p, h=0.05, steps=100, save_every=25)
     assert run.q["q"] == pytest.approx(other.q, abs=1e-13)
     assert run.p["q"] == pytest.approx(other.p, abs=1e-13)
     assert run.energy() == pytest.approx(other.energy(), abs=1e-13)
@@ -159,7 +165,7 @@ def test_one_library_serves_every_size(count: int) -> None:
         "svi:6",
     )
     q, velocity = random(count), random(2, count)[1]
-    run = stepper.integrate(q, velocity=velocity, h=0.25, steps=40, every=40)
+    run = stepper.integrate(q, velocity=velocity, h=0.25, steps=40, save_every=40)
     frequencies = 2 * np.abs(np.sin(np.pi * np.arange(count) / count))
     modes, rates, phase = np.fft.fft(q), np.fft.fft(velocity), 10.0 * frequencies
     slow = np.where(frequencies > 1e-12, np.sin(phase) / np.maximum(frequencies, 1e-12), 10.0)
@@ -176,7 +182,7 @@ def test_energy_does_not_drift() -> None:
         coordinates=["q[N]"],
         lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
     )
-    run = sc.compile_indexed(ring, "svi:6").integrate(each.q, h=0.05, steps=20_000, every=200)
+    run = sc.compile_indexed(ring, "svi:6").integrate(each.q, h=0.05, steps=20_000, save_every=200)
     changes = run.energy() - run.energy()[0]
     assert run.energy_error() < 1e-13
     assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
@@ -240,7 +246,7 @@ def test_observed_runs_keep_what_is_asked_for() -> None:
     """And the first and the last state."""
     each = CASES["ring"]
     stepper = sc.compile_indexed(each.system, "svi:2")
-    run = stepper.integrate(each.q, h=0.01, steps=25, every=10, observe=lambda run: run.q["q"][:2])
+    run = stepper.integrate(each.q, h=0.01, steps=25, save_every=10, observe=lambda run: run.q["q"][:2])
     assert run.observed is not None
     assert run.observed.shape == (3, 2)
     assert run.q["q"].shape == (2, 5)

@@ -123,9 +123,9 @@ def test_a_cloth_keeps_its_rods_and_its_energy():
 def test_compositions_have_their_order_and_keep_constraints():
     stepper = sc.compile_indexed(net(), "composition:8")
     q, data = chain(3)
-    exact = stepper.integrate(q, h=1 / 400, steps=400, every=400, **data).q["r"][-1]
+    exact = stepper.integrate(q, h=1 / 400, steps=400, save_every=400, **data).q["r"][-1]
     errors = [
-        np.abs(stepper.integrate(q, h=1 / n, steps=n, every=n, **data).q["r"][-1] - exact).max() for n in (25, 50)
+        np.abs(stepper.integrate(q, h=1 / n, steps=n, save_every=n, **data).q["r"][-1] - exact).max() for n in (25, 50)
     ]
     assert errors[1] < 1e-7
     assert 2.0**7 < errors[0] / errors[1] < 2.0**10
@@ -185,7 +185,7 @@ def test_momentum_maps_are_those_that_constraints_leave():
     velocity = np.random.default_rng(2).normal(size=q.shape)
     tables = {"bonds": [[0, 1], [1, 2], [2, 3]]}
     q, p = stepper.project(q, velocity=velocity, tables=tables)
-    run = stepper.integrate(q, p, h=0.01, steps=500, every=100, tables=tables)
+    run = stepper.integrate(q, p, h=0.01, steps=500, save_every=100, tables=tables)
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-13
 
 
@@ -198,7 +198,7 @@ def test_constraints_move_in_time():
         constraints=["(r[i, 0] - sin(3*t)/10)**2 + r[i, 1]**2 = 1 for i in N"],
     )
     stepper = sc.compile_indexed(shaken, "composition:8")
-    run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, every=100)
+    run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, save_every=100)
     angle = sc.LagrangianSystem.from_text(
         name="angle",
         coordinates=["a"],

@@ -138,14 +138,14 @@ class TestStatesBetween:
     TIMES = np.array([[0.33, 1.27], [5.0, 0.0]])
 
     def test_by_steps_of_one_length(self, steppers):
-        own, other = (each.integrate(Q, velocity=V, h=0.1, steps=50, every=5) for each in steppers)
+        own, other = (each.integrate(Q, velocity=V, h=0.1, steps=50, save_every=5) for each in steppers)
         (q, p), (q_expected, p_expected) = own.at(self.TIMES), other.at(self.TIMES)
         assert q["q"].shape == (2, 2, N)
         assert np.abs(q["q"] - q_expected).max() < 1e-14
         assert np.abs(p["q"] - p_expected).max() < 1e-14
 
     def test_by_steps_of_their_own(self, steppers):
-        own, other = (each.integrate(Q, velocity=V, t_end=5.0, every=10) for each in steppers)
+        own, other = (each.integrate(Q, velocity=V, t_end=5.0, save_every=10) for each in steppers)
         assert np.abs(own.at(self.TIMES)[0]["q"] - other.at(self.TIMES)[0]).max() < 1e-13
 
     def test_what_was_not_kept_is_not_there(self, steppers):
@@ -166,8 +166,8 @@ class TestEvents:
 
     def test_they_are_those_of_the_system_written_out(self, steppers):
         stepper, other = steppers
-        run = stepper.integrate(Q, velocity=V, h=0.1, steps=500, every=5, events=self.OWN)
-        expected = other.integrate(Q, velocity=V, h=0.1, steps=500, every=5, events=self.WRITTEN)
+        run = stepper.integrate(Q, velocity=V, h=0.1, steps=500, save_every=5, events=self.OWN)
+        expected = other.integrate(Q, velocity=V, h=0.1, steps=500, save_every=5, events=self.WRITTEN)
         assert [len(each) for each in run.events] == [len(each) for each in expected.events]
         for own, known in zip(run.events, expected.events, strict=True):
             assert np.abs(own.t - known.t).max(initial=0.0) < 1e-14
@@ -205,7 +205,7 @@ class TestInputs:
     @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 4.9}, {"t_end": 4.9}, {"h": 0.1, "steps": 33}])
     def test_runs_are_those_of_the_system_written_out(self, driven, way):
         own, other = (
-            each.drive(Q, velocity=V, inputs=DATA, every=4, **way)
+            each.drive(Q, velocity=V, inputs=DATA, save_every=4, **way)
             for each in (sc.compile_indexed(driven, "svi:6"), written(driven))
         )
         assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13

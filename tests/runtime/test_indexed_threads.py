@@ -174,7 +174,7 @@ def test_sweeps_go_where_leapfrog_goes() -> None:
         case = CASES[name]
         ends = [
             stepper_of(name, method).integrate(
-                start_of(name), h=h, steps=round(0.02 / h), every=round(0.02 / h), threads=2, **case.given
+                start_of(name), h=h, steps=round(0.02 / h), save_every=round(0.02 / h), threads=2, **case.given
             )
             for method, h in (("svi:4", 0.02), ("stoermer-verlet", 5e-5))
         ]

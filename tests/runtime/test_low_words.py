@@ -160,7 +160,7 @@ def test_states_of_ensembles_stay_within_a_rounding_of_exact_sums(name: str) -> 
     steps, members = 1024, 5
     shift = np.arange(members)[:, None] / 16
     begun = Q + shift, P - shift / 4
-    ends = compiled(name).integrate_ensemble(*begun, t=1 / 3, h=H, steps=steps, every=64)
+    ends = compiled(name).integrate_ensemble(*begun, t=1 / 3, h=H, steps=steps, save_every=64)
     most_p = float(np.spacing(np.abs(ends.p)).max(axis=0).sum(axis=1).max()) / 2
     most_q = float((np.spacing(np.abs(ends.q)).max(axis=0) * MASSES).sum(axis=1).max()) / 2
     for j in range(members):
@@ -259,7 +259,7 @@ def test_work_is_the_sum_of_what_each_step_gives() -> None:
     size = max(map(abs, given))
     for n in (1, 150, 300):
         assert abs(run.work()[n] - math.fsum(given[:n])) < 2.0**-52 * math.sqrt(n) * 30 * size
-    kept = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300, every=30)
+    kept = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300, save_every=30)
     assert np.abs(kept.work() - run.work()[::30]).max() < 1e-14
 
 

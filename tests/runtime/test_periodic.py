@@ -58,7 +58,7 @@ def test_a_halo_orbit_is_the_published_one(restricted):
     greatest = orbit.multipliers[0].real
     assert orbit.stability_indices[0] == pytest.approx((greatest + 1 / greatest) / 2, rel=1e-9)
     assert np.abs(orbit.stability_indices - 1.0).min() < 1e-9
-    assert len(orbit.run(every=50)) == 5
+    assert len(orbit.run(save_every=50)) == 5
 
 
 def _monodromy(orbit):

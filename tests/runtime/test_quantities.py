@@ -1,4 +1,4 @@
-"""Every public quantity of runs and ensembles, with parameters, start, direction and ``every`` that are no defaults.
+"""Every public quantity of runs and ensembles, with parameters, start, direction and stride that are no defaults.
 
 Beside each stands its value from the formula of L alone, by SymPy's derivatives; states stand beside SciPy's.
 """
@@ -30,8 +30,8 @@ FALLING = sc.LagrangianSystem.from_text(
 OTHER = {CART.name: {"M": 2.7, "m": 0.6, "l": 1.1, "a": 0.35, "w": 1.2}, FALLING.name: {"m": 2.3, "g": 3.1}}
 Q, V = np.array([0.3, 0.8]), np.array([-0.5, 0.4])
 SETTINGS = [
-    SimpleNamespace(system=system, own=own, t=t, h=h, every=every)
-    for system, own, (t, h, every) in product(
+    SimpleNamespace(system=system, own=own, t=t, h=h, save_every=save_every)
+    for system, own, (t, h, save_every) in product(
         (CART, FALLING), (False, True), ((0.0, 0.04, 1), (0.7, 0.04, 3), (-1.3, -0.05, 4))
     )
 ]
@@ -89,7 +89,7 @@ def arguments(given) -> dict:
     return {
         "h": given.h,
         "t": given.t,
-        "every": given.every,
+        "save_every": given.save_every,
         "steps": STEPS + 1,
         "parameters": OTHER[given.system.name] if given.own else None,
     }
@@ -149,7 +149,7 @@ def close(found, wanted) -> bool:
 def named(number: int) -> str:
     given = SETTINGS[number]
     own = "own parameters" if given.own else "defaults"
-    return f"{given.system.name}, {own}, t={given.t}, h={given.h}, every={given.every}"
+    return f"{given.system.name}, {own}, t={given.t}, h={given.h}, save_every={given.save_every}"
 
 
 every_setting = pytest.mark.parametrize("number", range(len(SETTINGS)), ids=named)
@@ -158,7 +158,7 @@ every_setting = pytest.mark.parametrize("number", range(len(SETTINGS)), ids=name
 @every_setting
 def test_of_trajectories(number, tmp_path):
     given, run = SETTINGS[number], trajectory(number)
-    times = given.t + given.h * given.every * np.arange((STEPS + 1) // given.every + 1)
+    times = given.t + given.h * given.save_every * np.arange((STEPS + 1) // given.save_every + 1)
     assert np.allclose(run.t, times, rtol=0, atol=1e-14)
     states = [expected(number, t) for t in run.t]
     data = run.to_xarray()
@@ -276,13 +276,13 @@ def test_of_runs_saved_pickled_and_gone_on_with(number):
     compiled, own = stepper(given.system.name), arguments(given)["parameters"]
     options = sc.SolverOptions(tolerance=3e-15, max_iterations=47)
     begun = compiled.start(Q, velocity=V, h=given.h, t=given.t, parameters=own, options=options)
-    begun.advance(2 * given.every)
+    begun.advance(2 * given.save_every)
     copies = (pickle.loads(pickle.dumps(begun)), compiled.restore(begun.save(), parameters=own, options=options))
-    rest = begun.record(STEPS + 1 - 2 * given.every, every=given.every)
+    rest = begun.record(STEPS + 1 - 2 * given.save_every, save_every=given.save_every)
     assert np.allclose(rest.q, run.q[2:], rtol=0, atol=1e-13)
     for copy in copies:
         assert copy.options == options
         assert np.array_equal(copy.parameters, values_of(given))
-        again = copy.record(STEPS + 1 - 2 * given.every, every=given.every)
+        again = copy.record(STEPS + 1 - 2 * given.save_every, save_every=given.save_every)
         assert all(np.array_equal(getattr(again, name), getattr(rest, name)) for name in ("t", "q", "p", "iterations"))
         assert again.options == options

@@ -123,11 +123,11 @@ def test_comparing_with_halves_leaves_an_array_as_it_is(solver):
     headers = tuple((name, text.replace("COMPARED 512", "COMPARED 1")) for name, text in few.source.support)
     source = dataclasses.replace(few.source, support=headers)
     assert source != few.source
-    every = sc.IndexedStepper(source, few.interface)
+    save_every = sc.IndexedStepper(source, few.interface)
     start = np.random.default_rng(1).normal(size=1100)
     wanted = few.integrate(start, h=0.1, steps=12)
     for threads in (1, 2):
-        found = every.integrate(start, h=0.1, steps=12, threads=threads)
+        found = save_every.integrate(start, h=0.1, steps=12, threads=threads)
         assert np.array_equal(found.q["x"], wanted.q["x"])
         assert np.array_equal(found.p["x"], wanted.p["x"])
         assert found.step_error >= wanted.step_error

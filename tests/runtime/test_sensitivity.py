@@ -180,7 +180,7 @@ def test_runs_tell_how_their_states_depend_on_all_they_started_from():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"every": 12}, {"h": -0.1}, {"h": None, "steps": None, "t_end": 4.0}],
+    [{}, {"save_every": 12}, {"h": -0.1}, {"h": None, "steps": None, "t_end": 4.0}],
     ids=["all", "checkpoints", "backward", "own lengths"],
 )
 def test_gradients_are_the_transpose_of_sensitivities(options):
@@ -205,7 +205,7 @@ def test_gradients_are_the_transpose_of_sensitivities(options):
 
 def test_checkpoints_give_what_all_states_give():
     _, whole = driven(steps=2500)
-    _, some = driven(steps=2500, every=500)
+    _, some = driven(steps=2500, save_every=500)
     seeds = np.zeros((len(whole), 2))
     seeds[::500] = np.random.default_rng(2).normal(size=(6, 2))
     expected, found = whole.pullback(seeds), some.pullback(seeds[::500])

@@ -101,14 +101,14 @@ def test_no_steps_give_the_initial_state(kepler):
     assert len(run) == 1
 
 
-@pytest.mark.parametrize("every", [1, 2, 7, 300, 1000, 5000])
-def test_every_thins_the_same_run(kepler, every):
+@pytest.mark.parametrize("save_every", [1, 2, 7, 300, 1000, 5000])
+def test_every_thins_the_same_run(kepler, save_every):
     """1000 steps are several calls into C: their seams must not show."""
-    dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, every=e) for e in (1, every))
-    assert np.array_equal(thin.q, dense.q[::every])
-    assert np.array_equal(thin.p, dense.p[::every])
-    assert np.array_equal(thin.t, dense.t[::every])
-    assert thin.iterations.sum() == dense.iterations[: 1000 // every * every + 1].sum()
+    dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, save_every=e) for e in (1, save_every))
+    assert np.array_equal(thin.q, dense.q[::save_every])
+    assert np.array_equal(thin.p, dense.p[::save_every])
+    assert np.array_equal(thin.t, dense.t[::save_every])
+    assert thin.iterations.sum() == dense.iterations[: 1000 // save_every * save_every + 1].sum()
 
 
 def test_progress_is_told_the_steps_done_up_to_the_last(kepler):
@@ -140,7 +140,7 @@ def test_a_restored_run_continues_bit_for_bit(sample, compiled, method):
     other = pickle.loads(pickle.dumps(stepper)).restore(saved)
     assert (other.t, other.steps) == (one.t, 123)
     assert np.array_equal([other.q, other.p], [one.q, one.p])
-    assert same(one.record(200, every=3), other.record(200, every=3))
+    assert same(one.record(200, save_every=3), other.record(200, save_every=3))
 
 
 def test_a_run_in_portions_is_one_run(kepler):
@@ -154,7 +154,7 @@ def test_a_run_in_portions_is_one_run(kepler):
 def test_every_counts_from_the_start_of_the_run(kepler):
     run = kepler.start(*STATE, h=0.05)
     run.record(5)
-    assert run.record(10, every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
+    assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
 
 
 def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
@@ -209,7 +209,7 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
         ({"steps": -1}, "steps must be at least 0, not -1"),
         ({"steps": 2.5}, "steps must be a whole number, not 2.5"),
         ({"steps": True}, "whole number"),
-        ({"steps": 3, "every": 0}, "every must be at least 1"),
+        ({"steps": 3, "save_every": 0}, "save_every must be at least 1"),
         ({"steps": 3, "t": np.nan}, "t is nan"),
     ],
 )
@@ -289,13 +289,13 @@ def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step
     stepper, state = falling(compiled)
     run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
     with pytest.raises(StepFailedError) as caught:
-        run.record(400, every=2)
+        run.record(400, save_every=2)
     error, kept = caught.value, caught.value.trajectory
     assert 5 < error.step < 400
     assert error.step == run.steps
     assert error.t == run.t == pytest.approx(0.05 * error.step)
     assert len(kept) == error.step // 2 + 1
-    again = stepper.integrate(*state, h=0.05, steps=error.step, every=2)
+    again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
     assert np.array_equal(kept.q, again.q)
     before = run.save()
     with pytest.raises(StepFailedError) as repeated:

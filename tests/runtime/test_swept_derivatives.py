@@ -55,7 +55,7 @@ def test_sweeps_carry_what_factors_do(name):
     found = []
     for stepper in (swept, factored):
         run = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3)
-        some = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3, every=35)
+        some = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3, save_every=35)
         gradient, other = run.pullback(slopes), some.pullback(slopes[::35])
         step = stepper.sensitivity(q, p, h, 0.3)
         columns = (step.state, step.parameters, step.t[:, np.newaxis], step.h[:, np.newaxis])

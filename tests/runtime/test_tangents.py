@@ -21,7 +21,7 @@ def test_runs_carry_directions():
         a, b, c, d = (np.concatenate([end.q[-1], end.p[-1]]) for end in ends)
         columns.append((8 * (a - b) - (c - d)) / 12e-4)
     assert_allclose(derivative[-1], np.array(columns).T, atol=1e-7 * np.abs(derivative[-1]).max())
-    some = stepper.integrate(start[:2], start[2:], h=0.05, steps=40, every=8)
+    some = stepper.integrate(start[:2], start[2:], h=0.05, steps=40, save_every=8)
     assert_allclose(some.tangent()[-1], derivative[-1], rtol=1e-11, atol=1e-11)
     one = run.tangent([1.0, 0.0, -1.0, 0.5])
     assert_allclose(one[-1], derivative[-1] @ [1.0, 0.0, -1.0, 0.5], rtol=1e-12)

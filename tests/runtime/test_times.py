@@ -68,7 +68,7 @@ def test_a_run_restored_has_the_time_it_had(free):
 
 
 def test_states_know_the_step_that_follows(free):
-    run = free.integrate([0.1], [0.0], h=0.25, steps=8, every=2)
+    run = free.integrate([0.1], [0.0], h=0.25, steps=8, save_every=2)
     assert run.lengths.tolist() == [0.25] * 5
     between = free.integrate([0.1], [0.0], h=0.25, steps=8, t_eval=[0.0, 0.3, 0.5])
     assert np.array_equal(between.lengths, [0.25, np.nan, 0.25], equal_nan=True)

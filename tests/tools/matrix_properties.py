@@ -35,10 +35,10 @@ __all__ = ["PROPERTIES", "SITUATIONS", "Case"]
 STEPS = 24
 
 SITUATIONS: dict[str, SimpleNamespace] = {
-    "defaults": SimpleNamespace(own=False, t=0.0, back=False, every=1),
-    "own": SimpleNamespace(own=True, t=1.3, back=False, every=1),
-    "back": SimpleNamespace(own=True, t=-0.7, back=True, every=1),
-    "sparse": SimpleNamespace(own=True, t=2.1, back=False, every=3),
+    "defaults": SimpleNamespace(own=False, t=0.0, back=False, save_every=1),
+    "own": SimpleNamespace(own=True, t=1.3, back=False, save_every=1),
+    "back": SimpleNamespace(own=True, t=-0.7, back=True, save_every=1),
+    "sparse": SimpleNamespace(own=True, t=2.1, back=False, save_every=3),
 }
 
 
@@ -128,11 +128,11 @@ class Case:
 
     def integrate(self, stepper: Any = None, q: Any = None, x: Any = None, **more: Any) -> Any:
         """The run, with what else is wanted; that of an array with its states as rows."""
-        stepper, every = stepper or self.stepper, more.pop("every", self.given.every)
-        given = {**self.common(every=every), **self.moving(x), **more}
+        stepper, save_every = stepper or self.stepper, more.pop("save_every", self.given.save_every)
+        given = {**self.common(save_every=save_every), **self.moving(x), **more}
         q = np.array(self.problem.q if q is None else q)
         if "t_eval" in more:
-            del given["every"]
+            del given["save_every"]
         if "t_end" not in more and self.kind == "monitored":
             given["t_end"] = self.given.t + self.span
         if "h" not in more and ("t_end" not in more or self.kind in ("monitored", "slowed")):
@@ -199,8 +199,10 @@ def states(case: Case) -> None:
     near(run.q, case.truth.q(run.t), case.error)
     near(run.p, case.truth.p(run.t), case.error)
     if case.kind in ("plain", "array"):
-        count = STEPS // given.every + 1
-        assert run.t.tolist() == [float(Fraction(given.t) + k * given.every * Fraction(case.h)) for k in range(count)]
+        count = STEPS // given.save_every + 1
+        assert run.t.tolist() == [
+            float(Fraction(given.t) + k * given.save_every * Fraction(case.h)) for k in range(count)
+        ]
         if case.problem.falls_back:
             assert not case.stepper.binding._lacks_fallback, "fixed-point iterations should have failed"
     elif case.kind == "slowed":
@@ -303,7 +305,7 @@ def failure(case: Case) -> None:
     last = float(Fraction(case.given.t) + 512 * Fraction(h))
     assert (failed.step, failed.t) == (512, last)
     kept = as_rows(kept) if case.kind == "array" else kept
-    assert len(kept.t) == 512 // case.given.every + 1
+    assert len(kept.t) == 512 // case.given.save_every + 1
     motion = truth_of(case.problem).motion(case.given.t, last, case.problem.q, case.problem.x, values)
     near(kept.q, motion.q(kept.t), 1e-6)
     if case.kind != "array":
@@ -343,7 +345,7 @@ def ensembles(case: Case) -> None:
     if case.kind in ("plain", "driven") and _tells_errors(case):
         ways.append({"t_end": goals, "tolerance": 1e-11})
     for way in ways:
-        found = ensemble_of(case, others, every=case.given.every, **way)
+        found = ensemble_of(case, others, save_every=case.given.save_every, **way)
         assert found.ok.all()
         energies, maps = found.energy(), found.momentum_maps()
         for j in (0, 3, 9):
@@ -369,7 +371,7 @@ def recording(case: Case) -> None:
             case.start(),
             f"{folder}/a",
             **steps,
-            every=case.given.every,
+            save_every=case.given.save_every,
             rows=5,
             checkpoint_steps=4,
             stop=lambda: next(looks, True),
@@ -459,7 +461,7 @@ def controlled(case: Case) -> None:
     near(p, case.truth.p(times), 1e-8)
     assert 0.0 < run.step_error < 1e-9
     assert min(case.given.t, end) <= run.step_error_t <= max(case.given.t, end)
-    if case.given.every == 1:
+    if case.given.save_every == 1:
         assert run.step_error_t in run.t
 
 
@@ -481,7 +483,7 @@ def _differences(case: Case, names: list[str], width: float) -> dict[str, np.nda
         else:
             values[which] += change
         run = case.stepper.integrate(
-            q, p, h=h, t=t, steps=steps, every=case.given.every, parameters=values, options=case.options
+            q, p, h=h, t=t, steps=steps, save_every=case.given.save_every, parameters=values, options=case.options
         )
         return np.concatenate([run.q, run.p], axis=1)
 
@@ -518,7 +520,7 @@ def derivatives(case: Case) -> None:
         near(columns[name], wanted[name], 1e-7)
         near(slopes[name], np.sum(seeds * wanted[name]), 1e-6)
     one = case.stepper.sensitivity(run.q[0], run.p[0], case.h, case.given.t, case.parameters(), options=case.options)
-    if case.given.every == 1:
+    if case.given.save_every == 1:
         near(one.state, found.state[1], 1e-11)
         near(one.parameters, found.parameters[1], 1e-11)
 
@@ -526,14 +528,14 @@ def derivatives(case: Case) -> None:
 def hessians(case: Case) -> None:
     """Products with the Hessian beside difference quotients of pullbacks."""
     m, width = len(case.problem.q), 1e-3
-    seeds = np.random.default_rng(3).normal(size=(SHORT // case.given.every + 1, 2 * m))
+    seeds = np.random.default_rng(3).normal(size=(SHORT // case.given.save_every + 1, 2 * m))
     direction = np.random.default_rng(4).normal(size=2 * m)
     run = case.integrate(steps=SHORT)
     found = run.hessian_product(seeds, direction)
 
     def pulled(change: float) -> np.ndarray:
         q, p = np.split(np.concatenate([run.q[0], run.p[0]]) + change * direction, 2)
-        other = case.stepper.integrate(q, p, **case.common(h=case.h, steps=SHORT, every=case.given.every))
+        other = case.stepper.integrate(q, p, **case.common(h=case.h, steps=SHORT, save_every=case.given.save_every))
         gradient = other.pullback(seeds)
         return np.concatenate([gradient.q, gradient.p, gradient.parameters, [gradient.t, gradient.h]])
 
@@ -543,13 +545,13 @@ def hessians(case: Case) -> None:
 
 def flows(case: Case) -> None:
     """The flow of frameworks over several pieces of 64 steps, its push and its pull."""
-    steps, every = 150, 10
-    flow = FlowOfRows(case.stepper, steps=steps, every=every)
-    run = case.integrate(steps=steps, every=every, h=case.h)
+    steps, save_every = 150, 10
+    flow = FlowOfRows(case.stepper, steps=steps, save_every=save_every)
+    run = case.integrate(steps=steps, save_every=save_every, h=case.h)
     m, binding = len(case.problem.q), flow.library
     row = np.array([*run.q[0], *run.p[0], *run.parameters, case.given.t, case.h])
     x = np.array([1.001 * row, row])  # the second of two rows is what is compared
-    kept, given = steps // every + 1, len(row)
+    kept, given = steps // save_every + 1, len(row)
     change, slopes = (
         np.random.default_rng(5).normal(size=(2, given)),
         np.random.default_rng(6).normal(size=(2, kept, 2 * m)),
@@ -558,7 +560,7 @@ def flows(case: Case) -> None:
     def call(part: int, count: int, what: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         found, report = np.empty((2, *shape)), binding.new("report *")
         pointers = map(binding.pointer, (x, np.ascontiguousarray(what), found))
-        assert binding.function("flow_rows")(part, steps, every, count, 2, *pointers, report) == 0
+        assert binding.function("flow_rows")(part, steps, save_every, count, 2, *pointers, report) == 0
         return found[1]
 
     states = call(0, 0, x, (kept, 2 * m))
@@ -583,7 +585,9 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "formulas": (formulas, lambda case: True),
     "exchanged": (
         exchanged,
-        lambda case: case.problem.work and _keeps_account(case) and (case.kind != "monitored" or case.given.every == 1),
+        lambda case: (
+            case.problem.work and _keeps_account(case) and (case.kind != "monitored" or case.given.save_every == 1)
+        ),
     ),
     "between": (between, lambda case: True),
     "events": (events, lambda case: case.kind != "slowed"),

@@ -177,7 +177,7 @@ def trials(name: str, count: int, seed: int = 1) -> list[Trial]:
         nudge = 1 + 2.0**-50 * random.choice([-1.0, 1.0], size=(2, len(q)))
         starts = [(exact, q, p, t), (other, q, p, t), (exact, q * nudge[0], p * nudge[1], t * (1 + 2.0**-50))]
         try:
-            ends = [by.integrate(a, b, t=begin, t_end=t + h, every=10**9).q[-1] for by, a, b, begin in starts]
+            ends = [by.integrate(a, b, t=begin, t_end=t + h, save_every=10**9).q[-1] for by, a, b, begin in starts]
         except sc.StepFailedError:
             continue
         noise = FLOOR + 4 * displaced(q, ends[0], ends[1]) + 16 * displaced(q, ends[0], ends[2])

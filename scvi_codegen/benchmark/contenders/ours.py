@@ -129,7 +129,7 @@ def _preparation(stepper: Stepper, case: Case, momenta: Array, count: int) -> Ca
         run = stepper.start(case.q[index], momenta[index], h=case.span / count)
 
         def integrate() -> Array:
-            final: Array = run.record(count, every=count).q[-1]
+            final: Array = run.record(count, save_every=count).q[-1]
             return final
 
         return integrate
@@ -141,7 +141,9 @@ def _ensemble_preparation(
     stepper: Stepper, case: Case, momenta: Array, count: int
 ) -> Callable[[int], Callable[[], Array]]:
     def integrate() -> Array:
-        result = stepper.integrate_ensemble(case.q, momenta, h=case.span / count, steps=count, every=count, threads=1)
+        result = stepper.integrate_ensemble(
+            case.q, momenta, h=case.span / count, steps=count, save_every=count, threads=1
+        )
         final: Array = result.q[-1]
         return final
 

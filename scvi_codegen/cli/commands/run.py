@@ -72,7 +72,7 @@ go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
 \b
 Examples:
   scvi-codegen run outer-solar-system --plot orbits.png
-  scvi-codegen run kepler --step 0.1 --steps 100000 --every 100 -o orbit.npz
+  scvi-codegen run kepler --step 0.1 --steps 100000 --save-every 100 -o orbit.npz
   scvi-codegen run kepler --tolerance 1e-12
   scvi-codegen run kepler --error 1e-9
   scvi-codegen run kepler --advise 1e-9

@@ -60,7 +60,7 @@ def segments() -> tuple[Segment, ...]:
     run = stepper.start(q, stepper.momentum(q, velocity), h=LONG_STEP, options=SECTION_4)
     found = []
     for first, last in SEGMENTS:
-        run.record(first - run.steps, every=SEGMENTS[-1][-1])
+        run.record(first - run.steps, save_every=SEGMENTS[-1][-1])
         found.append(_segment(run.record(last - first)))
     return tuple(found)
 

@@ -85,7 +85,7 @@ def _order(stepper: Stepper) -> float:
 def _error(stepper: Stepper, steps: int) -> float:
     """Return the error of the state after :data:`SPAN`; 0, which is ignored, if a step fails."""
     try:
-        run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, every=steps)
+        run = stepper.integrate(*STATE, h=SPAN / steps, steps=steps, save_every=steps)
     except StepFailedError:
         return 0.0
     exact = np.concatenate(exact_flow(*STATE, SPAN), axis=1)[0]

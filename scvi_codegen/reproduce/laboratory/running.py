@@ -45,11 +45,11 @@ def trajectory(
     *,
     h: float,
     span: float,
-    every: int = 1,
+    save_every: int = 1,
     options: SolverOptions = SECTION_3,
     solver: str = "auto",
 ) -> Trajectory:
     """Integrate with a method from (q, velocity) at t = 0 over ``span``."""
     stepper = stepper_of(system, method, solver)
     p = stepper.momentum(q, velocity)
-    return stepper.integrate(q, p, h=h, steps=steps_in(span, h), every=every, options=options)
+    return stepper.integrate(q, p, h=h, steps=steps_in(span, h), save_every=save_every, options=options)

@@ -136,7 +136,7 @@ def costs(number: int) -> Mapping[str, Cost]:
 def _seconds(stepper: Stepper, setting: Setting) -> float:
     run = stepper.start(setting.q, stepper.momentum(setting.q, setting.velocity), h=setting.h, options=SECTION_3)
     began = time.process_time()
-    run.record(setting.steps, every=setting.steps)
+    run.record(setting.steps, save_every=setting.steps)
     return time.process_time() - began
 
 
@@ -155,7 +155,7 @@ def _reference(setting: Setting, finer: int) -> NDArray[np.float64]:
     stepper = compile_stepper(setting.system, REFERENCE)
     p, steps = stepper.momentum(setting.q, setting.velocity), setting.steps * finer
     end: NDArray[np.float64] = stepper.integrate(
-        setting.q, p, h=setting.h / finer, steps=steps, every=steps, options=ROUNDOFF
+        setting.q, p, h=setting.h / finer, steps=steps, save_every=steps, options=ROUNDOFF
     ).q[-1]
     return end
 

@@ -168,7 +168,7 @@ def _along(name: str, exact: ExactStep, h: float, rule: Quadrature) -> Array:
     stepper, values = quick_stepper(name, CURVE), []
     q0, p0 = _floats(exact.q0, exact.p0)
     for c in map(float, rule.abscissae):
-        run = stepper.integrate(q0, p0, h=c * h / CURVE_STEPS, steps=CURVE_STEPS, every=CURVE_STEPS)
+        run = stepper.integrate(q0, p0, h=c * h / CURVE_STEPS, steps=CURVE_STEPS, save_every=CURVE_STEPS)
         q, p = run.q[-1], run.p[-1]
         values.append(p @ stepper.velocity(q, p) - stepper.energy(q, p))
     return np.array(values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,7 @@ class Manifest:
         parameters: values in the order of ``interface.parameters``.
         h: step size, 0 where steps choose their length.
         t: initial time.
-        every: distance between kept states in steps.
+        save_every: distance between kept states in steps.
         steps: number of steps wanted, ``None`` where steps choose their length.
         goal: where these lead, else ``None``.
         rows: states in a full file.
@@ -85,7 +86,7 @@ class Manifest:
     parameters: tuple[float, ...]
     h: float
     t: float
-    every: int
+    save_every: int
     steps: int | None
     goal: Goal | None = None
     rows: int
@@ -136,7 +137,7 @@ class Manifest:
         self._check_numbers()
 
     def _check_numbers(self) -> None:
-        for name, least in {"every": 1, "rows": 1, "steps": 0}.items():
+        for name, least in {"save_every": 1, "rows": 1, "steps": 0}.items():
             if (count := getattr(self, name)) is not None or name != "steps":
                 checked_count(count, name, least=least)
         for name in ("h", "t"):
@@ -170,6 +171,9 @@ class Manifest:
         document = json.loads(text)
         if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
             raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
+        if "every" in document:  # as version 0.1 named it, in the model, too
+            document["save_every"] = document["every"]
+            document["model"] = document["model"] and re.sub(r"(?m)^every\b", "save_every", document["model"])
         plain = {field: document[field] for field in PLAIN}
         options, goal = document["options"], document["goal"] if document["format"] == FORMAT_TO_A_TIME else None
         found = cls(
@@ -185,7 +189,7 @@ class Manifest:
         return found
 
 
-PLAIN = ("flags", "parameters", "h", "t", "every", "steps", "rows", "model", "certificate")
+PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")
 
 
 def read_manifest(folder: Path) -> Manifest:

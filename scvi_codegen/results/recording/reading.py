@@ -99,7 +99,7 @@ class RecordedRun:
 
     @property
     def steps(self) -> int:
-        """Steps done; the last of them is not among the states if it is not a multiple of ``manifest.every``."""
+        """Steps done; the last of them is not among the states if it is not a multiple of ``manifest.save_every``."""
         return self._last.step
 
     @property
@@ -227,7 +227,7 @@ class RecordedRun:
     def _trajectory(self, piece: tuple[Any, ...], rows: NDArray[np.int64]) -> Trajectory:
         t, q, p, iterations = piece
         manifest, run = self.manifest, self._standing
-        taken = manifest.every * rows
+        taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
         step_error, step_error_t = run.step_error
         return Trajectory(
@@ -252,7 +252,7 @@ class RecordedRun:
         """(n,) of the steps after these states, not numbers where the end of one that chose its length is not there."""
         if self.manifest.goal is None:
             return np.broadcast_to(self.manifest.h, t.shape)
-        found = np.where((np.diff(rows) == 1) & (self.manifest.every == 1), np.diff(t), np.nan)
+        found = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
         return np.append(found, np.nan)[: len(t)]
 
 

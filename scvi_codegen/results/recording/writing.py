@@ -50,7 +50,7 @@ def record_run(
     folder: str | os.PathLike[str],
     *,
     steps: int | None = None,
-    every: int = 1,
+    save_every: int = 1,
     checkpoint_seconds: float = CHECKPOINT_SECONDS,
     checkpoint_steps: int | None = None,
     rows: int | None = None,
@@ -59,13 +59,13 @@ def record_run(
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> RecordedRun:
-    """Advance a run by ``steps``, or to its goal, and record every ``every``-th state, the first too, in a folder.
+    """Advance a run by ``steps``, or to its goal, and record every ``save_every``-th state, the first too, in a folder.
 
     Args:
         run: at its start, from ``stepper.start(q, p, h=h)``, or ``start(q, p, t_end=..., tolerance=...)``.
         folder: made if it is missing; it must be empty, or hold a run that was ended before its first state.
         steps: number of steps; left out where they choose their length and lead to a goal.
-        every: distance between kept states; the one at a goal is kept, too.
+        save_every: distance between kept states; the one at a goal is kept, too.
         checkpoint_seconds: what is computed is written at least so often; no more is lost if the process is killed.
         checkpoint_steps: write it also every so many steps.
         rows: states in a file, by default about 16 MiB.
@@ -97,7 +97,7 @@ def record_run(
         parameters=tuple(map(float, run.parameters)),
         h=run.h,
         t=run.t,
-        every=checked_count(every, "every", least=1),
+        save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
         goal=run.goal,
         rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
@@ -218,7 +218,7 @@ class _Recorder:
 
     def _advance(self, steps: int) -> None:
         try:
-            self.keep(_piece(record(self.run, steps, every=self.manifest.every), 1))
+            self.keep(_piece(record(self.run, steps, save_every=self.manifest.save_every), 1))
         except StepFailedError as error:
             if isinstance(error.trajectory, Trajectory):
                 self.keep(_piece(error.trajectory, 1))
@@ -226,8 +226,8 @@ class _Recorder:
 
     def _most_steps(self) -> int:
         """Up to the end, the last state of this file, or the next checkpoint."""
-        done, every, manifest = self.run.steps, self.manifest.every, self.manifest
-        last = (done // every + manifest.rows - self._rows()) * every
+        done, save_every, manifest = self.run.steps, self.manifest.save_every, self.manifest
+        last = (done // save_every + manifest.rows - self._rows()) * save_every
         ends = [last] if manifest.steps is None else [last, manifest.steps]
         if self.steps is not None:
             ends.append((done // self.steps + 1) * self.steps)
