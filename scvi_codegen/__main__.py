@@ -1,4 +1,4 @@
-"""``python -m scvi_codegen`` is the command line."""
+"""Entry point of ``python -m scvi_codegen``: the command line."""
 
 from scvi_codegen.cli import main
 

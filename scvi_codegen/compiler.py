@@ -1,26 +1,25 @@
-"""The whole tour: a system and a method go in, a stepper comes out.
+"""Compilation pipeline: from a mechanical system and a method to a stepper.
 
     MechanicalSystem, Method
       -> discretise  StageSystem   points, kernel and tables: the equations of one step
                                    (:mod:`scvi_codegen.methods.discretise`)
-      -> sweep_of    Sweep         how they are solved without a matrix, where there is a way; splitting_of: explicitly
+      -> sweep_of    Sweep         fixed-point iteration, if the system admits one; splitting_of: explicit splitting
                                    (:mod:`scvi_codegen.lowering.solvers.choice`)
-      -> symmetries  Symmetry      what is conserved (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
-      -> lower       Program       kernels, tables, loops: C without syntax (:mod:`scvi_codegen.lowering.program`)
+      -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
+      -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
       -> render      Source        header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering.text`);
-                                   with events, the search for them behind it (:mod:`scvi_codegen.rendering.events`)
-      -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration behind
-                                   sweeps when these first fail (:mod:`scvi_codegen.rendering.fallback`)
+                                   plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
+      -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration is
+                                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.fallback`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.stepper`)
 
-Beside the way: :func:`scvi_codegen.derivation.equations.derive` writes the equations out as the paper prints them, and
-:func:`scvi_codegen.exact.step.derived_step` solves them in 60 digits; both read a ``StageSystem`` of their own.
-:mod:`scvi_codegen.frameworks` puts many steps and their derivatives behind the C text that has those of one step, for
-JAX, PyTorch and CasADi, and :func:`scvi_codegen.frameworks.casadi_step.casadi_step` a ``StageSystem`` as equations into
-CasADi.
+Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
+paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them in 60-digit arithmetic.
+:mod:`scvi_codegen.frameworks` extends the C source of one step and its derivatives to many steps for JAX, PyTorch and
+CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stage equations as CasADi expressions.
 
-Each stage is a pure function from frozen data to frozen data; only ``build`` touches the disk. Texts and modules are
-kept in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so the second time is quick.
+Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
+cached in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so later calls skip the derivation.
 """
 
 from __future__ import annotations
@@ -96,26 +95,26 @@ def compile_stepper(
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
-    Args:
-        system: what moves.
-        method: how its motion is discretised, or a name as the command line takes it: ``"svi"``, ``"svi:6"``.
-        solver: of the stage equations: ``"fixed-point"`` (fast, points as vector lanes; for every method of at most 32
-            points on every system, but variational SCVI with more than 8 coordinates, and SVI with fewer points than
-            the degree), ``"newton"`` (always, also for stiff systems and large steps), ``"explicit"`` (Stoermer-Verlet
-            and compositions on separable systems) or ``"auto"``: explicit or fixed point where there is one, Newton
-            where it fails, derived and compiled when that first happens.
-        flags: for the C compiler; by default tuned to this processor.
-        prefix: of the C names; by default made from the names of system and method.
-        symmetries: known beside those that are found
-            (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`): their momentum maps are tracked, too.
-        events: zero crossings that every run of this stepper (no ensemble) records, see :meth:`Stepper.integrate`.
-        monitor: g(q, t) > 0, or a name as of :func:`~scvi_codegen.reparametrise`, of a Hamiltonian g(q, p, t): runs
-            with h and t_end then take steps of h in a time with dt = g dtau, by the reversible controller of Hairer and
-            Soederlind, also where the system depends on time and where forces act. Momentum maps are kept.
+    Args:        system: the mechanical system.
+        method: the discretisation, or a name as on the command line: ``"svi"``, ``"svi:6"``.
+        solver: solver of the stage equations. ``"fixed-point"`` is fast (stages are SIMD lanes) and available for
+            methods with at most 32 stages, except variational SCVI with more than 8 coordinates and SVI with fewer
+            points than its degree; ``"newton"`` is always available, also for stiff systems and large steps;
+            ``"explicit"`` requires Stoermer-Verlet or a composition and a separable system; ``"auto"`` takes explicit
+            or fixed point if available and falls back to Newton, compiled when first needed.
+        flags: flags for the C compiler; the default is tuned to this processor.
+        prefix: prefix of the C names; by default made from the names of system and method.
+        symmetries: symmetries to track in addition to those that are detected
+            (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`).
+        events: zero crossings that every run of this stepper (not ensembles) records, see :meth:`Stepper.integrate`.
+        monitor: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
+            :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
+            by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
+            Momentum maps are preserved.
 
     Raises:
         BuildError: if there is no C compiler.
-        MethodError: for a solver that the method does not have.
+        MethodError: if the solver is not available for the method.
     """
     texts = _Texts(system, as_method(method, system), solver, prefix, symmetries, monitor)
     own = json.loads(remembered_text((*texts.key, "integrator"), texts.integrator))
@@ -135,7 +134,7 @@ def compile_stepper(
 
 
 class _Texts:
-    """The texts of one integrator; equations are derived when one of them is first made."""
+    """C sources of one integrator and its variants, derived on first use."""
 
     def __init__(
         self,
@@ -152,7 +151,7 @@ class _Texts:
         self._programs: dict[bool, Program] = {}
 
     def program(self, *, fallback: bool = False) -> Program:
-        """The program, with Newton's iteration behind its sweeps if that is the fallback."""
+        """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
         if fallback not in self._programs:
             with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
                 self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
@@ -160,27 +159,27 @@ class _Texts:
 
     @property
     def borrows(self) -> bool:
-        """Whether Newton's iteration is that of another library."""
+        """Return whether Newton's iteration comes from a separate fallback library."""
         return self.solver == "auto" and self.program().sweep is not None and not self.program().newton
 
     def integrator(self) -> str:
-        """The text, and what a caller must know of it."""
+        """Return the C source and its interface as JSON."""
         interface = describe(self.program(), self.system, self.method, borrows=self.borrows, monitor=self.monitor)
         return json.dumps([self._rendered().to_json(), interface.to_json()])
 
     def controlled(self) -> Source | None:
-        """With steps that choose their length, if a curve tells their error, or whose density a monitor carries."""
+        """Return the source with adaptive steps, or with the step-density controller of a monitor; else ``None``."""
         control = control_of(self.program()) if self.monitor is None else density_of(self.system, self.monitor)
         return self._rendered(control) if control else None
 
     def fallback(self) -> Source | None:
-        """With Newton's iteration, where the text itself borrows it."""
+        """Return the source with Newton's iteration if the integrator itself contains none."""
         return render(self.program(fallback=True), fallback="lent") if self.borrows else None
 
     def tangent(self, *, second: bool = False) -> Source | None:
-        """With derivatives of steps by all they start from, the second ones, too.
+        """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
 
-        In transformed time, and of damped systems, there are no second ones.
+        Second derivatives are unavailable in transformed time and for damped systems.
         """
         if second and (self.system.integrands or self.system.damping):
             return None
@@ -192,7 +191,7 @@ class _Texts:
             return render_derivatives(derivatives_of(self.system, stages, found, second=second))
 
     def changes(self, count: int) -> Source | None:
-        """With small changes beside each of many trajectories, where their equations are sums of forces, too."""
+        """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
         twin, sweep = lagrangian_twin(self.system), self.program().sweep
         varied = with_changes(twin, count) if twin and sweep and sweep.serves_many and sweep.constant_mass else None
         if varied is None:
@@ -205,7 +204,7 @@ class _Texts:
         return render(self.program(), control, fallback="borrowed" if self.borrows else None)
 
     def remembered(self, name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
-        """Makes a text, or finds it where texts are kept."""
+        """Return a function that makes a source or loads it from the cache."""
 
         @cache
         def source() -> Source | None:
@@ -233,18 +232,18 @@ def generate_source(
     controlled: bool = False,
     monitor: str | Expr | None = None,
 ) -> tuple[Source, Interface]:
-    """C text of the integrator, and what a caller must know of it; arguments as of :func:`compile_stepper`.
+    """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
     Args:
-        embedded: the precision, ``"double"`` or ``"single"``, of text for a microcontroller: explicit or Newton's
-            iteration alone, which takes half of the stack that lanes take where there are no vector registers.
-        amalgamate: whether support headers stand in the source, not beside it; for a microcontroller they always do.
-        controlled: with steps that choose their length, where the curve of a step tells its error.
-        monitor: with steps of tau instead, dt = g dtau, by the reversible controller.
+        embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
+            Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
+        amalgamate: include the support headers in the source; always done for a microcontroller.
+        controlled: use adaptive steps, if the method has an error estimate.
+        monitor: use constant steps in tau instead, dt = g dtau, by the reversible controller.
 
     Raises:
-        MethodError: for a solver that the method does not have, for a number beyond single precision, and for events in
-            text for a microcontroller.
+        MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
+            events are combined with ``embedded``.
     """
     method = as_method(method, system)
     functions = tuple(event.function for event in as_events(events))
@@ -276,11 +275,11 @@ def program_of(
     lanes: bool = True,
     fallback: bool = True,
 ) -> Program:
-    """The integrator without syntax; arguments as of :func:`compile_stepper`.
+    """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
 
     Args:
-        lanes: whether there may be a solver with vector lanes.
-        fallback: whether Newton's iteration is to stand behind it. Time as an integral along the curve needs it there.
+        lanes: allow a solver that uses SIMD lanes.
+        fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     tracked = all_symmetries(system, symmetries)
@@ -302,7 +301,7 @@ def _program(
     lanes: bool,
     fallback: bool,
 ) -> Program:
-    """That of a system as it is written out."""
+    """Lower a system without rolling its terms into loops."""
     stages = discretise(system, method)
     explicit = solver in ("auto", "explicit") and not system.integrands
     splitting = splitting_of(system, method) if explicit else None
@@ -332,7 +331,7 @@ def describe(
     borrows: bool = False,
     monitor: str | Expr | None = None,
 ) -> Interface:
-    """The interface of a program; ``borrows``: whether Newton's iteration is that of another library."""
+    """Return the interface of a program; ``borrows``: Newton's iteration comes from a separate fallback library."""
     return Interface(
         prefix=program.prefix,
         title=program.title,
@@ -361,16 +360,16 @@ def describe(
 
 
 def _solver_of(program: Program) -> str:
-    """What solves the equations of its steps first."""
+    """Return the name of the solver that is tried first."""
     if program.splitting:
         return "explicit"
     return "rattle" if program.rattle else "fixed-point" if program.sweep else "newton"
 
 
 def c_identifier(name: str) -> str:
-    """Lower-case letters, digits and underscores, beginning with a letter, of limited length.
+    """Return a name of lower-case letters, digits and underscores that begins with a letter, of limited length.
 
-    A single letter (``X_OK`` is a macro of POSIX) and names of C headers get a longer name.
+    Single letters (``X_OK`` is a POSIX macro) and names of C headers get a suffix.
     """
     cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
     if not cleaned[:1].isalpha():

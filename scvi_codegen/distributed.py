@@ -1,3 +1,3 @@
-"""Ensembles over a cluster, by the path that programs import (:mod:`scvi_codegen.runtime.distributed`)."""
+"""Import path of :mod:`scvi_codegen.runtime.distributed` for user programs."""
 
 from scvi_codegen.runtime.distributed import integrate_ensemble as integrate_ensemble

@@ -1,4 +1,4 @@
-"""Every error a user can meet. Each message names the symbol or value at fault and says what to do."""
+"""Errors and warnings of the package. Each message names the symbol or value at fault and says what to do."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ PACKAGE = __name__.partition(".")[0]
 
 
 def closest(name: str, known: Iterable[str]) -> str:
-    """``"; did you mean 'x'?"`` for the known name nearest to ``name``, or a full stop."""
+    """Return ``"; did you mean 'x'?"`` for the known name nearest to ``name``, or a full stop if none is near."""
     matches = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean '{matches[0]}'?" if matches else "."
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Of the line that called this package, from however deep inside it."""
+    """Issue a warning attributed to the line that called this package, at any depth inside it."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
         level, frame = level + 1, frame.f_back
@@ -53,23 +53,23 @@ def warn(message: str, category: type[Warning]) -> None:
 
 
 class ScviCodegenError(Exception):
-    """Base of all errors raised on purpose by this package."""
+    """Base class of all errors raised by this package."""
 
 
 class ArgumentError(ScviCodegenError, TypeError):
-    """An argument is not of the kind that a public function takes."""
+    """An argument of the wrong type."""
 
 
 class SystemDefinitionError(ScviCodegenError, ValueError):
-    """The mechanical system is not well defined (unknown symbol, singular mass matrix, ...)."""
+    """An ill-defined mechanical system (unknown symbol, singular mass matrix, ...)."""
 
 
 class ExpressionError(SystemDefinitionError):
-    """Text that is not a formula of the accepted grammar.
+    """Text that the formula grammar does not accept.
 
     Attributes:
-        text: the text as given.
-        column: 0-based position of the offence in ``text``.
+        text: the text that was parsed.
+        column: 0-based position of the error in ``text``.
     """
 
     def __init__(self, message: str, text: str, column: int) -> None:
@@ -80,7 +80,7 @@ class ExpressionError(SystemDefinitionError):
 
 
 class ControlError(ScviCodegenError, ArithmeticError):
-    """No optimal control was found; ``motion`` is the last that was tried."""
+    """Failure to find an optimal control; ``motion`` is the last iterate."""
 
     def __init__(self, message: str, motion: Any = None) -> None:
         self.motion = motion
@@ -88,19 +88,19 @@ class ControlError(ScviCodegenError, ArithmeticError):
 
 
 class FitError(ScviCodegenError, ValueError):
-    """Measurements that do not tell what is asked of them."""
+    """Measurements that do not determine the requested parameters."""
 
 
 class MethodError(ScviCodegenError, ValueError):
-    """A combination of degree, nodes and quadrature that makes no sense."""
+    """An invalid combination of degree, nodes and quadrature, or a feature that the method does not have."""
 
 
 class OrbitError(ScviCodegenError, ArithmeticError):
-    """No periodic orbit was found near a guess."""
+    """Failure to find a periodic orbit near an initial guess."""
 
 
 class MethodWarning(UserWarning):
-    """A method that can be built, with a property the user should know of."""
+    """A method that works but has a property the user should know."""
 
 
 class SystemDefinitionWarning(UserWarning):
@@ -112,61 +112,62 @@ class SystemDefinitionWarning(UserWarning):
 
 
 class AccuracyWarning(UserWarning):
-    """Of a run that went on: steps too long for the motion, or an initial state that was moved onto its constraints.
+    """A run that completed with doubtful accuracy: too large steps, or an initial state projected onto its constraints.
 
-    The equations were solved; but states after steps that are too long are not to be trusted.
+    The equations were solved, but states computed with too large steps are unreliable.
     """
 
 
 class ModelFileError(ScviCodegenError, ValueError):
-    """A model file that cannot be read, or that lacks or repeats something."""
+    """A model file that cannot be read, or that lacks or repeats an entry."""
 
 
 class PackageError(ScviCodegenError, ValueError):
-    """A folder that cannot hold a generated package, or holds none."""
+    """A folder that contains no generated package or cannot be used for one."""
 
 
 class EventError(ScviCodegenError, ValueError):
-    """An event that cannot be watched: an unknown symbol, a constant, another direction, a value that is not finite."""
+    """An invalid event: an unknown symbol, a constant function, an unknown direction or a value that is not finite."""
 
 
 class PlotError(ScviCodegenError):
-    """matplotlib is not installed."""
+    """Missing matplotlib."""
 
 
 class CacheWarning(UserWarning):
-    """A cache folder that is not used."""
+    """A cache folder that cannot be used."""
 
 
 class MissingLibraryError(ScviCodegenError, ImportError):
-    """A library that a file format or a conversion needs is not installed; the message names the extra that has it."""
+    """An optional library that is not installed; the message names the extra that provides it."""
 
 
 class RecordingError(ScviCodegenError, OSError):
-    """A folder that holds no run, or that cannot be read or written; the message says how far the run in it goes."""
+    """A folder without a run, or one that cannot be read or written; the message says how far its run goes."""
 
 
 class RecordingWarning(UserWarning):
-    """A recorded run goes on under other circumstances than it began."""
+    """A recorded run that is resumed under other conditions than those of its start."""
 
 
 class StateError(ScviCodegenError, ValueError):
-    """A state, step or parameter of the wrong shape, type or name."""
+    """A state, step size or parameter of the wrong shape, type or name."""
 
 
 class BuildError(ScviCodegenError, RuntimeError):
-    """No C compiler was found, or it refused the generated source."""
+    """A missing C compiler, or C source that the compiler rejected."""
 
 
 class StepFailedError(ScviCodegenError, ArithmeticError):
-    """A step did not converge; the state before it is untouched.
+    """Failure to solve a step; the state before it is unchanged.
 
     Attributes:
         status: the status word of the C code (``"not converged"``, ``"singular"``, ``"not finite"``).
-        step: index of the failing step, counted from 0.
-        t: time at the start of the failing step.
+        step: index of the failed step, counted from 0.
+        t: time at the start of the failed step.
         residual: the last scaled Newton update.
-        trajectory: the :class:`Trajectory` before the failure, ``None`` for a single step; :meth:`Trajectory.before`.
+        trajectory: the :class:`Trajectory` before the failure, ``None`` for a single step; see
+            :meth:`Trajectory.before`.
     """
 
     def __init__(

@@ -1,11 +1,11 @@
-"""From a Lagrangian of sums over indices to a compiled integrator of any number of coordinates.
+"""Compilation pipeline of indexed systems: from a Lagrangian in index notation to an integrator of any size.
 
     IndexedSystem  x  Method
       -> lower       IndexedProgram  kernels of terms, tables of one coordinate (:mod:`scvi_codegen.lowering.indexed`)
       -> render      Source          loops around kernels (:mod:`scvi_codegen.rendering.indexed`)
       -> IndexedStepper              runs over arrays (:mod:`scvi_codegen.runtime.indexed_stepper`)
 
-Neither the length of the text nor the time to compile it depends on the number of coordinates.
+Neither the length of the C source nor its compile time depends on the number of coordinates.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ def compile_indexed(
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
 ) -> IndexedStepper:
-    """Derive, generate, compile and load the integrator of sums over indices.
+    """Derive, generate, compile and load the integrator of an indexed system.
 
     Args:
-        system: what moves.
-        method: how its motion is discretised, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods, and
-            those whose equations sweeps over positions solve: SVI, SC, Runge-Kutta.
-        solver: of the equations of a step: ``"fixed-point"``, sweeps, or ``"newton"`` for stiff systems: Newton's
-            iteration, its linear systems by GMRES from products with the derivatives of the forces alone, which their
-            diagonal preconditions, or on lattices their mean in Fourier space.
-        flags: for the C compiler; by default tuned to this processor.
-        prefix: of the C names; by default made from the names of system and method.
+        system: the indexed system.
+        method: the discretisation, or a name: ``"svi:4"``, ``"stoermer-verlet"``. Explicit methods and methods with a
+            fixed-point iteration over stage positions (SVI, SC, Runge-Kutta) are supported.
+        solver: solver of the stage equations: ``"fixed-point"``, or ``"newton"`` for stiff systems: Newton-GMRES with
+            Jacobian-vector products of the forces, preconditioned by the diagonal of the Jacobian or, on lattices, by
+            its circulant (Fourier) average.
+        flags: flags for the C compiler; the default is tuned to this processor.
+        prefix: prefix of the C names; by default made from the names of system and method.
 
     Raises:
         BuildError: if there is no C compiler.
-        MethodError: for a method without such sweeps, and a solver that it does not have.
+        MethodError: if the method or the solver is not supported.
     """
     texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
     return IndexedStepper(texts.plain, texts.interface, controlled=lambda: texts.controlled, flags=flags)
@@ -65,13 +65,13 @@ def compile_indexed(
 def generate_indexed(
     system: IndexedSystem, method: Method | str, *, solver: str = "fixed-point", prefix: str | None = None
 ) -> tuple[Source, IndexedInterface]:
-    """The C text, and what a caller must know of it; arguments and errors as of :func:`compile_indexed`."""
+    """Return the C source and its interface; arguments and errors as of :func:`compile_indexed`."""
     texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
     return texts.plain, texts.interface
 
 
 class _IndexedTexts:
-    """The texts of one integrator; equations are derived when one of them is first made."""
+    """C sources of one integrator, derived on first use."""
 
     def __init__(self, system: IndexedSystem, method: Method, prefix: str | None, solver: str) -> None:
         check_solver(solver)
@@ -80,7 +80,7 @@ class _IndexedTexts:
 
     @property
     def interface(self) -> IndexedInterface:
-        """What a caller must know."""
+        """Interface of the generated library."""
         return replace(
             _interface(self.system, self.method, self.prefix),
             solver="rattle" if self.system.constraints else self.solver,
@@ -88,18 +88,18 @@ class _IndexedTexts:
 
     @cached_property
     def program(self) -> IndexedProgram:
-        """Without steps that choose their length."""
+        """Lowered program with fixed step size."""
         with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
             return lower_indexed(self.system, self.method, self.prefix, newton=self.solver == "newton")
 
     @cached_property
     def plain(self) -> Source:
-        """The text by steps of one length."""
+        """C source with fixed step size."""
         return Source.from_json(self._remembered("indexed", lambda: render_indexed(self.program).to_json()))
 
     @cached_property
     def controlled(self) -> Source | None:
-        """The text with steps that choose their length, if a curve tells their error."""
+        """C source with adaptive steps; ``None`` if the method has no error estimate."""
 
         def text() -> str:
             program = with_control(self.program)

@@ -1,4 +1,4 @@
-"""Arrays, indices and loops: what sums over many like terms are written with.
+"""Arrays, indices and loops of Lagrangians in index notation.
 
     array    = name "[" size ("," size)* "]"                      declared, as q[N], r[N, 3], bonds[B, 2]
     loop     = name "in" (bound ".." bound | size) ["periodic"]   i in N, i in 0..N-2, i in N periodic
@@ -7,9 +7,9 @@
              | index (+|-) whole number                           i, i+1
              | table "[" index "," whole number "]"               bonds[b, 0]
 
-Sizes are names, whose values the arrays of a run have, or whole numbers. SymPy never sees an index: every *access* of
-an array (``q[i+1]``, ``m[bonds[b, 0]]``) is a symbol of its own in the formula of a term, a *slot*, of which
-derivatives are taken as of any other.
+A size is a name, whose value follows from the arrays of a run, or a whole number. SymPy never sees an index: every
+*access* of an array (``q[i+1]``, ``m[bonds[b, 0]]``) is replaced by a separate symbol in the formula of a term, and
+derivatives are taken with respect to these symbols.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ __all__ = ["Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """``name + number``; a whole number alone where there is no name."""
+    """Array size ``name + number``; a whole number if ``name`` is empty."""
 
     name: str
     number: int = 0
 
     def at(self, sizes: Mapping[str, int]) -> int:
-        """Its value."""
+        """Return the numerical value for the sizes of a run."""
         return (sizes[self.name] if self.name else 0) + self.number
 
     def __add__(self, number: int) -> Size:
@@ -39,7 +39,7 @@ class Size:
 
 
 def offset_text(name: str, number: int) -> str:
-    """``name + number`` as short as it can be written."""
+    """Return ``name + number`` in its shortest form."""
     if not name:
         return str(number)
     return f"{name}{number:+d}" if number else name
@@ -47,18 +47,18 @@ def offset_text(name: str, number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """A name with the size of each of its axes; of a table of places the last is a whole number of columns."""
+    """Declaration of an array: name and size of each axis; the last axis of an index table is a whole number."""
 
     name: str
     axes: tuple[Size, ...]
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """Its shape where the sizes have values."""
+        """Return the numerical shape for the sizes of a run."""
         return tuple(axis.at(sizes) for axis in self.axes)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its axes that are no whole numbers."""
+        """Names of the symbolic axis sizes."""
         return tuple(axis.name for axis in self.axes if axis.name)
 
     def __str__(self) -> str:
@@ -67,13 +67,13 @@ class Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loop:
-    """An index from ``first`` to the one before ``end``, or from behind another index on.
+    """Loop over an index from ``first`` to ``end`` - 1, or over the values greater than another index.
 
     Attributes:
-        index: its name.
-        first, end: bounds; first is 0 where it begins behind another index.
-        periodic: whether the index ``end`` is ``first`` again.
-        behind: the other index of a pair.
+        index: name of the index.
+        first, end: bounds; ``first`` is 0 in a pair loop.
+        periodic: periodic boundary: index ``end`` wraps to ``first``.
+        behind: the smaller index of a pair loop, or "".
     """
 
     index: str
@@ -84,7 +84,7 @@ class Loop:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it begins at 0."""
+        """Return whether the loop begins at 0."""
         return self.first == Size("", 0)
 
     def __str__(self) -> str:
@@ -96,12 +96,12 @@ class Loop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """Where an axis is accessed: an index, a size or nothing, plus a whole number; or an entry of a table.
+    """Index expression of one axis: an index, a size or nothing, plus a whole number; or an entry of an index table.
 
     Attributes:
-        index: the loop that it moves with, or "".
-        base: the size and the whole number that it stands at, if it does not move; else what is added to the index.
-        table, column: the table whose row is that of the index, or "".
+        index: the loop index, or "".
+        base: the constant position if there is no index; otherwise the offset added to the index.
+        table, column: the index table whose row is the index, and its column; or "".
     """
 
     index: str = ""
@@ -117,14 +117,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """An entry of an array, ``q[i+1, 0]``."""
+    """Array access such as ``q[i+1, 0]``."""
 
     array: Array
     places: tuple[Place, ...]
 
     @property
     def indices(self) -> frozenset[str]:
-        """The loops that it moves with."""
+        """Loop indices that occur in the access."""
         return frozenset(place.index for place in self.places if place.index)
 
     def __str__(self) -> str:
@@ -133,12 +133,13 @@ class Access:
 
 @dataclass(frozen=True, slots=True)
 class IndexedMap:
-    """The momentum of a shift along a component of an array (of all of it: ``None``), or that of a turn of two.
+    """Momentum map of a translation of an array component (all components if ``None``) or of a rotation of two.
 
     Attributes:
-        array: of coordinates.
-        component, other: of its last axis.
-        phase: whether positions turn into momenta, each by the same angle: sum (q^2 + p^2)/2, the norm of a field.
+        array: name of the coordinate array.
+        component, other: indices on its last axis.
+        phase: phase rotation of positions into momenta; the conserved quantity is sum (q^2 + p^2)/2, the norm of a
+            field.
     """
 
     array: str
@@ -148,7 +149,7 @@ class IndexedMap:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Descriptive name."""
         if self.phase:
             return f"norm of {self.array}"
         if self.component is None:

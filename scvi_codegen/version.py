@@ -1,3 +1,3 @@
-"""The version of this package; files that it writes say which one wrote them."""
+"""Version of this package, written into the files it produces."""
 
 __version__ = "0.2.0.dev0"

@@ -1,1 +1,1 @@
-"""What is made of trajectories: recorded runs."""
+"""Storage of results: recorded runs."""

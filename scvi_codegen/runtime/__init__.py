@@ -1,1 +1,1 @@
-"""Stepping: the integrator, the memory of a run, trajectories, events, states between steps, ensembles."""
+"""Time stepping: integrators, runs, trajectories, events, dense output, ensembles."""

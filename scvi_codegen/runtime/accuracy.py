@@ -1,4 +1,4 @@
-"""What is said of steps that were solved and are too long for their motion, and of errors that grew on the way."""
+"""Accuracy warnings: steps too large for the motion, and energy errors at the end of a run."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ __all__ = [
 ]
 
 TOLERABLE_ERROR: Final = 1e-3
-"""Of a step, relative to the state: one that is wrong by more is too long for its motion; and of a run's energy."""
+"""Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 
 CONTROLLED: Final = ", or steps that choose their length (t_end= with a tolerance)"
 
 GROSS_ERROR: Final = 0.5
-"""Of the energy of a run by steps of one length that tell no error; it swings by less while these are short enough."""
+"""Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
 
 MOST_ASKED: Final = 1000
-"""Trajectories of an ensemble."""
+"""Largest number of trajectories of an ensemble whose energy is checked."""
 
 MAGNIFIED: Final = (
     "though each step was as accurate as wanted: the motion magnifies errors, as near collisions do; take a smaller "
@@ -56,7 +56,7 @@ _heard: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=Tr
 
 
 class Steps(Protocol):
-    """What a trajectory tells of its steps."""
+    """Step data of a trajectory."""
 
     @property
     def goal(self) -> Goal | None: ...
@@ -69,7 +69,7 @@ class Steps(Protocol):
 
 
 class EnergyAtEnds(Protocol):
-    """What a trajectory tells of its states, the first and the last among them."""
+    """States of a trajectory, including the first and the last."""
 
     @property
     def goal(self) -> Goal | None: ...
@@ -86,7 +86,7 @@ class EnergyAtEnds(Protocol):
 
 
 class StatesOfMany(Protocol):
-    """What an ensemble tells of its trajectories: times, positions, momenta, status and steps of each."""
+    """States of an ensemble; ``each`` yields times, positions, momenta, status and step count of each trajectory."""
 
     @property
     def goals(self) -> tuple[Goal, ...]: ...
@@ -99,7 +99,7 @@ class StatesOfMany(Protocol):
 
 @contextmanager
 def unwarned() -> Iterator[None]:
-    """Inside, and in functions that this decorates, long steps are made on purpose."""
+    """Suppress accuracy warnings within a ``with`` block or a decorated function that takes large steps on purpose."""
     token = _heard.set(False)
     try:
         yield
@@ -113,7 +113,7 @@ def warnings_wanted() -> bool:
 
 
 def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = CONTROLLED) -> None:
-    """An :class:`AccuracyWarning` of the worst step of a run of h, unless one ``before`` was a reason for it."""
+    """Issue an :class:`AccuracyWarning` for the worst fixed step, unless an error ``before`` already caused one."""
     error = trajectory.step_error
     controlled = trajectory.goal is not None and not trajectory.goal.tau
     if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
@@ -126,7 +126,7 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
 
 
 def warn_of_lost_energy(trajectory: EnergyAtEnds) -> None:
-    """An :class:`AccuracyWarning` where steps chose their length and the energy that is conserved is another."""
+    """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves."""
     goal, stepper = trajectory.goal, trajectory.stepper
     if goal is None or goal.tau or not stepper.interface.conserves_energy or not _heard.get():
         return
@@ -135,7 +135,7 @@ def warn_of_lost_energy(trajectory: EnergyAtEnds) -> None:
 
 
 def warn_of_lost_energies(ensemble: StatesOfMany) -> None:
-    """The same of an ensemble: of the worst of its trajectories, of which so many are asked."""
+    """Issue the warning of :func:`warn_of_lost_energy` for the worst of ``MOST_ASKED`` trajectories of an ensemble."""
     goals, stepper = ensemble.goals, ensemble.stepper
     if not goals or not stepper.interface.conserves_energy or not _heard.get():
         return
@@ -151,21 +151,21 @@ def warn_of_lost_energies(ensemble: StatesOfMany) -> None:
 def warn_of_energies(
     first: float, last: float, size: float, *, tolerable: float = TOLERABLE_ERROR, where: str = "", why: str = MAGNIFIED
 ) -> None:
-    """An :class:`AccuracyWarning` where an energy that the motion conserves is another at the end.
+    """Issue an :class:`AccuracyWarning` if a conserved energy differs between the first and the last state.
 
     Args:
-        first, last: energies.
-        size: of a part of one: that of p.v, so that an energy near zero has a size.
-        tolerable: part of the largest of the three.
-        where: which motion, in words.
-        why: what may be the cause, and what to do.
+        first, last: energies of the first and the last state.
+        size: scale of the energy terms (largest |p.v|), for energies near zero.
+        tolerable: tolerated change relative to the largest of the three.
+        where: description of the trajectory, appended to "the energy".
+        why: probable cause and remedy.
     """
     if lost_part(first, last, size) > tolerable and _heard.get():
         warn(f"the energy{where} went from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
 
 
 def lost_part(first: float, last: float, size: float) -> float:
-    """By what part of its size an energy changed; 0 of one that is not known."""
+    """Return the relative change of an energy; 0 if it is NaN."""
     part = abs(last - first) / max(abs(first), abs(last), size, sys.float_info.min)
     return part if part == part else 0.0
 
@@ -173,9 +173,9 @@ def lost_part(first: float, last: float, size: float) -> float:
 def _lost_energies(
     stepper: Integrator, t: Array, q: Array, p: Array, parameters: Array
 ) -> tuple[float, float, float] | None:
-    """Of the first and the last state the energies, and the largest p.v, if it takes that to tell whether they are one.
+    """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
 
-    Nothing beyond the domain of L. Most runs end with the energy they began with, which is known without velocities.
+    ``None`` is also returned outside the domain of L. Velocities are computed only if the energies differ.
     """
     apart = max(1, len(t) - 1)
     t, q, p = (np.ascontiguousarray(states[::apart]) for states in (t, q, p))

@@ -1,8 +1,8 @@
-"""Small changes of many motions, carried along in vector lanes: each lane has a motion and the changes beside it.
+"""Tangent vectors of many trajectories in SIMD lanes: each lane integrates a trajectory and its variational equations.
 
-Changes are coordinates of an ensemble of their own (:mod:`scvi_codegen.mechanics.changes`), whose steps are as those of
-any. After so many steps their QR factorisation is taken, in all lanes, and Q goes on; a piece of steps in which changes
-of one motion part too far is taken again, shorter.
+The variations are additional coordinates (:mod:`scvi_codegen.mechanics.changes`) of an ordinary ensemble. After each
+block of steps the tangent frame of every lane is replaced by Q of its QR factorisation. A block is repeated with half
+as many steps if its R shows that the tangent vectors became nearly parallel.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["MOTIONS", "in_lanes"]
 
 MOTIONS = 256
-"""That go along together: what is kept of their steps stays near the processor."""
+"""Number of trajectories integrated together, so that the output of a block of steps fits into the cache."""
 FIRST, MOST = 8, 32
-"""Steps of a piece."""
+"""Number of steps of the first and of the largest block."""
 
 
 def in_lanes(
@@ -38,20 +38,21 @@ def in_lanes(
     options: SolverOptions | None,
     heed: Callable[[int], None],
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Of K motions from (q, p) by steps of h at (n + 1,) times t, at every so-many-th state.
+    """Integrate K trajectories with tangent vectors from (q, p) over (steps + 1,) times t, saving some of them.
 
     Args:
-        binding: of the text with k changes.
-        changes: (2m, k) of length 1, the same for all.
-        q, p: (K, m); parameters: (K, number of them).
-        heed: called before each piece, may raise.
+        binding: library with k tangent vectors per trajectory.
+        changes: (2m, k) initial tangent vectors of length 1, common to all trajectories.
+        q, p: (K, m) initial states.
+        parameters: (K, number of parameters).
+        heed: called with the completed steps before each block; may raise to stop.
 
     Returns:
-        (5, n, K, k) what :class:`Growth` found, and (K,) whether all steps of a motion were taken.
+        (5, n, K, k) series of :class:`Growth`, and (K,) flags of the trajectories that completed all steps.
     """
     motions = _Motions(binding, q, p, parameters, changes.shape[1], t=float(t[0]), h=h, options=options)
     frame, triangle = (np.broadcast_to(part, (len(q), *part.shape)) for part in np.linalg.qr(changes))
-    with np.errstate(divide="ignore"):  # directions that depend on each other span nothing
+    with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
         growth = Growth(t[::save_every], np.log(np.abs(np.diagonal(triangle, axis1=1, axis2=2))))
     done, steps, size, most = 0, len(t) - 1, FIRST, MOST
     motions.take(frame)
@@ -81,14 +82,14 @@ def in_lanes(
 
 
 def _lengths(images: Array, triangle: Array) -> Array:
-    """(steps, K, k) of what (steps, K, 2m, k) images of the frame make of changes."""
+    """Return (steps, K, k) norms of the tangent vectors, whose images in the frame are (steps, K, 2m, k)."""
     whole = images if images.shape[-1] == 1 else images @ triangle
     lengths: Array = np.sqrt(np.einsum("skij,skij->skj", whole, whole))
     return lengths
 
 
 def _factors(images: Array) -> tuple[Array, Array]:
-    """(K, 2m, k) and (K, k, k) Q and R."""
+    """Return the QR factors, (K, 2m, k) and (K, k, k)."""
     if images.shape[-1] > 1:
         orthonormal, upper = np.linalg.qr(images)
         return np.asarray(orthonormal), np.asarray(upper)
@@ -97,7 +98,7 @@ def _factors(images: Array) -> tuple[Array, Array]:
 
 
 class _Motions:
-    """K motions with k changes each, lanes of blocks; lanes too many repeat the last one and rest."""
+    """SIMD blocks of K trajectories with k tangent vectors each; surplus lanes hold inactive copies of the last one."""
 
     def __init__(
         self,
@@ -126,26 +127,26 @@ class _Motions:
         self.lanes["active"] = (save_every < self.size).reshape(blocks, self.width)
 
     def _across(self, rows: Array) -> Array:
-        """(blocks, n, lanes) from (K, n)."""
+        """Transpose (K, n) rows to (blocks, n, lanes)."""
         across: Array = rows[self.places].reshape(len(self.lanes), self.width, rows.shape[1]).transpose(0, 2, 1)
         return across
 
     @property
     def running(self) -> NDArray[np.bool_]:
-        """(K,) of those whose steps did not fail."""
+        """(K,) flags of the trajectories without a failed step."""
         running: NDArray[np.bool_] = self.lanes["active"].ravel()[: self.size] > 0.0
         return running
 
     def save(self) -> bytes:
-        """All of it."""
+        """Return a copy of the memory of all blocks."""
         return bytes(self.binding.buffer(self.memory))
 
     def restore(self, saved: bytes) -> None:
-        """As it was."""
+        """Restore a copy returned by :meth:`save`."""
         self.binding.buffer(self.memory)[:] = saved
 
     def take(self, frame: Array) -> None:
-        """(K, 2m, k) changes to go on with; of former ones nothing is left, nor is there a guess from them."""
+        """Set (K, 2m, k) tangent vectors, clear their compensation terms and discard the predictor."""
         m = self.dimension
         for name, part in (("q", frame[:, :m]), ("p", frame[:, m:])):
             self.lanes[name][:, m:] = self._across(part.transpose(0, 2, 1).reshape(self.size, -1))
@@ -153,7 +154,7 @@ class _Motions:
         self.lanes["guess"] = 0
 
     def advance(self, steps: int) -> Array:
-        """(steps, K, 2m, k) what becomes of the changes."""
+        """Advance all trajectories and return the (steps, K, 2m, k) tangent vectors after each step."""
         advance, own = self.binding.function("advance"), self.dimension * (self.count + 1)
         q, p = np.empty((2, steps, len(self.places), own))
         row, (at_q, at_p) = len(self.places) * own, map(self.binding.pointer, (q, p))

@@ -1,7 +1,7 @@
-"""Transformed time: the part of a step that ends at a time, and states between.
+"""Time transformation dt = g dtau: partial steps that end at a time t, and dense output.
 
-A run of a system with a clock takes steps of tau, dt = rate dtau, and carries t along, summed by the method's own
-quadrature. What users give and get is in t: velocities are dq/dt and energies those of the system itself.
+A run in transformed time takes steps of tau and integrates t with the method's own quadrature. Arguments and results
+refer to t: velocities are dq/dt and energies are those of the original system.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ def part_of_step(
     parameters: Array,
     options: SolverOptions | None,
 ) -> tuple[Array, Array, float]:
-    """State at the time ``end`` inside a step of h from (q, p) at t, and at what part of the step that is.
+    """Return the state at the time ``end`` within a step of h from (q, p) at t, and the fraction of the step taken.
 
     Raises:
-        StepFailedError: if a step of a part of h fails.
+        StepFailedError: if a partial step fails.
     """
     binding = stepper.binding
     start_q, start_p, q1, p1 = (np.array(x, dtype=float) for x in (q, p, q, p))
@@ -54,7 +54,7 @@ def part_of_step(
 
 
 def states_by_clock(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
-    """(n, m) positions and momenta, and (n,) tau, at (n,) times within the states."""
+    """Return (n, m) positions and momenta, and (n,) tau, at (n,) times within the range of the saved states."""
     assert states.tau is not None
     (q, p), tau = np.empty((2, len(times), states.q.shape[1])), np.empty(len(times))
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
@@ -72,7 +72,7 @@ def states_by_clock(states: KeptStates, times: Array) -> tuple[Array, Array, Arr
 
 
 def _steps_from(states: KeptStates, kept: int) -> tuple[Array, Array, Array, float]:
-    """The states of all steps from one that was kept to the one before the next, and the length of these steps."""
+    """Return the states of all steps from a saved state up to the next one, and the size of these steps."""
     assert states.tau is not None
     t, q, p = (array[kept : kept + 1] for array in (states.t, states.q, states.p))
     h = float(np.nan_to_num(states.lengths[kept], nan=states.h))

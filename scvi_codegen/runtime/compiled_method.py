@@ -1,4 +1,4 @@
-"""A method compiled for one system: its text, loaded, and what it is called, also with events and controlled steps."""
+"""Compiled method: generated C source, its loaded libraries (plain, adaptive, with events) and its interface."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ __all__ = ["CompiledMethod", "no_text"]
 
 
 MOST_WATCHING = 16
-"""Sets of events whose integrators are kept, so that the same formulas are not parsed again in every call."""
+"""Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
 
 
 def no_text(*_: int) -> None:
-    """Of a method without a text for many trajectories, or for steps that choose their length."""
+    """Return ``None``: the default for source variants that a method does not have."""
 
 
 class CompiledMethod:
-    """One method for one system, compiled.
+    """A method compiled for one system.
 
     Attributes:
-        title: system and method, one line.
-        coordinates, parameters: names in order.
+        title: system and method, in one line.
+        coordinates, parameters: names, in order.
         defaults: (k,) default parameter values.
         dimension: degrees of freedom m.
-        momentum_map_names: what symmetries conserve.
-        source: the C text it was compiled from.
-        fallback: text with Newton's iteration, where the source has sweeps alone.
-        events: zero crossings that every run records.
+        momentum_map_names: names of the conserved quantities.
+        source: the C source it was compiled from.
+        fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
+        events: events that every run records.
     """
 
     def __init__(
@@ -88,29 +88,29 @@ class CompiledMethod:
 
     @property
     def ensemble(self) -> Source | None:
-        """The C text for many trajectories at once, derived when first asked for; ``None`` if the method has none."""
+        """C source of the ensemble variant, derived on first use; ``None`` if the method has none."""
         return self._ensemble()
 
     @property
     def fallback(self) -> Source | None:
-        """The C text that lends Newton's iteration, derived when first asked for; ``None`` if none is borrowed."""
+        """C source of the fallback library with Newton's iteration, derived on first use; ``None`` if not needed."""
         return self._fallback()
 
     @property
     def derivatives(self) -> Source | None:
-        """The C text with the derivatives of steps, derived when first asked for."""
+        """C source with the derivatives of steps, derived on first use."""
         return self._tangent()
 
     @property
     def second_derivatives(self) -> Source | None:
-        """The same with second derivatives, derived when first asked for; ``None`` where there are none."""
+        """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
         self._second = self._curvature()
         return self._second
 
     def changes(self, count: int) -> Source | None:
-        """The C text for many trajectories at once with so many small changes beside each, kept when asked for.
+        """Return the C source of ensembles with ``count`` tangent vectors per trajectory, derived on first use.
 
-        ``None`` where changes are carried along by the derivatives of steps alone.
+        ``None`` if tangent vectors can only be propagated by the derivatives of steps.
         """
         if count not in self._with_changes:
             self._with_changes[count] = self._changes(count)
@@ -125,10 +125,9 @@ class CompiledMethod:
         ensemble: bool = False,
         events: EventLike | Sequence[EventLike] | None = None,
     ) -> None:
-        """Compile now what later calls would compile when they first need it: a run then never waits for a compiler.
+        """Compile the variants that later calls would compile on first use, so that a run never waits for the compiler.
 
-        Newton's iteration behind fixed-point iterations is always compiled, where the method has it. What the method
-        lacks is skipped.
+        The Newton fallback of a fixed-point iteration is always compiled. Variants that the method lacks are skipped.
 
         Args:
             adaptive: the variant with adaptive step size, for ``t_end=``.
@@ -148,14 +147,14 @@ class CompiledMethod:
 
     @property
     def tangent(self) -> Binding:
-        """The library with derivatives of steps, compiled when first asked for."""
+        """Library with derivatives of steps, compiled on first use."""
         if self._with_tangent is None:
             self._with_tangent = self._linearised(self.derivatives, "derivatives")
         return self._with_tangent
 
     @property
     def curvature(self) -> Binding:
-        """The library with second derivatives, too; MethodError where there are none."""
+        """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
         if self._with_curvature is None:
             self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
         return self._with_curvature
@@ -185,7 +184,7 @@ class CompiledMethod:
 
     @property
     def title(self) -> str:
-        """System and method, one line."""
+        """System and method, in one line."""
         return self.interface.title
 
     @property
@@ -215,7 +214,7 @@ class CompiledMethod:
 
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
-        """What symmetries of the system conserve: ``"angular momentum"``, ``"boost of x"``."""
+        """Names of the conserved quantities of the system: ``"angular momentum"``, ``"boost of x"``."""
         return self.interface.map_names
 
     @property
@@ -224,7 +223,7 @@ class CompiledMethod:
         return self.interface.dimension
 
     def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
-        """The same integrator, whose runs record these events in place of its own."""
+        """Return the integrator with these events in place of its own."""
         wanted = as_events(events)
         if wanted == self.events:
             return self
@@ -249,7 +248,7 @@ class CompiledMethod:
         )
 
     def controlled(self) -> Self:
-        """The same integrator with steps that choose their length, loaded once; MethodError where it has none."""
+        """Return the integrator with adaptive steps, loaded once; raise ``MethodError`` if the method has none."""
         if self._with_control is None:
             self._with_control = self._loaded_with_control()
         return self._with_control

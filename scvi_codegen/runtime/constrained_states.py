@@ -1,4 +1,4 @@
-"""What an integrator says of states that constraints hold, as users ask for it."""
+"""Public methods for constrained states: projection, multipliers and constraint values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ConstrainedStates"]
 
 
 class ConstrainedStates(Integrator):
-    """:class:`Integrator` with states that meet constraints, how far others are off them, and multipliers."""
+    """:class:`Integrator` with projection onto the constraints, constraint values and Lagrange multipliers."""
 
     def project(
         self,
@@ -24,11 +24,13 @@ class ConstrainedStates(Integrator):
         t: float = 0.0,
         parameters: Parameters = None,
     ) -> tuple[Array, Array]:
-        """The nearest state (q, p) that meets the constraints, in the metric of the masses; at rest without p.
+        """Return the nearest state (q, p) on the constraint manifold, in the metric of the mass matrix.
+
+        Without p and velocity the initial velocity is 0.
 
         Raises:
-            MethodError: for a system without constraints.
-            StateError: if none is found, or constraints depend on each other there.
+            MethodError: if the system has no constraints.
+            StateError: if the iteration fails, or if the constraints are linearly dependent there.
         """
         momenta = self.momenta_given(
             q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
@@ -37,10 +39,10 @@ class ConstrainedStates(Integrator):
         return q1, p1
 
     def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """The lambda with which G^T lambda are the forces that keep a state on its constraints: (c,), or (n, c).
+        """Return the Lagrange multipliers lambda of the constraint forces G^T lambda at states: (c,), or (n, c).
 
-        d/dt L_v = L_q + f + G^T lambda, where G = g_q, or g_v of a constraint of velocities: of ``x**2 + y**2 = l**2``
-        the tension of the rod is -2 l lambda. It is what the state itself says, as exact as the state.
+        They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
+        l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
         """
         found = multipliers(self, q, p, t, parameters)
         return found[0] if np.ndim(q) == 1 else found
@@ -48,9 +50,9 @@ class ConstrainedStates(Integrator):
     def constraint_values(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
     ) -> tuple[Array, Array]:
-        """How far states are off: g, and its rate g_q v + g_t; (c,) each, or (n, c).
+        """Return the constraint residuals g and their rates g_q v + g_t: (c,) each, or (n, c).
 
-        A constraint of velocities is a rate alone: 0 stands where it says nothing of positions.
+        For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
         """
         g, rate = constraint_values(self, q, p, t, parameters)
         return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)

@@ -1,8 +1,8 @@
-"""Rank of the Jacobian G of constraints at a state: which constraints depend on each other, and which contradict.
+"""Rank of the constraint Jacobian G at a state: detect linearly dependent and contradictory constraints.
 
-G is read off the rates G v + g_t, which are linear in the velocities, by unit velocities. Constraints that follow from
-others only where these hold (``(u - 1)**2 + y**2 = 1`` from ``x**2 + y**2 = 1`` and ``u = x + 1``) lose rank on the
-constraint manifold alone, where no generic point shows it.
+G is computed from the rates G v + g_t, which are linear in v, at unit velocities. A constraint implied by others only
+on the constraint manifold (``(u - 1)**2 + y**2 = 1`` by ``x**2 + y**2 = 1`` and ``u = x + 1``) reduces the rank there
+but not at generic points.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["Linearised", "dependence", "refusal"]
 
 DEPENDENT = 1e-9
-"""Least singular value of G with rows of length 1: rows that depend on each other but for rounding."""
+"""Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
 TAKES_PART = 1e-6
-"""Of the largest entry of a null vector."""
+"""Entries of a null vector above this fraction of 1 mark the constraints that are dependent."""
 CONTRADICTED = 1e-7
-"""Of the size of the positions: how far constraints are off at the nearest state if no state meets them."""
+"""Residual at the nearest state, relative to the size of q, above which constraints count as contradictory."""
 ITERATIONS = 30
 
 Linearised: TypeAlias = Callable[[Array], tuple[Array, Array]]
@@ -42,10 +42,10 @@ def refusal(names: Sequence[str], q: Array, at: Linearised, *, nearest: bool = F
     """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
 
     Args:
-        names: of the constraints.
+        names: formulas of the constraints.
         q: (m,) positions.
-        at: g and G there.
-        nearest: first go to the positions that are least off the constraints (Gauss and Newton).
+        at: function that returns g and G at positions.
+        nearest: first minimise the constraint residual by Gauss-Newton iteration.
     """
     for _ in range(ITERATIONS if nearest else 0):
         g, jacobian = at(q)

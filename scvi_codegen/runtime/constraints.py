@@ -1,4 +1,4 @@
-"""States on the constraints g(q, t) = 0 of a system: how far they are off, the nearest that is on, what holds them."""
+"""States on the constraints g(q, t) = 0 of a system: residuals, projection, multipliers, initial consistency."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_SHOWN = 4
 
 
 def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
-    """(2, n, c): g, and g_q v + g_t, of states."""
+    """Return (2, n, c) values of g and of its rate g_q v + g_t at states."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((2, len(times), len(stepper.constraints)))
     _call(stepper, "constraint_values", times, positions, momenta, parameters, *values)
@@ -37,7 +37,7 @@ def constraint_values(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayL
 
 
 def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, parameters: Parameters) -> Array:
-    """(n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states; forces in t, also where time is transformed."""
+    """Return (n, c) lambda of d/dt L_v = L_q + f + g_q^T lambda at states, in physical time t."""
     times, positions, momenta = _of_constrained(stepper, q, p, t)
     values = np.empty((len(times), len(stepper.constraints)))
     _call(stepper, "multipliers", times, positions, momenta, parameters, values)
@@ -49,12 +49,12 @@ def multipliers(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike, p
 def projected(
     stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters
 ) -> tuple[Array, Array, Array]:
-    """The nearest state on the constraints, and (2,) how far it is, in parts of q and of p.
+    """Return the nearest state on the constraints, and (2,) its relative distance in q and in p.
 
-    Both in the metric of the masses, at the nearest state: whatever the units of coordinates.
+    Distances are in the metric of the mass matrix at the projected state, hence independent of coordinate units.
 
     Raises:
-        StateError: if none is found, or constraints depend on each other there.
+        StateError: if the iteration fails, or if the constraints are linearly dependent there.
     """
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     _of_constrained(stepper, q0, p0, t)
@@ -77,11 +77,11 @@ def projected(
 def consistent(
     stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: Parameters, *, check_rank: bool = True
 ) -> tuple[Array, Array]:
-    """An initial state put on the constraints: silently by what rounding and typing explain, else with a warning.
+    """Return an initial state projected onto the constraints; warn unless rounding explains the distance.
 
     Raises:
-        StateError: if it is far off, if constraints depend on each other there (``check_rank``), and where an input
-            that constraints name is not given.
+        StateError: if the state is far from the constraints, if these are linearly dependent there
+            (``check_rank``), or if an input that occurs in a constraint is not set.
     """
     for name in inputs_not_given(stepper.interface, parameters):
         if any(re.search(rf"\b{name}\b", formula) for formula in stepper.constraints):
@@ -103,12 +103,12 @@ def consistent(
 
 
 def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parameters) -> str:
-    """The constraint that a state is farthest off, and the rate; one of them where the other is 0 but for rounding."""
+    """Describe the largest residual of the constraints and of their rates, omitting one that is 0 up to rounding."""
     values = constraint_values(stepper, q, p, t, parameters)[:, 0]
     worst = np.abs(values).argmax(axis=1)
     largest = values[np.arange(2), worst]
     names = [stepper.constraints[k] for k in worst]
-    if not any(f"{q}_dot" in names[1] for q in stepper.coordinates):  # else it is of velocities, and a rate itself
+    if not any(f"{q}_dot" in names[1] for q in stepper.coordinates):  # a velocity constraint is a rate itself
         names[1] = f"the rate of {names[1]}"
     told = [
         f"{name} is {value:.3g}"
@@ -119,9 +119,9 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
 
 
 def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
-    """Raise :class:`StateError` where a run at (q, p) is to go on with parameters that put its constraints elsewhere.
+    """Raise :class:`StateError` if new parameters move the position constraints away from the state (q, p) of a run.
 
-    Rates may jump: momenta then do, by an impulse along the slopes of the constraints. Positions cannot.
+    Rates may jump: an impulse along the constraint gradients then changes the momenta. Positions cannot jump.
     """
     moved = projected(stepper, q, p, t, parameters)[2][0]
     if moved > TYPED:
@@ -152,7 +152,7 @@ def _call(
 
 
 def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Linearised:
-    """G by unit velocities, which constraints of velocities have, too; no numbers where velocities give no momenta."""
+    """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
     unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
 
     def at(q: Array) -> tuple[Array, Array]:

@@ -1,16 +1,15 @@
-"""States between steps: a step of a part of h from the kept state before, by the method itself.
+"""Dense output: the state at any time, by a partial step of the method from the saved state before it.
 
-Such a state is as accurate as the method, for every method and solver. It depends continuously on time, is the state
-kept at both ends of a step, and needs nothing that a run would have to store. A polynomial through what a step leaves
-behind costs less to evaluate, but is of order 4 (states and velocities at both ends), or of about half the order of the
-method (the curve of its stages). Measured on one revolution of Kepler's problem, e = 0.5, largest errors of the
-positions at 2001 times:
+Dense output has the accuracy of the method, for every method and solver. It is continuous in time, equals the saved
+states at both ends of a step, and needs no additional storage. Interpolating polynomials are cheaper to evaluate but of
+order 4 (Hermite cubics through states and velocities) or of about half the order of the method (the stage polynomial).
+Measured over one revolution of the Kepler problem, e = 0.5, largest position errors at 2001 times:
 
-    method, steps    states kept    between them    cubics through positions and velocities
-    SVI(4), 40       7.0e-8         7.0e-8          9.7e-5
-    SVI(8), 20       4.2e-11        4.2e-11         1.3e-3
+    method, steps    saved states    dense output    cubics through positions and velocities
+    SVI(4), 40       7.0e-8          7.0e-8          9.7e-5
+    SVI(8), 20       4.2e-11         4.2e-11         1.3e-3
 
-A state takes 0.65 microseconds there, four times as long as a step of the run, whose first guess is better.
+One state takes 0.65 microseconds there, four times as long as a step of the run, whose predictor is better.
 """
 
 from __future__ import annotations
@@ -46,18 +45,18 @@ ON_GRID = 1e-6
 
 
 def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
-    """(n, m) positions and momenta at (n,) times within the states, in any order.
+    """Return (n, m) positions and momenta at (n,) times within the range of the saved states, in any order.
 
     Raises:
-        StateError: for times outside, or if the states kept do not stand at whole steps (those of ``t_eval``).
-        StepFailedError: if a step of a part of h fails.
+        StateError: if a time is outside the range, or if the saved states are not at whole steps (those of ``t_eval``).
+        StepFailedError: if a partial step fails.
     """
     q, p, _ = states_and_steps_at(states, times)
     return q, p
 
 
 def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
-    """The same, and (n,) what steps are made of, tau or t."""
+    """Return the states of :func:`states_at` and (n,) values of the independent variable of the steps, tau or t."""
     times = within(times, states.t[0], states.t[-1])
     if states.tau is not None:
         _check_on_grid(states)
@@ -75,7 +74,7 @@ def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array,
 
 
 def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal: Goal) -> tuple[Array, Array]:
-    """By steps that choose their length, from the state kept before each time."""
+    """Integrate with adaptive steps from the saved state before each time to that time."""
     q, p = states.q[left], states.p[left]
     for k in np.flatnonzero(times != states.t[left]):
         memory = Memory.started(
@@ -93,7 +92,7 @@ def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal:
 
 
 def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]:
-    """Steps of h that fit into spans; one that only rounding makes too long fits, or a part of it, the slack."""
+    """Return the number of steps h that fit into spans, tolerating rounding and an excess of ``slack`` steps."""
     ratio = spans / h
     nearest = np.rint(ratio)
     fits = np.abs(ratio - nearest) <= slack + ROUNDINGS * np.finfo(float).eps * np.maximum(1.0, nearest)
@@ -109,7 +108,7 @@ def _takewhole_steps(
     q: Array,
     p: Array,
 ) -> None:
-    """Where several steps lie between kept states: one run from each of these, stopped at what is asked for."""
+    """Advance in place by whole steps: one run from each saved state, stopped at every requested step number."""
     kept, run = -1, None
     for k in order:
         if run is None or left[k] != kept:
@@ -128,7 +127,7 @@ def _takewhole_steps(
 
 
 def _take_parts(states: KeptStates, t: Array, h: Array, q: Array, p: Array) -> None:
-    """From each state at t a step of its own h, in place."""
+    """Take one step of size h[k] from each state k, in place."""
     binding, m = states.stepper.binding, states.stepper.dimension
     step, report, workspace = binding.function("step"), binding.new("report *"), binding.workspace()
     parameters, options = binding.pointer(states.parameters), binding.options(states.options)
@@ -142,7 +141,7 @@ def _take_parts(states: KeptStates, t: Array, h: Array, q: Array, p: Array) -> N
 
 
 def checked_times(t: ArrayLike, name: str) -> Array:
-    """Finite times, any shape; a copy."""
+    """Return a copy of finite times of any shape."""
     times = real_array(t, name)
     if not np.isfinite(times).all():
         checked_number(float(times[~np.isfinite(times)][0]), f"a number in {name}")
@@ -150,7 +149,7 @@ def checked_times(t: ArrayLike, name: str) -> Array:
 
 
 def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
-    """(n,) times within a run, sorted as it goes."""
+    """Return (n,) times within a run, sorted in its direction."""
     times = checked_times(t_eval, "t_eval")
     if times.ndim != 1:
         raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
@@ -162,7 +161,7 @@ def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
 
 
 def within(times: Array, first: float, last: float) -> Array:
-    """The times, those beyond an end by no more than rounding at it."""
+    """Return the times, clipped to the range of a run; times outside by more than rounding raise ``StateError``."""
     low, high = min(first, last), max(first, last)
     slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
     outside = times[(times < low - slack) | (times > high + slack)]
@@ -172,14 +171,14 @@ def within(times: Array, first: float, last: float) -> Array:
 
 
 def grid_tolerance(states: KeptStates) -> Array:
-    """(n,) by how much a state may seem to be off the end of a step: times are rounded."""
+    """Return (n,) distances within which a time counts as the end of a step: times are rounded."""
     rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped).max()
     tolerance: Array = np.fmax(ON_GRID * np.abs(states.lengths), rounding)
     return tolerance
 
 
 def lengths_at(states: KeptStates, times: Array) -> Array:
-    """(n,) of the steps that follow at times, not numbers where these are between two steps."""
+    """Return (n,) sizes of the steps that begin at the given times; NaN at times between two steps."""
     before = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     after = np.minimum(before + 1, len(states) - 1)
     nearest = np.where(np.abs(states.t[after] - times) < np.abs(times - states.t[before]), after, before)
@@ -188,7 +187,7 @@ def lengths_at(states: KeptStates, times: Array) -> Array:
 
 
 def _check_on_grid(states: KeptStates) -> None:
-    """All states but the last, which an event may have ended, stand at whole steps from the first."""
+    """Raise ``StateError`` unless all states but the last (an event may end it) are at whole steps from the first."""
     if np.isnan(states.lengths[:-1]).any():
         raise StateError(
             "the states of this trajectory do not stand at whole steps (it was made with t_eval): "

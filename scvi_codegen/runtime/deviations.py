@@ -1,8 +1,8 @@
-"""What becomes of small changes of the initial state, and the indicators of chaos that are told from it.
+"""Growth of tangent vectors along a trajectory, and chaos indicators: Lyapunov exponents, MEGNO, FLI, SALI, GALI.
 
-Changes v_1, .., v_k are carried along by the exact derivatives of the steps. What all indicators need are the
-logarithms of their lengths and, of their QR factorisation, those of the diagonal of R: both stay known to round-off
-when the changes themselves have long become parallel, or too large for numbers.
+Tangent vectors v_1, .., v_k are propagated by the exact derivatives of the steps. All indicators follow from the
+logarithms of their norms and of the diagonal of R in their QR factorisation, which remain accurate to round-off when
+the vectors themselves have become parallel or would overflow.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ __all__ = ["Deviations"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Deviations:
-    """Of k changes of the initial state along a motion, at n kept states; of an ensemble with an axis (.., K, ..) more.
+    """Chaos indicators of k tangent vectors at n saved states; for an ensemble of K trajectories of shape (n, K, k).
 
-    Lengths are those of (q, p) as a vector of 2m numbers: in units in which these are of a size they mean most.
+    Norms are Euclidean norms of the 2m entries of (q, p); use units in which these are of comparable size.
 
     Attributes:
         t: (n,) times.
-        lengths: (n, k) logarithms of the lengths of the changes, of length 1 at first.
-        greatest: (n, k) the greatest that these had after any step until then.
-        stretches: (n, k) logarithms of the diagonal of R: the first i are that of the volume of i changes, summed.
-        rates: (n, k) 2/T times the integral of T d(lengths), T the time passed: MEGNO before it is averaged.
-        mean_rates: (n, k) the averages of these over the time passed.
-        status: (K,) of an ensemble, ``"ok"``, or why a motion ended: not numbers from there on; else ``None``.
+        lengths: (n, k) logarithms of the norms of the tangent vectors, which are 1 at the start.
+        greatest: (n, k) maxima of these logarithms over all steps so far.
+        stretches: (n, k) logarithms of the diagonal of R: the first i sum to the log volume of i tangent vectors.
+        rates: (n, k) 2/T times the integral of T d(lengths), T the elapsed time: MEGNO before averaging.
+        mean_rates: (n, k) time averages of ``rates``.
+        status: (K,) for an ensemble, ``"ok"`` or the reason of a failure, after which values are NaN; else ``None``.
     """
 
     t: Array
@@ -46,38 +46,38 @@ class Deviations:
 
     @classmethod
     def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> Deviations:
-        """From (n,) times and (5, n, .., k) :data:`~scvi_codegen.runtime.growth.SERIES`."""
+        """Construct from (n,) times and (5, n, .., k) values of :data:`~scvi_codegen.runtime.growth.SERIES`."""
         return cls(t=t, status=status, **dict(zip(SERIES, found, strict=True)))
 
     def lyapunov_exponents(self) -> Array:
-        """(n, k) the k largest exponents of the time until each state, descending; not numbers at the first.
+        """Return (n, k) the k largest Lyapunov exponents up to each state, descending; NaN at the first state.
 
-        By QR: Benettin et al., Meccanica 15 (1980) 9.
+        QR method of Benettin et al., Meccanica 15 (1980) 9.
         """
         time = np.abs(self.t - self.t[0]).reshape(-1, *[1] * (self.stretches.ndim - 1))
         exponents: Array = -np.sort(-self.stretches / np.where(time > 0.0, time, np.nan), axis=-1)
         return exponents
 
     def megno(self) -> Array:
-        """(n,) the mean exponential growth of nearby orbits of the first change, averaged over the time passed.
+        """Return (n,) MEGNO, the time-averaged mean exponential growth of nearby orbits, of the first tangent vector.
 
-        It tends to 2 for regular motions (below it next to stable periodic ones), lambda t / 2 for chaotic ones:
+        It tends to 2 for regular motion (to less near stable periodic orbits) and to lambda t / 2 for chaotic motion:
         Cincotta & Simo, Astron. Astrophys. Suppl. 147 (2000) 205.
         """
         mean: Array = self.mean_rates[..., 0]
         return mean
 
     def fli(self) -> Array:
-        """(n,) the fast Lyapunov indicator: the logarithm of the greatest length of any change until then.
+        """Return (n,) the fast Lyapunov indicator: the logarithm of the largest norm of any tangent vector so far.
 
-        It grows as log t for regular motions, as lambda t for chaotic ones: Froeschle, Lega & Gonczi, Celest. Mech.
+        It grows as log t for regular motion and as lambda t for chaotic motion: Froeschle, Lega & Gonczi, Celest. Mech.
         Dyn. Astron. 67 (1997) 41; Froeschle & Lega, ibid. 78 (2000) 167.
         """
         greatest: Array = self.greatest.max(axis=-1)
         return greatest
 
     def log_gali(self, k: int = 2) -> Array:
-        """(n,) natural logarithms of :meth:`gali`, also where that is smaller than all numbers."""
+        """Return (n,) natural logarithms of :meth:`gali`, also where GALI underflows."""
         most = self.lengths.shape[-1]
         if checked_count(k, "k", least=1) > most:
             raise StateError(f"there are {most} changes here, and no generalized alignment index of {k}")
@@ -85,16 +85,17 @@ class Deviations:
         return volume
 
     def gali(self, k: int = 2) -> Array:
-        """(n,) the generalized alignment index: the volume that the first k changes span, each of length 1.
+        """Return (n,) the generalised alignment index: the volume spanned by the first k tangent vectors, normalised.
 
-        exp(-(sum over i = 2..k of lambda_1 - lambda_i) t) for chaotic motions; for regular ones on tori of dimension m
-        about constant for k <= m, and t^(-2(k - m)) for k > m: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30.
+        It decays as exp(-(sum over i = 2..k of lambda_1 - lambda_i) t) for chaotic motion; on regular tori of dimension
+        m it is about constant for k <= m and decays as t^(-2(k - m)) for k > m: Skokos, Bountis & Antonopoulos, Physica
+        D 231 (2007) 30.
         """
         volume: Array = np.exp(self.log_gali(k))
         return volume
 
     def sali(self) -> Array:
-        """(n,) the smaller alignment index, the lesser length of u + v and u - v, the first two changes of length 1.
+        """Return (n,) the smaller alignment index min(|u + v|, |u - v|) of the first two normalised tangent vectors.
 
         Skokos, J. Phys. A 34 (2001) 10029.
         """

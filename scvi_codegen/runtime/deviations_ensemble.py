@@ -1,8 +1,8 @@
-"""Indicators of chaos over many initial states: small changes carried along each motion, over threads.
+"""Chaos indicators of many initial states: tangent vectors propagated along each trajectory, in parallel threads.
 
-Where a text has changes beside the motions these go in vector lanes; else, and where a step in lanes fails, states and
-derivatives of each are told by the same steps in C, from piece to piece. Of a motion nothing is kept but what the
-indicators need, so that a million initial states are a question of time, not of memory.
+If the ensemble source supports variational equations they run in SIMD lanes. Otherwise, and where a SIMD step fails,
+states and derivatives are computed trajectory by trajectory in C, chunk by chunk. Only the indicator series are stored,
+so memory does not limit the number of initial states.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from scvi_codegen.runtime.workers import Heed, run_each
 __all__ = ["DeviationsEnsemble"]
 
 ASKED: Final = 64
-"""Motions, of which one is asked for the error of its steps."""
+"""Stride of the trajectories whose step error is estimated."""
 
 
 class DeviationsEnsemble:
-    """Changes of many initial states, to be carried along; arguments as of ``deviations_ensemble``."""
+    """Computation of the chaos indicators of many initial states; arguments as of ``deviations_ensemble``."""
 
     def __init__(
         self,
@@ -74,10 +74,9 @@ class DeviationsEnsemble:
         self.found = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> Deviations:
-        """Follow all motions; ``progress`` is called with the number of those done, and may raise to stop them.
+        """Compute the indicators; ``progress`` is called with the number of finished trajectories and may raise.
 
-        In lanes, where the changes of a motion can stand beside it; else, and where steps in lanes failed, each by the
-        derivatives of its own.
+        Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
         """
         told, left = progress or _silence, np.arange(len(self.q))
         if (binding := self._lanes()) is not None:
@@ -95,7 +94,7 @@ class DeviationsEnsemble:
         return Deviations.of(self.t[:: self.save_every], self.found, self.status)
 
     def _warn_of_long_steps(self) -> None:
-        """Of one motion in so many, which is run once more by itself: steps in lanes tell no error."""
+        """Warn of too large steps: rerun every ``ASKED``-th trajectory singly, as SIMD steps estimate no error."""
         steps, runs = len(self.t) - 1, {}
         for j in range(0, len(self.q), ASKED):
             start = self.q[j], self.p[j]
@@ -109,14 +108,14 @@ class DeviationsEnsemble:
             warn_of_long_steps(runs[worst], remedy=f" (motion {worst} of {len(self.q)})")
 
     def _lanes(self) -> Binding | None:
-        """The compiled text with changes beside the motions, if there is one."""
+        """Return the compiled ensemble library with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints:
             return None
         source = self.stepper.changes(self.found.shape[-1])
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     def _all_in_lanes(self, binding: Binding, told: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
-        """Follow all motions, so many at a time; the numbers of those whose steps failed."""
+        """Process all trajectories in SIMD lanes, ``MOTIONS`` at a time; return the indices of those that failed."""
         count, changes = len(self.q), self._first(0)
         done = np.zeros(count, dtype=bool)
 
@@ -139,14 +138,14 @@ class DeviationsEnsemble:
         return np.flatnonzero(~done)
 
     def _width(self) -> int:
-        """How many changes there are: of the first motion that has a step, where constraints leave fewer than 2m."""
+        """Return the number of tangent vectors of the first trajectory that can be started (constraints reduce it)."""
         for j in range(len(self.q)):
             with suppress(StepFailedError):
                 return int(self._first(j).shape[1])
         return self.changes.count or 2 * self.stepper.dimension
 
     def _first(self, j: int) -> Array:
-        """(2m, k) the changes that motion j begins with."""
+        """Return the (2m, k) initial tangent vectors of trajectory j."""
         start = self.q[j], self.p[j], self.h, float(self.t[0])
         return self.changes.at(*start, self.parameters[j], self.options)
 

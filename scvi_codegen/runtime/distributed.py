@@ -1,7 +1,7 @@
-"""Ensembles past one machine: blocks of trajectories over a ``dask.distributed`` cluster (extra ``distributed``).
+"""Ensembles on a cluster: blocks of trajectories distributed by ``dask.distributed`` (extra ``distributed``).
 
-A stepper travels as source text; each worker compiles it once and keeps it in its cache. Blocks know nothing of each
-other, so a worker that dies costs no more than the blocks it had, which others do again.
+A stepper is sent as C source; each worker compiles it once and caches the library. Blocks are independent, so the
+blocks of a lost worker are simply computed again by others.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 __all__ = ["integrate_ensemble"]
 
 ARRAYS = ("t", "times", "q", "p", "status", "steps")
-"""Of a result, that travel."""
+"""Attributes of a result that workers send back."""
 
 LANES = 8
 BLOCKS_A_THREAD = 4
-"""More than one, so that fast workers help slow ones out and a lost one loses little."""
+"""Blocks per worker thread; several balance the load and limit the loss when a worker dies."""
 WORKER_SECONDS = 60
-"""How long to wait for the first worker of a cluster."""
+"""Time to wait for the first worker of a cluster, in seconds."""
 
 
 def integrate_ensemble(
@@ -58,24 +58,24 @@ def integrate_ensemble(
     address: str | None = None,
     blocks: int | None = None,
 ) -> EnsembleTrajectory:
-    """``stepper.integrate_ensemble`` over a cluster; the same bits on the same kind of processors.
+    """Run ``stepper.integrate_ensemble`` on a cluster; results are bitwise equal on equal processors.
 
     Args:
-        stepper: compiled here; its source is compiled again by each worker, which needs this package and a C compiler.
+        stepper: the stepper; each worker compiles its source again and needs this package and a C compiler.
         q, p: (k, m) initial positions and momenta.
-        velocity: (k, m) initial velocities, in place of p.
+        velocity: (k, m) initial velocities, instead of p.
         h, steps, t_end, tolerance, save_every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
-        inputs: then as ``stepper.drive_ensemble``; without ``t_eval``.
-        progress: called now and then with the number of trajectories done.
-        address: of a scheduler, as in ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
-        blocks: number of parts that the trajectories are divided into, by default four for each thread of the cluster.
+        inputs: as of ``stepper.drive_ensemble``; not combined with ``t_eval``.
+        progress: called with the number of completed trajectories.
+        address: address of a scheduler, ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
+        blocks: number of blocks of trajectories, by default four for each thread of the cluster.
 
     Returns:
-        An :class:`EnsembleTrajectory`, also if workers were lost on the way.
+        An :class:`EnsembleTrajectory`, also if workers were lost during the computation.
 
     Raises:
         ImportError: if dask.distributed is not installed.
-        StateError: on wrong shapes, names or numbers, before anything is sent.
+        StateError: if a shape, name or number is invalid; raised before anything is sent.
         BuildError: if a worker cannot compile the source.
     """
     start: dict[str, Any] = {
@@ -102,7 +102,7 @@ def integrate_ensemble(
 
 @contextmanager
 def _client(address: str | None) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a cluster of its own."""
+    """Connect to the scheduler at an address, or to a local cluster of threads."""
     try:
         import distributed
     except ImportError as error:
@@ -122,7 +122,7 @@ def _client(address: str | None) -> Iterator[Any]:
 
 
 def _slices(count: int, blocks: int) -> Iterator[slice]:
-    """About so many parts, of full vector registers."""
+    """Divide ``count`` trajectories into about ``blocks`` slices, multiples of the SIMD width in size."""
     size = -(-count // (blocks * LANES)) * LANES
     for first in range(0, count, size):
         yield slice(first, min(first + size, count))
@@ -131,7 +131,7 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
 def _gather(
     client: Any, work: Ensemble | EnsembleToEnds, parts: list[slice], progress: Callable[[int], None] | None
 ) -> None:
-    """Send the parts out and put what comes back into its place."""
+    """Submit the slices and store their results."""
     from distributed import as_completed
 
     pickled = pickle.dumps(work.stepper)
@@ -152,13 +152,13 @@ def _gather(
 
 
 def _integrate(pickled: bytes, call: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
-    """The arrays of one part, by one thread of a worker."""
+    """Integrate one slice on a single worker thread and return its arrays."""
     result = getattr(_stepper(pickled), call)(threads=1, **arguments)
     return tuple(getattr(result, name) for name in ARRAYS)
 
 
 @lru_cache(maxsize=16)
 def _stepper(pickled: bytes) -> Stepper:
-    """The stepper, compiled or from the cache of this worker."""
+    """Unpickle the stepper, compiled or loaded from the cache of this worker."""
     stepper: Stepper = pickle.loads(pickled)
     return stepper

@@ -1,6 +1,6 @@
-"""Runs whose inputs are data: from breakpoint to breakpoint, the parameters of each input those of its piece.
+"""Runs with inputs: integrate from breakpoint to breakpoint of piecewise cubic functions of time.
 
-Steps end at breakpoints; the compensated sums go on across them. See :mod:`scvi_codegen.formulas.inputs`.
+Steps end at breakpoints; compensated sums continue across them. See :mod:`scvi_codegen.formulas.inputs`.
 """
 
 from __future__ import annotations
@@ -49,24 +49,24 @@ __all__ = [
 POWERS = 4
 ALL = slice(None)
 NEGLIGIBLE_STEP = 1e-9
-"""Of a step: what is left before a breakpoint that is not worth one."""
+"""Fraction of a step below which the remainder before a breakpoint is skipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """A piecewise cubic of time.
+    """Piecewise cubic function of time.
 
     Attributes:
         breakpoints: (n + 1,) ascending times.
-        pieces: (n, 5) parameters from each to the next: coefficients of powers of the time since it, ascending, and
-            itself; (n, k, 5) of k trajectories.
+        pieces: (n, 5) C parameters of each piece: ascending coefficients in powers of the time since its breakpoint,
+            and that breakpoint; (n, k, 5) for k trajectories.
     """
 
     breakpoints: Array
     pieces: Array
 
     def parameters(self, t: float, part: slice = ALL) -> Array:
-        """(5,) for the piece in which t lies, or those of a part of the trajectories."""
+        """Return the (5,) parameters of the piece that contains t, or (k, 5) for the trajectories ``part``."""
         piece = int(self.breakpoints.searchsorted(t, side="right")) - 1
         found: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
         return found[part] if found.ndim == 2 else found
@@ -75,12 +75,12 @@ class Input:
 def checked_inputs(
     interface: TakesInputs, given: Mapping[str, Any] | None, trajectories: int | None = None
 ) -> dict[str, Input]:
-    """Inputs as users give them: (t, values), (t, values, kind), or a piecewise polynomial of SciPy's.
+    """Return validated inputs: (t, values), (t, values, kind) or a piecewise polynomial of SciPy for each name.
 
-    With a number of trajectories each may have values of its own, a row each.
+    With a number of trajectories, values may have one row for each trajectory.
 
     Raises:
-        StateError: for names that are no inputs, inputs that are not given, and data that make no function of time.
+        StateError: if a name is no input, an input is missing, or data define no function of time.
     """
     names, given = interface.inputs, dict(given or {})
     if interface.energy_parameter:
@@ -94,7 +94,7 @@ def checked_inputs(
 
 
 def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
-    """One of them; raises as :func:`checked_inputs`."""
+    """Return one validated input; raises as :func:`checked_inputs`."""
     if isinstance(given, Input):
         return given
     if callable(given) and not hasattr(given, "c"):
@@ -122,7 +122,7 @@ def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
 
 
 def _powers(name: str, given: Any) -> tuple[Array, Array]:
-    """Breakpoints and coefficients, ascending, of a piecewise polynomial of SciPy's; pieces of no length left out."""
+    """Return breakpoints and ascending coefficients of a SciPy piecewise polynomial, without pieces of zero length."""
     from scipy.interpolate import PPoly  # here: slow to import
 
     if not isinstance(given, PPoly):
@@ -172,7 +172,7 @@ def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: 
 
 
 def part_of_inputs(inputs: Mapping[str, Input], part: slice) -> dict[str, Input]:
-    """Those of a part of the trajectories of an ensemble."""
+    """Return the inputs of a slice of the trajectories of an ensemble."""
     return {
         name: replace(data, pieces=data.pieces[:, part]) if data.pieces.ndim == 3 else data
         for name, data in inputs.items()
@@ -188,15 +188,15 @@ def drive(
     values: Callable[[float], Array],
     progress: Callable[[int], None] | None,
 ) -> DrivenTrajectory:
-    """The run to t_end, piece by piece.
+    """Integrate to t_end, piece by piece.
 
     Args:
-        run: at its start, with a goal where steps choose their length.
-        inputs: by name.
-        t_end: the time to reach.
-        save_every: steps between kept states; those at breakpoints are kept, too.
-        values: the parameters of the piece in which a time lies.
-        progress: called with the steps done.
+        run: the run at its start; its ``goal`` is set for adaptive steps.
+        inputs: inputs by name.
+        t_end: final time.
+        save_every: steps between saved states; states at breakpoints are saved as well.
+        values: function that returns the parameters of the piece containing a time.
+        progress: called with the number of completed steps.
     """
     pieces: list[Trajectory] = []
     first, run._crossed = run.steps, (0,) * len(run.stepper.events)
@@ -217,10 +217,10 @@ def drive(
 def stretches(
     run: Driven, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
 ) -> Iterator[int | None]:
-    """Has the run ready for each stretch without a breakpoint or another step inside.
+    """Prepare the run for each segment between breakpoints, in order.
 
     Yields:
-        How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
+        The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
     """
     if run.goal is None:
         for stretch in planned(run.t, t_end, run.h, inputs):
@@ -233,32 +233,32 @@ def stretches(
 
 
 def advance_to(run: Driven, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
-    """Advance a run of adaptive steps to a time, keeping nothing but the state there."""
+    """Advance a run with adaptive steps to a time without saving intermediate states."""
     for _ in stretches(run, inputs, t_end, values):
         while not run.arrived:
             run.advance(UNHEARD_STEPS)
 
 
 class Driven(Standing, Protocol):
-    """What is asked of a run whose inputs are data."""
+    """Interface required of a run with inputs."""
 
     @property
     def arrived(self) -> bool:
-        """Whether the run stands at its goal."""
+        """Return whether the run has reached its target time."""
 
     def advance(self, steps: int) -> None:
-        """So many steps, or those that lead to the goal."""
+        """Take ``steps`` steps, fewer if the target time is reached."""
 
     def update(self, *, parameters: Array, h: float | None = None, goal: Goal | None = None) -> None:
-        """Go on with others."""
+        """Set parameters and optionally the step size or the target time."""
 
 
 class Stretch(NamedTuple):
-    """Steps of one length in one piece of all inputs.
+    """Segment of equal steps within one piece of every input.
 
     Attributes:
-        start: when they begin, in two pieces as runs carry them.
-        middle: a time in that piece.
+        start: start time as a double-double number.
+        middle: a time inside the piece.
     """
 
     steps: int
@@ -268,7 +268,7 @@ class Stretch(NamedTuple):
 
 
 def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Stretch]:
-    """By steps of h, and one that is shorter where a breakpoint or the end comes before theirs."""
+    """Return the segments from t to t_end: steps of h, and a shorter one before each breakpoint and the end."""
     forward, now, found = np.sign(t_end - t), (t, 0.0), []
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in ends_on_the_way(t, t_end, inputs):
@@ -284,14 +284,14 @@ def planned(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> li
 
 
 def later(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:
-    """A time in two pieces, so many steps on."""
+    """Return the double-double time after ``steps`` steps of h."""
     high, low = map(float, times_after(now[0], h, steps))
     total = high + (low + now[1])
     return total, (low + now[1]) - (total - high)
 
 
 def with_end(piece: Trajectory, run: Run) -> Trajectory:
-    """A stretch with the state that it ends at, whatever the number of that."""
+    """Append the final state of a segment if the output stride skipped it."""
     if piece.t[-1] == run.t:
         return piece
     iterations, run.iterations = run.iterations, 0
@@ -306,7 +306,7 @@ def with_end(piece: Trajectory, run: Run) -> Trajectory:
 
 
 def ends_on_the_way(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
-    """Breakpoints on the way, and its end."""
+    """Return the breakpoints between t and t_end in the direction of the run, followed by t_end."""
     low, high = min(t, t_end), max(t, t_end)
     inner: set[float] = set()
     for name, data in inputs.items():
@@ -322,7 +322,7 @@ def ends_on_the_way(t: float, t_end: float, inputs: Mapping[str, Input]) -> list
 
 
 def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
-    """Where a run with inputs leads."""
+    """Return the final time of a run with inputs, given by t_end or by h and steps."""
     t = checked_number(t, "the time t")
     if (t_end is None) == (steps is None):
         raise StateError("a run with inputs leads to t_end or takes steps of h: give one of t_end and steps")
@@ -337,12 +337,12 @@ def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) ->
 
 
 def entered(t: float, t_end: float) -> float:
-    """A time in the pieces that a run from t to t_end begins in: going back from a breakpoint those before it."""
+    """Return a time inside the first piece of a run: just after t, or just before it for a run backward."""
     return float(np.nextafter(t, t_end))
 
 
 def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
-    """The values of all parameters at a time, those of inputs by their pieces."""
+    """Return a function of time that evaluates all parameters, those of inputs by their pieces."""
     check_left_to_inputs(stepper.interface, given)
     return partial(parameters_at, stepper.parameters, stepper._parameters(given), inputs)
 
@@ -350,7 +350,7 @@ def parameters_of(stepper: Integrator, given: Any, inputs: Mapping[str, Input]) 
 def parameters_at(
     names: Sequence[str], others: Array, inputs: Mapping[str, Input], t: float, part: slice = ALL
 ) -> Array:
-    """(p,) values by names, or (k, p) of a part of many trajectories: others, but for those of inputs."""
+    """Return (p,) parameter values at t, or (k, p) for a slice of the trajectories; inputs override ``others``."""
     values = others[part].copy()
     for name, data in inputs.items():
         first = names.index(f"{name}_0")

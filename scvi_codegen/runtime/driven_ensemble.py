@@ -1,6 +1,6 @@
-"""Ensembles whose inputs are data: common steps and breakpoints, one input for all trajectories or one for each.
+"""Ensembles with inputs and fixed step size: common steps and breakpoints, inputs shared or one per trajectory.
 
-Lanes go on across breakpoints, with the parameters of the next pieces; sums stay compensated.
+SIMD lanes continue across breakpoints with the parameters of the next pieces; sums remain compensated.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ __all__ = ["DrivenEnsemble"]
 
 
 class DrivenEnsemble(Ensemble):
-    """An ensemble with inputs, to be integrated from t to t_end; arguments as of :class:`Ensemble`.
+    """Ensemble with inputs, integrated from t to t_end; arguments as of :class:`Ensemble`.
 
     Attributes:
-        stretches: that lead to t_end.
-        ends: of each, the number of steps up to there.
-        numbers: of the steps after which states are kept.
+        stretches: segments of equal steps from t to t_end.
+        ends: number of steps up to the end of each segment.
+        numbers: step numbers of the saved states.
     """
 
     call: ClassVar[str] = "drive_ensemble"
@@ -76,17 +76,17 @@ class DrivenEnsemble(Ensemble):
         self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
 
     def part(self, part: slice) -> dict[str, object]:
-        """Arguments by name that make the ensemble of a part of the trajectories."""
+        """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
         found = super().part(part) | {"inputs": part_of_inputs(self.data, part), "t_end": self.t_end}
         del found["steps"]
         return found
 
     def row(self, step: int) -> int:
-        """Of the first state kept that comes after ``step``."""
+        """Return the index of the first saved state after ``step`` steps."""
         return bisect_right(self.numbers, step)
 
     def portions(self, begin: int, size: int) -> Iterator[Portion]:
-        """From breakpoint to breakpoint; the last step of a stretch alone, where its state is kept out of turn."""
+        """Split steps at breakpoints; the last step of a segment is separate if the output stride skips its state."""
         end, step = begin + size, begin
         while step < end:
             k = bisect_right(self.ends, step)
@@ -98,7 +98,7 @@ class DrivenEnsemble(Ensemble):
             step = until
 
     def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
-        """H, time and parameters of trajectory j after ``step`` steps."""
+        """Return h, the time and the parameters of trajectory j after ``step`` steps."""
         if not self.stretches:
             return super().placed(step, j)
         k = min(bisect_right(self.ends, step), len(self.ends) - 1)
@@ -107,7 +107,7 @@ class DrivenEnsemble(Ensemble):
         return stretch.h, now, self._change(stretch).parameters(slice(j, j + 1))[0]
 
     def _first(self, k: int) -> int:
-        """Steps before a stretch."""
+        """Return the number of steps before segment k."""
         return self.ends[k] - self.stretches[k].steps
 
     def _change(self, stretch: Stretch) -> Change:
@@ -116,7 +116,7 @@ class DrivenEnsemble(Ensemble):
         )
 
     def kept_times(self) -> Array:
-        """(n,) of the states."""
+        """Return the (n,) times of the saved states."""
         after = [bisect_left(self.ends, step) for step in self.numbers[1:]]
         times = [
             later(self.stretches[k].start, self.stretches[k].h, step - self._first(k))[0]
@@ -125,7 +125,7 @@ class DrivenEnsemble(Ensemble):
         return np.array([self.t0, *times])
 
     def result(self) -> EnsembleTrajectory:
-        """With the parameters of each piece for the states in it; one at a breakpoint belongs to the piece before."""
+        """Return the trajectories with the parameters of each piece; a breakpoint belongs to the earlier piece."""
         last = [bisect_right(self.numbers, end) for end in self.ends]
         spans = [
             (slice(first, end), slice(None), self._change(stretch).parameters)

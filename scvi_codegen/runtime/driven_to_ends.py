@@ -1,6 +1,6 @@
-"""Ensembles whose inputs are data and whose steps choose their length: each trajectory its own steps, ends and inputs.
+"""Ensembles with inputs and adaptive step size: each trajectory has its own steps, final time and inputs.
 
-Trajectories are those of :meth:`Stepper.drive`, bit for bit: steps of each end at all breakpoints.
+Trajectories are bitwise equal to those of :meth:`Stepper.drive`: steps end at all breakpoints.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["DrivenToEnds"]
 
 
 class DrivenToEnds(EnsembleToEnds):
-    """An ensemble with inputs, each trajectory by steps of its own; arguments as of :class:`EnsembleToEnds`."""
+    """Ensemble with inputs and adaptive steps; arguments as of :class:`EnsembleToEnds`."""
 
     call: ClassVar[str] = "drive_ensemble"
 
@@ -74,13 +74,13 @@ class DrivenToEnds(EnsembleToEnds):
         self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
 
     def part(self, part: slice) -> dict[str, object]:
-        """Arguments by name that make the ensemble of a part of the trajectories."""
+        """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
         found = super().part(part) | {"inputs": part_of_inputs(self.data, part)}
         del found["t_eval"]
         return found
 
     def _values(self, j: int, t: float) -> Array:
-        """Parameters of trajectory j in the pieces in which a time lies."""
+        """Return the parameters of trajectory j for the pieces that contain t."""
         found: Array = parameters_at(self.stepper.parameters, self.parameters, self.data, t, slice(j, j + 1))[0]
         return found
 
@@ -97,12 +97,12 @@ class DrivenToEnds(EnsembleToEnds):
         return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK
 
     def result(self) -> EnsembleTrajectory:
-        """With the parameters of each piece for the states in it; one at a breakpoint belongs to the piece before."""
+        """Return the trajectories with the parameters of each piece; a breakpoint belongs to the earlier piece."""
         found = super().result()
         return replace(found, spans=tuple(span for j in range(len(self)) for span in self._spans(j, found)))
 
     def _spans(self, j: int, found: EnsembleTrajectory) -> Iterator[Span]:
-        """Of the states of one trajectory."""
+        """Yield the rows of trajectory j in each piece and their parameters."""
         assert found.times is not None
         t, goal = found.times[:, j], self.goals[j].t_end
         forward = -1.0 if goal < self.t0 else 1.0

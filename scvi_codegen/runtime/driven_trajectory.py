@@ -1,4 +1,4 @@
-"""The result of a run whose inputs are data: trajectories from breakpoint to breakpoint, as one."""
+"""Result of a run with inputs: the trajectories between breakpoints, joined."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ Number = TypeVar("Number", bound=np.generic)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
-    """States along a run with inputs, and what follows from them, each with the parameters of its piece.
+    """States along a run with inputs, and derived quantities evaluated with the parameters of each piece.
 
     Attributes:
-        pieces: trajectories from breakpoint to breakpoint, the first state of each the last of the one before.
+        pieces: trajectories between breakpoints; the first state of each is the last of the previous one.
         confirmation: as of :class:`Trajectory`.
     """
 
@@ -58,10 +58,10 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
     def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
         """Return successive states as a trajectory, for a slice; (t, q, p) of one state, for a number.
 
-        As of :meth:`Trajectory.__getitem__`, for slices of stride 1: the states at breakpoints belong to a trajectory.
+        Slices must have stride 1, since pieces share the states at breakpoints; see :meth:`Trajectory.__getitem__`.
 
         Raises:
-            IndexError: for a state that is not there, and for a slice that is empty, goes backward or has a stride.
+            IndexError: if a row is out of range, or a slice is empty, descending or has a stride.
         """
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
@@ -103,12 +103,12 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
     @property
     def iterations(self) -> NDArray[np.int32]:
-        """(n,) iterations since the state before."""
+        """(n,) solver iterations since the previous saved state."""
         return self._joined(lambda piece: piece.iterations)
 
     @property
     def steps(self) -> int:
-        """Taken since the start."""
+        """Number of steps since the start."""
         return self.pieces[-1].steps
 
     @property
@@ -118,12 +118,12 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
     @property
     def h(self) -> float:
-        """Of the first step."""
+        """Size of the first step."""
         return self.pieces[0].h
 
     @property
     def parameters(self) -> Array:
-        """(k,) values of the first piece; those of inputs are others in each."""
+        """(k,) parameter values of the first piece; those of inputs differ between pieces."""
         return self.pieces[0].parameters
 
     @property
@@ -133,27 +133,27 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
     @property
     def step_error(self) -> float:
-        """As of :class:`Trajectory`: the run knows its worst step."""
+        """Largest relative step error of the run, as of :class:`Trajectory`."""
         return self.pieces[-1].step_error
 
     @property
     def step_error_t(self) -> float:
-        """When that began."""
+        """Start time of the step with the largest error."""
         return self.pieces[-1].step_error_t
 
     def __len__(self) -> int:
         return len(self.t)
 
     def energy(self) -> Array:
-        """(n,) energies p.v - L."""
+        """Return (n,) energies p.v - L."""
         return self._joined(lambda piece: piece.energy())
 
     def momentum_maps(self) -> Array:
-        """(n, k) values of what symmetries conserve."""
+        """Return (n, k) values of the conserved quantities."""
         return self._joined(lambda piece: piece.momentum_maps())
 
     def momentum_errors(self) -> Array:
-        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
         found = [
             self.stepper.momentum_maps_and_sizes(piece.q, piece.p, piece.t, piece.parameters) for piece in self.pieces
         ]
@@ -161,25 +161,25 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
         return relative_changes(values, sizes)
 
     def constraint_values(self) -> tuple[Array, Array]:
-        """(n, c) values of the constraints, and of their rates, at the states."""
+        """Return (n, c) constraint residuals and (n, c) rates at the states."""
         found = zip(*(piece.constraint_values() for piece in self.pieces), strict=True)
         g, rate = (_after_another(part) for part in found)
         return g, rate
 
     def multipliers(self) -> Array:
-        """(n, c) multipliers of the constraints."""
+        """Return (n, c) Lagrange multipliers of the constraints."""
         return self._joined(lambda piece: piece.multipliers())
 
     def work(self) -> Array:
-        """(n,) work of the forces since the first state."""
+        """Return (n,) work of the forces since the first state."""
         return self._summed(lambda piece: piece.work())
 
     def impulses(self) -> Array:
-        """(n, k) what forces gave to momentum maps since the first state."""
+        """Return (n, k) changes of the momentum maps by forces since the first state."""
         return self._summed(lambda piece: piece.impulses())
 
     def at(self, t: ArrayLike) -> tuple[Array, Array]:
-        """States between those kept, as of :meth:`Trajectory.at`."""
+        """Return dense output at times t, as :meth:`Trajectory.at`."""
         times = checked_times(t, "t")
         first, last = self.pieces[0].t[0], self.pieces[-1].t[-1]
         flat, m = within(times.ravel(), first, last), self.stepper.dimension
@@ -193,13 +193,13 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
     @property
     def plot(self) -> Plots:
-        """Pictures, as of :attr:`Trajectory.plot`."""
+        """Plots, as of :attr:`Trajectory.plot`."""
         from scvi_codegen.pictures.plots import Plots
 
         return Plots(self)
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
-        """The states as :mod:`scvi_codegen.files.export` writes them; parameters are those that are no inputs'."""
+        """Return the states for :mod:`scvi_codegen.files.export`; the parameters of inputs are omitted."""
         own = {self.stepper.parameters[k] for k in columns_of_inputs(self.stepper.interface)}
         found = [quantities(self.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
         told = {name: _after_another([each[name] for each in found]) for name in found[0]}
@@ -218,11 +218,11 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
         write_states(self.states(units), path)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """As of :meth:`Trajectory.to_xarray`."""
+        """Return a dataset, as :meth:`Trajectory.to_xarray`."""
         return to_dataset(self.states(units).labelled())
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """As of :meth:`Trajectory.to_dataframe`."""
+        """Return a data frame, as :meth:`Trajectory.to_dataframe`."""
         return to_dataframe(self.states())
 
     def _joined(self, part: Callable[[Trajectory], NDArray[Number]]) -> NDArray[Number]:
@@ -236,12 +236,12 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
 
 
 def _after_another(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
-    """Arrays along states of pieces, the first of each being the last of the one before."""
+    """Concatenate arrays of successive pieces; the first state of each repeats the last of the previous one."""
     first, *others = parts
     return np.concatenate([first, *(other[1:] for other in others)])
 
 
 def _in_a_row(found: Sequence[Crossings]) -> Crossings:
-    """Crossings of one event in all pieces."""
+    """Concatenate the crossings of one event over all pieces."""
     t, q, p = (np.concatenate([getattr(each, name) for each in found]) for name in ("t", "q", "p"))
     return Crossings(event=found[0].event, t=t, q=q, p=p)

@@ -1,9 +1,8 @@
-"""Many trajectories at once: a trajectory a vector lane, blocks of lanes over the processor's cores.
+"""Ensembles with fixed step size: trajectories are SIMD lanes, blocks of lanes run on all cores.
 
-Each block runs in C without Python's lock, so threads share the work. One trajectory cannot spoil another: a lane whose
-step fails keeps its last good state and is continued alone by the single integrator (which has Newton's iteration to
-fall back on); if that fails too, its later states are NaN and its status says so. Results are the same, bit for bit,
-for any number of threads.
+Blocks run in C without the GIL, so threads work in parallel. A lane whose step fails keeps its last good state and is
+continued by the single integrator (which falls back on Newton's iteration); if that fails too, its later states are NaN
+and its status gives the reason. Other lanes are unaffected. Results are bitwise equal for any number of threads.
 """
 
 from __future__ import annotations
@@ -42,24 +41,24 @@ __all__ = [
 ]
 
 FIRST_PORTION = 64
-"""Steps of a block before the first look at the clock."""
+"""Steps of the first chunk of a block, before its speed is known."""
 PORTION_SECONDS = 0.02
-"""Time between looks, in a block, for a wish to stop."""
+"""Target duration of a chunk in seconds; bounds the delay of an interruption."""
 
 
 class Change(NamedTuple):
-    """Another step, and other parameters: those of a part of the trajectories, (number of it, number of parameters)."""
+    """New step size, and a function that returns the parameters of a slice of trajectories, one row each."""
 
     h: float
     parameters: Callable[[slice], Array]
 
 
 class Portion(NamedTuple):
-    """Steps of one call.
+    """Chunk of steps for one call into C.
 
     Attributes:
-        save_every: distance between the states kept.
-        change: before them, or ``None``.
+        save_every: steps between saved states.
+        change: new step size and parameters before the chunk, or ``None``.
     """
 
     steps: int
@@ -68,7 +67,7 @@ class Portion(NamedTuple):
 
 
 class Ensemble:
-    """An ensemble to be integrated: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
+    """Ensemble integration: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
 
     def __init__(
         self,
@@ -109,32 +108,32 @@ class Ensemble:
 
     @property
     def length(self) -> int:
-        """What ``progress`` counts up to: steps."""
+        """Final value of ``progress``: the number of steps."""
         return self.steps
 
     def row(self, step: int) -> int:
-        """Of the first state kept that comes after ``step``."""
+        """Return the index of the first saved state after ``step`` steps."""
         return step // self.save_every + 1
 
     def portions(self, begin: int, size: int) -> Iterator[Portion]:
-        """What leads ``size`` steps on, in as many calls of C as are needed."""
+        """Yield the chunks that advance from step ``begin`` by ``size`` steps."""
         yield Portion(size, self.save_every)
 
     def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
-        """H, time and parameters of trajectory j after ``step`` steps."""
+        """Return h, the time and the parameters of trajectory j after ``step`` steps."""
         high, low = times_after(self.t0, self.h, step)
         return self.h, (float(high), float(low)), self.parameters[j]
 
     def kept_times(self) -> Array:
-        """(n,) of the states, by steps of h."""
+        """Return the (n,) times of the saved states."""
         number = self.save_every * np.arange(len(self.q), dtype=np.float64)
         return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
 
     call: ClassVar[str] = "integrate_ensemble"
-    """Of a stepper, that takes the arguments of a part."""
+    """Stepper method that accepts the arguments of :meth:`part`."""
 
     def part(self, part: slice) -> dict[str, object]:
-        """Arguments by name that make the ensemble of a part of the trajectories."""
+        """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
         return {
             "q": self.q[0, part],
             "p": self.p[0, part],
@@ -147,7 +146,7 @@ class Ensemble:
         }
 
     def keep(self, part: slice, found: EnsembleTrajectory) -> None:
-        """Take over what was integrated of a part elsewhere."""
+        """Store the results of a slice that was integrated elsewhere."""
         self.q[:, part], self.p[:, part], self.status[part], self.done[part] = (
             found.q,
             found.p,
@@ -158,9 +157,9 @@ class Ensemble:
             self.times[:, part] = found.times
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
-        """All blocks, by ``threads`` workers; what ``progress`` raises stops them within moments.
+        """Integrate all blocks with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
 
-        Afterwards, also after an exception, :meth:`result` holds what was computed.
+        Afterwards, also after an exception, :meth:`result` returns what was computed.
         """
         workers = workers_of(threads)
         make, width = self.blocks()
@@ -195,7 +194,7 @@ class Ensemble:
                 pool.shutdown(cancel_futures=True)
 
     def blocks(self) -> tuple[Callable[[int], LaneBlock | _SingleBlock], int]:
-        """How to make the block that begins with a trajectory, compiled, and how many trajectories it holds."""
+        """Return a function that makes the block beginning at a trajectory, and the trajectories per block."""
         source = self.stepper.ensemble
         if source is None:
             return lambda first: _SingleBlock(self, first), 1
@@ -204,7 +203,7 @@ class Ensemble:
         return lambda first: LaneBlock(self, first, binding), width
 
     def result(self) -> EnsembleTrajectory:
-        """The arrays, with their times; trajectories that neither ended nor failed are ``"interrupted"``."""
+        """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
         unfinished = (self.status == OK) & (self.done < self.steps)
         return EnsembleTrajectory(
             t=self.kept_times(),
@@ -220,7 +219,7 @@ class Ensemble:
 
 
 class LaneBlock:
-    """A few trajectories, lanes of one C block, and those of them that had to leave it."""
+    """Trajectories in the SIMD lanes of one C block, and those that left it after a failed step."""
 
     def __init__(self, work: Ensemble, first: int, binding: Binding) -> None:
         self.work, self.first, self.binding = work, first, binding
@@ -234,7 +233,7 @@ class LaneBlock:
         self._fill()
 
     def _fill(self) -> None:
-        """A trajectory into each lane; those too many repeat the last one and rest."""
+        """Put a trajectory into each lane; surplus lanes repeat the last one and are inactive."""
         work, call, pointer = self.work, self.binding.function("set"), self.binding.pointer
         v = self._velocities()
         for lane in range(len(self.active)):
@@ -247,7 +246,7 @@ class LaneBlock:
             self.active[: self.count] *= np.isfinite(v).all(axis=1)
 
     def _velocities(self) -> Array | None:
-        """(count, m) initial velocities if the lanes need them, not numbers where there are none."""
+        """Return (count, m) initial velocities if the predictor needs them, NaN where undefined; else ``None``."""
         if not self.binding.constant("NEEDS_VELOCITIES"):
             return None
         work, v = self.work, np.full((self.count, self.work.stepper.dimension), np.nan)
@@ -258,19 +257,19 @@ class LaneBlock:
         return v
 
     def lanes(self, name: str) -> Array:
-        """(m, lanes) the field of the block of this name, as it is: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
+        """Return a (m, lanes) view of a field of the block: ``q``, ``p``, ``carry_q`` or ``carry_p``."""
         field = np.frombuffer(self.binding.buffer(getattr(self.memory, name)), dtype=np.float64)
         return field.reshape(self.work.stepper.dimension, -1)
 
     def advance(self, size: int) -> None:
-        """``size`` steps on."""
+        """Advance by ``size`` steps."""
         for portion in self.work.portions(self.step, size):
             if portion.change is not None:
                 self._change(portion.change.h, portion.change.parameters(slice(self.first, self.first + self.count)))
             self._advance(portion.steps, portion.save_every)
 
     def _change(self, h: float, own: Array) -> None:
-        """Another step, before which what the curve of the last one says of the next is forgotten, and parameters."""
+        """Set step size and parameters; a new step size invalidates the predictor."""
         for lane, alone in self.left.items():
             alone.update(h, own[lane])
         self.parameters[:, : self.count] = own.T
@@ -282,7 +281,7 @@ class LaneBlock:
             self._take_velocities(own)
 
     def _take_velocities(self, parameters: Array) -> None:
-        """Into the memory at the points, as before the first step; lanes that have none rest."""
+        """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
         at_points = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
         at_points = at_points.reshape(-1, self.work.stepper.dimension, len(self.active))
         q, p, t = self.lanes("q").T, self.lanes("p").T, float(self.memory.t)
@@ -314,7 +313,7 @@ class LaneBlock:
             self._leave(int(lane), begin, save_every)
 
     def _leave(self, lane: int, begin: int, save_every: int) -> None:
-        """What a call that began after ``begin`` steps stored of a resting lane gives way to a run of its own."""
+        """Replace the states that a call from step ``begin`` stored for an inactive lane by those of a single run."""
         work, j = self.work, self.first + lane
         if lane not in self.left:
             step = int(self.memory.last_step[lane])
@@ -327,13 +326,13 @@ class LaneBlock:
 
 
 class _SingleBlock:
-    """One trajectory, of a method without lanes."""
+    """Block of one trajectory, for methods without SIMD lanes."""
 
     def __init__(self, work: Ensemble, first: int) -> None:
         self.step, self.run = 0, _Alone(work, first, work.q[0, first], work.p[0, first])
 
     def advance(self, size: int) -> None:
-        """``size`` steps on."""
+        """Advance by ``size`` steps."""
         for portion in self.run.work.portions(self.step, size):
             self.step += portion.steps
             if portion.change is not None:
@@ -342,7 +341,7 @@ class _SingleBlock:
 
 
 class _Alone:
-    """Trajectory j by the single integrator, from its state after ``step`` steps."""
+    """Trajectory j computed by the single integrator from its state after ``step`` steps."""
 
     def __init__(
         self, work: Ensemble, j: int, q: Array, p: Array, step: int = 0, carries: tuple[Array, Array] | None = None
@@ -353,7 +352,7 @@ class _Alone:
         h, time, parameters = work.placed(step, j)
         try:
             run = Memory.started(work.stepper, q, p, h=h, t=work.t0, parameters=parameters, options=work.options)
-        except StateError:  # a sum of finite terms that overflowed
+        except StateError:  # a sum of finite terms has overflowed
             work.status[j] = "not finite"
         else:
             if carries is not None:
@@ -361,12 +360,12 @@ class _Alone:
             self.run = run
 
     def update(self, h: float, parameters: Array) -> None:
-        """Go on with others."""
+        """Set step size and parameters."""
         if self.run is not None:
             self.run.update(h=h, parameters=parameters)
 
     def advance_to(self, step: int, save_every: int) -> None:
-        """On to ``step``, unless it failed before."""
+        """Advance to step number ``step``, unless the trajectory has failed."""
         work, j, run = self.work, self.j, self.run
         if run is None:
             return

@@ -1,4 +1,4 @@
-"""Initial states and parameters of ensembles as users give them, checked."""
+"""Validation of the initial states and parameters of ensembles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
 
 
 def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
-    """Initial positions and momenta, (k, m) each."""
+    """Return validated (k, m) initial positions and momenta."""
     positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
     if positions.shape != momenta.shape:
         raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
@@ -35,7 +35,7 @@ def momenta_of_each(
     t: float,
     parameters: EnsembleParameters,
 ) -> ArrayLike:
-    """The momenta of states that are given by one of p and velocity, each with its parameters."""
+    """Return the momenta of states specified by p or by velocity, each with its own parameters."""
     name, given = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
         return given
@@ -50,7 +50,7 @@ def momenta_of_each(
 def start_of_ensemble(
     stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
 ) -> tuple[Array, Array, Array]:
-    """(k, m) positions and momenta, put on the constraints where there are any, and (k, number of parameters)."""
+    """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters."""
     check_inputs_given(stepper.interface, parameters)
     positions, momenta = checked_ensemble(stepper, q, p)
     values = parameters_of_each(stepper, parameters, len(positions))
@@ -61,7 +61,7 @@ def start_of_ensemble(
 
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
-    """(k, m) finite numbers."""
+    """Return a validated (k, m) array of finite numbers."""
     array = real_array(value, name)
     if array.ndim == 1:
         array = array[np.newaxis]
@@ -74,7 +74,7 @@ def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
 
 
 def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
-    """(k, number of parameters): defaults, by name (a number or k numbers each), or a whole array."""
+    """Return (k, number of parameters) values: defaults overridden by name (one or k numbers each) or by an array."""
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
     if isinstance(given, Mapping):

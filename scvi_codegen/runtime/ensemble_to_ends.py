@@ -1,7 +1,7 @@
-"""Many trajectories whose steps choose their length: each its own steps and its own end, shared between the cores.
+"""Ensembles with adaptive step size: each trajectory has its own steps and final time; threads share the work.
 
-Trajectories are the single integrator's, which has a table for each change of length, so that results are those of
-:meth:`Stepper.integrate`, bit for bit, for any number of threads. C runs without Python's lock.
+Trajectories are computed by the single integrator, so results are bitwise equal to those of :meth:`Stepper.integrate`
+for any number of threads. C runs without the GIL.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ __all__ = ["EnsembleToEnds"]
 
 
 class LaneStates(Protocol):
-    """Of a trajectory, as far as they are kept."""
+    """Saved states of one trajectory."""
 
     @property
     def t(self) -> Array:
-        """(n,)."""
+        """(n,) times."""
 
     @property
     def q(self) -> Array:
-        """(n, m)."""
+        """(n, m) positions."""
 
     @property
     def p(self) -> Array:
-        """(n, m)."""
+        """(n, m) momenta."""
 
 
 class KeptLane(NamedTuple):
-    """What is kept of a trajectory: its states, why it ended, and the steps that were taken."""
+    """Saved states of one trajectory, its status and its number of steps."""
 
     t: Array
     q: Array
@@ -58,7 +58,7 @@ class KeptLane(NamedTuple):
 
 
 class EnsembleToEnds:
-    """An ensemble to be integrated, each trajectory by steps of its own; arguments as of ``integrate_ensemble``."""
+    """Ensemble integration with adaptive steps; arguments as of ``integrate_ensemble``."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class EnsembleToEnds:
         self.kept: dict[int, KeptLane] = {}
 
     def _goals(self, t_end: ArrayLike, tolerance: float | None) -> list[Goal]:
-        """One for each trajectory, all forward or all back."""
+        """Return the step plan of each trajectory; all must run forward or all backward."""
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self.q),)):
             raise StateError(f"t_end must be one time or {len(self.q)}, not of shape {ends.shape}")
@@ -106,14 +106,14 @@ class EnsembleToEnds:
 
     @property
     def length(self) -> int:
-        """What ``progress`` counts up to: trajectories."""
+        """Final value of ``progress``: the number of trajectories."""
         return len(self)
 
     call: ClassVar[str] = "integrate_ensemble"
-    """Of a stepper, that takes these."""
+    """Stepper method that accepts the arguments of :meth:`part`."""
 
     def part(self, part: slice) -> dict[str, object]:
-        """Arguments by name that make the ensemble of a part of the trajectories."""
+        """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
         return {
             "q": self.q[part],
             "p": self.p[part],
@@ -127,13 +127,13 @@ class EnsembleToEnds:
         }
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
-        """All trajectories, by ``threads`` workers; what ``progress`` raises stops them within moments.
+        """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
 
-        Afterwards, also after an exception, :meth:`result` holds the trajectories that were done.
+        Afterwards, also after an exception, :meth:`result` returns the completed trajectories.
 
         Args:
-            progress: called now and then with the number of trajectories done.
-            threads: workers, by default one a core.
+            progress: called with the number of completed trajectories.
+            threads: number of threads, by default one per core.
         """
 
         def drive(j: int, heed: Heed) -> None:
@@ -153,17 +153,17 @@ class EnsembleToEnds:
                 options=self.options,
             )
             found, status = self._states(j, run, heed)
-        except StateError:  # a sum of finite terms that overflowed
+        except StateError:  # a sum of finite terms has overflowed
             return KeptLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
         return KeptLane(found.t, found.q, found.p, status, run.steps)
 
     def _first_parameters(self, j: int) -> Array:
-        """Of trajectory j."""
+        """Return the initial parameters of trajectory j."""
         found: Array = self.parameters[j]
         return found
 
     def _states(self, j: int, run: Memory, heed: Heed) -> tuple[LaneStates, str]:
-        """What is kept of trajectory j, and why it ended."""
+        """Return the saved states of trajectory j and its status."""
         try:
             if self.t_eval is None:
                 return record(run, None, save_every=self.save_every, progress=heed), OK
@@ -173,7 +173,7 @@ class EnsembleToEnds:
             return Trajectory.before(failure), failure.status
 
     def result(self) -> EnsembleTrajectory:
-        """The arrays; trajectories that were not done are ``"interrupted"`` after their initial state."""
+        """Return the trajectories; incomplete ones are ``"interrupted"`` after their initial state."""
         found = [self.kept.get(j) or self._unfinished(j) for j in range(len(self))]
         if self.t_eval is None:
             t, times, rows = self._by_number(found)
@@ -197,7 +197,7 @@ class EnsembleToEnds:
         )
 
     def _by_number(self, found: list[KeptLane]) -> tuple[Array, Array, list[slice]]:
-        """Numbers of the states, and the time of each; a trajectory with fewer states ends before the last row."""
+        """Return row numbers, (n, k) times padded with NaN, and the rows of each trajectory."""
         rows = [slice(0, len(each.t)) for each in found]
         count = max(row.stop for row in rows)
         times = np.full((count, len(found)), np.nan)
@@ -210,6 +210,6 @@ class EnsembleToEnds:
         return KeptLane(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
 
     def keep(self, part: slice, found: EnsembleTrajectory) -> None:
-        """Take over what was integrated of a part elsewhere."""
+        """Store the results of a slice that was integrated elsewhere."""
         for j, each in zip(range(part.start, part.stop), found.each(), strict=True):
             self.kept[j] = KeptLane(*each)

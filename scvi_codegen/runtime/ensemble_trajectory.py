@@ -1,4 +1,4 @@
-"""The result of an ensemble: states of many trajectories at common times, diagnostics and files."""
+"""Result of an ensemble: states of many trajectories, diagnostics and files."""
 
 from __future__ import annotations
 
@@ -30,27 +30,25 @@ __all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory", "Span"]
 OK, INTERRUPTED = "ok", "interrupted"
 
 Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
-"""Rows of states, the trajectories that they are of, and the parameters in them of a part of all trajectories."""
+"""Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleTrajectory:
-    """States of k trajectories at common times, the initial one first.
+    """States of k trajectories, the initial state first.
 
     Attributes:
-        t: (n,) times; where time is transformed tau, from 0; where each trajectory keeps the states at its own steps
-            their numbers.
-        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a trajectory of fewer states.
-        status: (k,) ``"ok"``, or why the trajectory ended (``"not converged"``, ``"singular"``, ``"not finite"``,
+        t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
+        status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
             ``"vanished"``, ``"interrupted"``).
-        steps: (k,) steps completed.
-        h: step size, 0 where steps choose their length.
-        spans: with inputs, rows of states of some of the trajectories, and the parameters in them of a part of all;
-            ``parameters`` has zeros in place of inputs.
-        goals: of each trajectory whose steps choose their length, else none.
-        parameters: (k, number of parameters).
+        steps: (k,) completed steps.
+        h: step size; 0 for adaptive steps.
+        parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
-        times: (n, k) where every trajectory has its own (transformed time, steps of their own lengths), else ``None``.
+        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        goals: step plan of each trajectory for adaptive steps, else empty.
+        spans: with inputs, rows of states of a slice of trajectories and their parameters.
     """
 
     t: Array
@@ -74,7 +72,7 @@ class EnsembleTrajectory:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """(k,) which trajectories reached the end."""
+        """(k,) flags of the trajectories that reached the end."""
         reached: NDArray[np.bool_] = self.status == OK
         return reached
 
@@ -86,18 +84,18 @@ class EnsembleTrajectory:
         return self._times()[last, j], self.q[last, j], self.p[last, j]
 
     def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
-        """Of each trajectory the times, positions and momenta of its states, why it ended, and its steps."""
+        """Yield the times, positions and momenta of each trajectory, its status and its number of steps."""
         times = self._times()
         for j, (status, steps) in enumerate(zip(self.status.tolist(), self.steps.tolist(), strict=True)):
             good = self._reached(j)
             yield times[good, j], self.q[good, j], self.p[good, j], status, steps
 
     def _times(self) -> Array:
-        """(n, k)."""
+        """Return the (n, k) times."""
         return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
 
     def energy(self) -> Array:
-        """(n, k) energies p.v - L; NaN after a failure, and for a trajectory with a state that has no energy."""
+        """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
         energies = np.full(self.q.shape[:2], np.nan)
         for j, good, parameters in self._with_parameters():
             try:
@@ -109,11 +107,11 @@ class EnsembleTrajectory:
         return energies
 
     def momentum_maps(self) -> Array:
-        """(n, k, c) values of what symmetries conserve, named ``stepper.momentum_map_names``; NaN as above."""
+        """Return (n, k, c) values of the momentum maps ``stepper.momentum_map_names``; NaN as for :meth:`energy`."""
         return self._momentum_maps()[0]
 
     def momentum_errors(self) -> Array:
-        """(n, k, c) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        """Return (n, k, c) changes of the momentum maps since the first state, relative to their largest term."""
         return relative_changes(*self._momentum_maps())
 
     def _momentum_maps(self) -> tuple[Array, Array]:
@@ -128,7 +126,7 @@ class EnsembleTrajectory:
         return values, sizes
 
     def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
-        """Trajectories, rows of states that there are, and the parameters in them."""
+        """Yield trajectories with the rows of their states and the parameters in these rows."""
         for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
             for j, own in zip(range(*some.indices(len(self))), parameters(some), strict=True):
                 good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
@@ -137,14 +135,14 @@ class EnsembleTrajectory:
 
     @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv`` (a line a state: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
+        """Write ``.npz``, ``.csv`` (one state a line: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
 
-        In a CSV file trajectories are numbered from 0, parameters that differ between them have columns too, and states
-        after a failure are left out. HDF5 and Zarr hold what :meth:`to_xarray` gives.
+        CSV files number trajectories from 0, have columns for parameters that differ between trajectories, and omit
+        states after a failure. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
 
         Raises:
-            StateError: for another suffix, or units in a format that has none.
-            MissingLibraryError: without h5netcdf or zarr (extra ``data``).
+            StateError: if the suffix is unknown, or the format has no units.
+            MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
         suffix, known = Path(path).suffix.lower(), checked_units(units)
         self._check_common_times()
@@ -160,14 +158,14 @@ class EnsembleTrajectory:
         write_atomically(path, write)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """Variables q, p, velocity (t, trajectory, coordinate), energy, momentum_map, parameters, status, steps.
+        """Return a dataset of q, p, velocity, energy, momentum_map, parameters, status and steps.
 
         Args:
             units: as of :meth:`Trajectory.to_xarray`.
 
         Raises:
-            StateError: for units of something else.
-            MissingLibraryError: without xarray (extra ``data``).
+            StateError: if units name an unknown variable.
+            MissingLibraryError: if xarray is not installed (extra ``data``).
         """
         self._check_common_times()
         return to_dataset(self._labelled(checked_units(units)))
@@ -177,7 +175,7 @@ class EnsembleTrajectory:
             raise StateError("in transformed time trajectories have no common times: files of ensembles need them")
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
-        """The arrays with names for their dimensions."""
+        """Return the arrays with named dimensions."""
         interface, each = self.stepper.interface, ("t", "trajectory")
         dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",), "energy": each}
         dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
@@ -216,7 +214,7 @@ class EnsembleTrajectory:
         return found
 
     def _reached(self, j: int) -> NDArray[np.bool_]:
-        """(n,) which states of a trajectory there are."""
+        """Return (n,) flags of the states that trajectory j reached."""
         return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
 
     def _write_npz(self, file: IO[bytes]) -> None:

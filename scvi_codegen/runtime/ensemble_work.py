@@ -1,4 +1,4 @@
-"""Which ensemble does what is asked for: by common steps or by steps of each, with inputs or without."""
+"""Selection of the ensemble class: common fixed steps or adaptive steps of each trajectory, with or without inputs."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def ensemble_work(
     parameters: EnsembleParameters,
     **others: Any,
 ) -> Ensemble | EnsembleToEnds:
-    """An ensemble without inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
+    """Return an ensemble without inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
-        StateError: on wrong shapes, names or numbers, and where a monitor chooses steps.
+        StateError: if a shape, name or number is invalid, or the stepper has a monitor.
     """
     _refuse_monitors(stepper)
     p = momenta_of_each(stepper, q, p, velocity, t, parameters)
@@ -58,7 +58,7 @@ def ensemble_work(
 
 
 def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple[float, int]:
-    """The step and number of steps of an ensemble that does not go to its ends by steps of their own lengths."""
+    """Return h and steps of a fixed-step ensemble; raise ``StateError`` for missing or contradictory arguments."""
     given = [name for name, value in others.items() if value is not None]
     if h is None or steps is None:
         raise StateError("give h and steps, for steps of one length, or t_end, for steps that choose theirs")
@@ -82,10 +82,10 @@ def driven_work(
     parameters: EnsembleParameters,
     **others: Any,
 ) -> DrivenEnsemble | DrivenToEnds:
-    """An ensemble with inputs; arguments as of :meth:`Stepper.drive_ensemble`.
+    """Return an ensemble with inputs; arguments as of :meth:`Stepper.drive_ensemble`.
 
     Raises:
-        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
+        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and if the stepper has a monitor.
     """
     make: partial[DrivenEnsemble] | partial[DrivenToEnds]
     if h is not None:
@@ -115,10 +115,10 @@ def _driven_start(
     way: tuple[float, float],
     parameters: EnsembleParameters,
 ) -> tuple[dict[str, Input], ArrayLike, Array]:
-    """Inputs, momenta, and (k, number of parameters) at the start of a ``way`` from a time to one.
+    """Return inputs, momenta and (k, number of parameters) initial parameters; ``way`` is (start time, final time).
 
     Raises:
-        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and where a monitor chooses steps.
+        StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and if the stepper has a monitor.
     """
     _refuse_monitors(stepper)
     count = len(checked_ensemble(stepper, q, q)[0])

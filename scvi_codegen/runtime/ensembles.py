@@ -1,4 +1,4 @@
-"""Many trajectories at once, as users ask a stepper for them."""
+"""Public methods for ensembles."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Ensembles"]
 
 
 class Ensembles(ConstrainedStates):
-    """Integrations of many states, each on its own, over all cores."""
+    """Integration of many initial states on all cores."""
 
     @takes(StateError, progress=FUNCTION)
     def integrate_ensemble(
@@ -43,26 +43,26 @@ class Ensembles(ConstrainedStates):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
     ) -> EnsembleTrajectory:
-        """Run k trajectories over all cores: with common steps, eight at a time as vector lanes, or each by its own.
+        """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
         Args:
             q, p: (k, m) initial positions and momenta.
-            velocity: (k, m) initial velocities, in place of p.
+            velocity: (k, m) initial velocities, instead of p.
             h, steps, save_every, t, options, progress: as in :meth:`integrate`.
-            t_end: instead of h and steps: one time or (k,) times to go to, by steps that choose their length in each
-                trajectory. Every ``save_every``-th state of each is kept, and the last, at the ``times`` of the
-                result. ``progress`` is then called with the number of trajectories done.
-            tolerance: relative error of the end of such a step; by default round-off.
-            t_eval: (n,) times: keep the states of all trajectories at these instead; NaN beyond their ends.
-            parameters: by name, one number or k each; or (k, number of parameters).
-            threads: workers, by default one a core.
+            t_end: final time, or (k,) final times, for adaptive steps, instead of h and steps. Every
+                ``save_every``-th state and the last state of each trajectory are saved, with their times in ``times``.
+                ``progress`` is then called with the number of completed trajectories.
+            tolerance: relative error of an adaptive step; by default round-off.
+            t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
+            parameters: values by name, one number or k each; or an array (k, number of parameters).
+            threads: number of threads, by default one per core.
 
         Returns:
             An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
-            fails has NaN from there on and says why in ``status``; the others are not disturbed.
+            fails has NaN after the failure and the reason in ``status``; the others are unaffected.
 
         Raises:
-            StateError: on wrong shapes, names or numbers.
+            StateError: if a shape, name or number is invalid.
         """
         work = ensemble_work(
             self,
@@ -103,17 +103,17 @@ class Ensembles(ConstrainedStates):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
     ) -> EnsembleTrajectory:
-        """Run k trajectories with inputs: by common steps that end at all breakpoints, or each by steps of its own.
+        """Run k trajectories with inputs, with common fixed steps that end at all breakpoints or with adaptive steps.
 
         Args:
-            inputs: as of :meth:`drive`, the same for all trajectories; with values of shape (k, n) each has its own.
-            h: of common steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
-            steps, t_end: with h one of both; without it ``t_end``, one time or (k,).
+            inputs: as of :meth:`drive`, common to all trajectories, or values of shape (k, n) for one input each.
+            h: common step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
+            steps, t_end: with h one of both; without h ``t_end``, one time or (k,) times.
             q, p, velocity, tolerance, save_every, t, parameters, options, progress, threads: as of
                 :meth:`integrate_ensemble`.
 
         Returns:
-            An :class:`EnsembleTrajectory` with the states of :meth:`drive`, equal to round-off, to the bit without h.
+            An :class:`EnsembleTrajectory`; states equal those of :meth:`drive` to round-off, bitwise without h.
 
         Raises:
             StateError: as :meth:`drive`.
@@ -154,27 +154,27 @@ class Ensembles(ConstrainedStates):
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
     ) -> Deviations:
-        """What becomes of small changes of K initial states over ``steps`` steps of h: indicators of chaos of each.
+        """Return chaos indicators of K initial states over ``steps`` steps of size h.
 
-        Of systems with constant diagonal masses and forces of position and time, by methods with sweeps for them (SVI,
-        collocation), eight motions go at a time, as vector lanes; others each by the derivatives of its steps, about
-        ten times as slow. What is told is the same, to round-off.
+        For constant diagonal masses and forces of position and time, methods with a fixed-point iteration (SVI,
+        collocation) integrate eight trajectories at a time in SIMD lanes; otherwise the derivatives of single steps are
+        used, about ten times slower. Results agree to round-off.
 
         Args:
             q, p, velocity: (K, m) initial states, as of :meth:`integrate_ensemble`.
-            count, directions: of changes, as of :meth:`Trajectory.deviations`; 1 is enough for MEGNO.
-            save_every: steps between what is kept of each motion; by default the last alone.
+            count, directions: tangent vectors, as of :meth:`Trajectory.deviations`; one suffices for MEGNO.
+            save_every: steps between saved values; by default only the last is saved.
             t, parameters, options, threads: as of :meth:`integrate_ensemble`.
-            progress: called now and then with the number of motions done.
+            progress: called with the number of completed trajectories.
 
         Returns:
-            :class:`Deviations` of (n, K, k): ``found.megno()[-1]`` are K numbers. A motion that fails is not a number
-            from there on, or from up to a thousand steps before, and says why in ``status``. An
-            :class:`~scvi_codegen.AccuracyWarning` says when steps are too long, as one motion in 64 finds.
+            :class:`Deviations` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has NaN
+            from at most a thousand steps before the failure on, and the reason in ``status``. An
+            :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
 
         Raises:
-            MethodError: in transformed time, and where a monitor chooses the steps.
-            StateError: on wrong shapes, names or numbers.
+            MethodError: if time is transformed, or the stepper has a monitor.
+            StateError: if a shape, name or number is invalid.
         """
         p = momenta_of_each(self, q, p, velocity, t, parameters)
         work = DeviationsEnsemble(

@@ -1,8 +1,8 @@
-"""Indicator of error growth: other runs from a changed state, made after an adaptive run.
+"""Check for exponential error growth after an adaptive run, by repeating it from a perturbed initial state.
 
-The difference of two runs is what the motion makes of an initial error. A coarse run, of a larger tolerance, shows in
-the first quarter or half of the steps whether errors grow exponentially; only then the run itself is repeated from a
-state changed in its last place, which keeps no states and is made of at most a fixed number of steps.
+The difference of two runs shows how the motion amplifies an initial error. A coarse run with a larger tolerance shows
+in the first quarter or half of the steps whether errors grow exponentially; only then is the run repeated from a state
+perturbed in its last place. The repeated run stores no states and has a bounded number of steps.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ __all__ = ["MOST_STEPS", "GrowthCheck"]
 Array = NDArray[np.float64]
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18
-"""Steps of the second run by default: their number, and that times the number of coordinates."""
+"""Default limits of the second run: number of steps, and that number times the number of coordinates."""
 FASTEST = 1.15
-"""Growth of an error within one step: what grows slower than this in so few steps is not looked at."""
+"""Assumed largest growth of an error per step; runs with too few steps to reach the threshold are not checked."""
 NUDGE = 2.0**-50
-"""Relative change of the initial state, or the local tolerance if that is larger."""
+"""Relative perturbation of the initial state, unless the local tolerance is larger."""
 TOLERABLE, LOOSE, LARGEST = 1e-7, 1e5, 0.1
-"""A run is reported where the difference exceeds the first and the second times its tolerance, or the third."""
+"""Reporting threshold of the relative difference: max(TOLERABLE, LOOSE * tolerance), at most LARGEST."""
 COARSE = 1e-8
-"""Local tolerance of the coarse run and relative change of its initial state, unless the tolerance is larger."""
+"""Local tolerance and relative perturbation of the coarse run, unless the tolerance of the run is larger."""
 FIRST, DECISIVE = 1.0 / 8.0, (1.0 / 4.0, 1.0 / 2.0)
-"""Parts of the steps where the coarse run is compared: for the rate of growth, and for the decision."""
+"""Fractions of the steps at which the coarse run is compared: for the growth rate, and for the decision."""
 MANY = 256
-"""Steps from which on the coarse run is compared at the first part, too."""
+"""Number of steps from which on the coarse run is also compared at the fraction FIRST."""
 SMALLEST = 1e-140
-"""Squares of smaller numbers, and of those above its inverse, are not exact: states are scaled then."""
+"""Numbers below this, or above its inverse, are scaled before squaring to avoid underflow and overflow."""
 SLOW = 0.9
-"""Part of the decades in question that an error must grow, extrapolated exponentially, for the run to be repeated."""
+"""Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
 
 
 class StatesRepeated(Protocol):
-    """The states of a run that are compared."""
+    """States of a run for comparison."""
 
     @property
     def t(self) -> Array: ...
@@ -59,16 +59,16 @@ class StatesRepeated(Protocol):
 
 
 class GrowthCheck:
-    """A run to be repeated, as it was at its start.
+    """Check of error growth, with the initial state of the run.
 
     Args:
-        run: at its start.
-        asked: ``True``: repeat all of the run; ``None``: up to ``MOST_STEPS`` of its steps, and only if a coarse run
-            shows exponential growth; ``False``: nothing.
-        lead: advances the run to a time; by default to the goal of that time.
+        run: the run at its start.
+        asked: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a coarse
+            run shows exponential growth; ``False``: no check.
+        lead: function that advances the run to a time; by default adaptive steps to that time.
 
     Raises:
-        StateError: if the check is asked for and steps have a fixed size.
+        StateError: if the check is requested for a fixed step size.
     """
 
     def __init__(
@@ -86,10 +86,10 @@ class GrowthCheck:
             self.start: Any = run.save() if isinstance(run, Memory) else run.mark
             self.parameters = (
                 run.parameters.copy() if isinstance(run, Memory) else None
-            )  # inputs change them on the way
+            )  # inputs change them during the run
 
     def warn(self, states: StatesRepeated) -> None:
-        """Repeat the run, which stays where that ends, and warn if it ends elsewhere by more than is tolerable."""
+        """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
         if not self.wanted or len(states.t) < 2:
             return
         assert self.run.goal is not None  # by construction
@@ -114,9 +114,9 @@ class GrowthCheck:
     def _slow(self, states: StatesRepeated, last: int, tolerance: float, decades: float) -> bool:
         """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
 
-        The growth A(k) until step k of n is extrapolated as an exponential function, from the start, A(k)^(n/k), or
-        from the comparison before, at j: A(k) (A(k) / A(j))^((n - k) / (k - j)), whichever is less; growth by a power
-        of the time has a smaller second one.
+        The growth A(k) until step k of n is extrapolated exponentially from the start, A(k)^(n/k), and from the
+        previous comparison at step j, A(k) (A(k) / A(j))^((n - k) / (k - j)); the smaller value counts. For algebraic
+        growth the second is smaller.
         """
         first = {int(last * FIRST)} if last >= MANY else set()
         before, grown_before = 0, 0.0
@@ -135,7 +135,7 @@ class GrowthCheck:
         return False
 
     def _last(self, states: StatesRepeated, steps: int) -> int:
-        """Return the number of the last state to compare: all of them are kept, or as many for each part of the run."""
+        """Return the index of the last state to compare; 0 unless all states of the run are saved."""
         count = len(states.t) - 1
         if len(self._rows(states.q, 0, len(states.t))) != len(states.t):
             return 0
@@ -143,14 +143,14 @@ class GrowthCheck:
         return count if self.asked or steps <= most else int(count * most / steps)
 
     def _halves(self) -> tuple[Array, Array]:
-        """Return the positions and momenta of the run, to be changed in place."""
+        """Return views of the positions and momenta of the run."""
         if isinstance(self.run, Memory):
             return self.run._q, self.run._p
         q, p = np.split(self.run.state, 2)
         return q, p
 
     def _begin(self, nudge: float, tolerance: float) -> None:
-        """Put the run back to its start, changed, and on its constraints, with another local tolerance."""
+        """Reset the run to its perturbed initial state, on its constraints, with another local tolerance."""
         run = self.run
         run.rewind(self.start)
         if isinstance(run, Memory):
@@ -175,9 +175,9 @@ class GrowthCheck:
             run.advance(MOST_STEPS)
 
     def _apart(self, states: StatesRepeated, k: int, small: float = 0.0) -> float:
-        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest until there.
+        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
 
-        Relative to the state itself, a bound that is quicker, if that is at most ``small``.
+        If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
         """
         ratios = []
         for mine, each in zip(self._halves(), (states.q, states.p), strict=True):
@@ -185,7 +185,7 @@ class GrowthCheck:
             difference = mine - row
             largest = float(np.abs(row).max())
             apart = size = 0.0
-            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # else squares overflow
+            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # squares do not overflow
                 apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
             if not (size > 0.0 and apart <= small * size):
                 rows = self._rows(each, 0, k + 1)
@@ -197,7 +197,7 @@ class GrowthCheck:
 
     @staticmethod
     def _rows(values: Any, first: int, end: int) -> Array:
-        """Return states, those of several arrays side by side."""
+        """Return states as rows; several arrays are concatenated."""
         if isinstance(values, Mapping):
             parts = [each[first:end] for each in values.values()]
             return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
@@ -215,5 +215,5 @@ class GrowthCheck:
 
 @lru_cache(maxsize=8)
 def _factors(size: int, nudge: float) -> tuple[Array, Array]:
-    """Return by what positions and momenta are multiplied to change them by about ``nudge``."""
+    """Return factors for positions and momenta that change them by about ``nudge``, relatively."""
     return 1.0 + nudge * np.cos(np.arange(size)), 1.0 + nudge * np.cos(np.arange(size) + 1)

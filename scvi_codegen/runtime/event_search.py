@@ -1,4 +1,4 @@
-"""The compiled search for zero crossings, run over the states of a trajectory."""
+"""Event detection: the compiled search for zero crossings along the states of a trajectory."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from scvi_codegen.runtime.kept_states import KeptStates
 __all__ = ["CrossingSearch", "crossings_of"]
 
 ROOM = 256
-"""Crossings that one call can report; a step with more makes room for twice as many."""
+"""Initial number of crossings that one call can return; doubled when exceeded."""
 
 
 class CrossingSearch:
-    """The crossings of a stepper's events along consecutive parts of one run.
+    """Crossings of a stepper's events along consecutive parts of one run.
 
     Args:
-        stepper: with its events.
-        crossed: numbers of crossings of each event before these parts; none by default.
+        stepper: the stepper, with its events.
+        crossed: numbers of earlier crossings of each event; none by default.
 
     Attributes:
-        ended: whether a terminal event was met; ``found[-1]`` is then its crossing.
-        found: structured arrays (t, function, q, p), in order of the run.
+        ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
+        found: structured arrays (t, function, q, p), in the order of the run.
     """
 
     def __init__(self, stepper: Integrator, crossed: Sequence[int] = ()) -> None:
@@ -49,19 +49,19 @@ class CrossingSearch:
 
     @property
     def ended(self) -> bool:
-        """Whether a terminal event was met."""
+        """Return whether a terminal event occurred."""
         return bool(self.watch.ended)
 
     def search(self, part: KeptStates, first: int = 0) -> int:
-        """Look between the states of a trajectory that has all of them; the number of steps before the search ended.
+        """Search between consecutive states of a trajectory; return the number of steps before the search ended.
 
         Args:
             part: the trajectory.
-            first: number of its first state in the run, for messages.
+            first: index of its first state in the run, for messages.
 
         Raises:
-            EventError: where a function is not finite.
-            StepFailedError: if a step of a part of h fails.
+            EventError: if an event function is not finite.
+            StepFailedError: if a partial step fails.
         """
         h, t, q, p = map(np.ascontiguousarray, (part.lengths, part.t, part.q, part.p))
         parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
@@ -105,7 +105,7 @@ class CrossingSearch:
         return step_failure(status, report, step=step, h=h)
 
     def crossings(self) -> tuple[Crossings, ...]:
-        """What was found, by event."""
+        """Return the crossings by event."""
         found = np.concatenate([np.empty(0, self._record), *self.found])
         return tuple(
             Crossings(event=event, t=mine["t"].copy(), q=mine["q"].copy(), p=mine["p"].copy())
@@ -115,10 +115,10 @@ class CrossingSearch:
 
 
 def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ...]:
-    """The crossings of the stepper's events along a trajectory that has all states of its run; none is terminal.
+    """Return the crossings of the stepper's events along a trajectory with all states saved; no event is terminal.
 
     Raises:
-        StateError: if states between were not kept.
+        StateError: if intermediate states were not saved.
         EventError, StepFailedError: as :meth:`CrossingSearch.search`.
     """
     lengths, spans, tolerance = states.lengths.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]

@@ -1,4 +1,4 @@
-"""Events: where functions of the state cross zero along a motion, as a user asks for them and as they are found."""
+"""Events: zero crossings of functions of the state, as specified and as detected."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class Event:
     """Zero crossings of a function g(q, v, p, t; inputs, parameters).
 
     Attributes:
-        function: g, as text of the grammar or as a SymPy expression. It may use the coordinates, their velocities
-            (``q_dot``), their momenta (``p_q``, or as the Hamiltonian calls them), time ``t``, inputs and parameters.
-        direction: 1 for crossings from negative to positive as the run goes, -1 for the opposite, 0 for both.
-        terminal: whether the first crossing ends the run; or the number of the crossing that does. Other events that
-            are crossed at the same state, such as two walls met in their corner, are recorded as well: look at all.
+        function: g, as a formula or a SymPy expression in the coordinates, their velocities (``q_dot``), their momenta
+            (``p_q``, or the names of the Hamiltonian), time ``t``, inputs and parameters.
+        direction: 1 for crossings from negative to positive in the direction of the run, -1 for the opposite, 0 both.
+        terminal: ``True`` if the first crossing ends the run, or the number of the crossing that ends it. Simultaneous
+            crossings of other events (two walls in a corner) are recorded as well.
 
     Raises:
-        EventError: for another direction.
-        StateError: for a number of crossings below 0.
+        EventError: if the function or the direction is invalid.
+        StateError: if ``terminal`` is negative.
     """
 
     function: str | Expr
@@ -55,18 +55,18 @@ class Event:
 
 
 EventLike: TypeAlias = "Event | str | Expr"
-"""An event, or its function alone."""
+"""An event, or its function."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Crossings:
-    """The crossings of one event, in the order of the run.
+    """Crossings of one event, in the order of the run.
 
-    At each of them g has its new sign or is 0, and a rounding earlier its old one: a run that starts from such a state
-    does not find the same crossing again.
+    At each of them g has its new sign or is 0; one rounding error earlier it has the old sign. A run started from such
+    a state does not detect the same crossing again.
 
     Attributes:
-        event: what was looked for.
+        event: the event.
         t: (k,) times.
         q, p: (k, m) states.
     """
@@ -80,12 +80,12 @@ class Crossings:
         return len(self.t)
 
     def chosen(self, which: NDArray[np.bool_]) -> Crossings:
-        """Return some of the crossings, by (k,) truth values."""
+        """Return the crossings selected by a (k,) boolean mask."""
         return replace(self, t=self.t[which], q=self.q[which], p=self.p[which])
 
 
 def as_events(events: EventLike | Sequence[EventLike] | None) -> tuple[Event, ...]:
-    """The events, whether one is given or several, as :class:`Event` or as functions."""
+    """Return a tuple of events from one or several events or functions."""
     if events is None:
         return ()
     several = events if isinstance(events, list | tuple) else (events,)

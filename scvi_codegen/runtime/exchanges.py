@@ -1,4 +1,4 @@
-"""What forces gave along a run: work, and impulses to momentum maps, by the curve of each step."""
+"""Work and impulse of the forces along a run, by the quadrature of each step."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["exchanged_until"]
 
 
 def exchanged_until(states: KeptStates) -> Array:
-    """(n, 1 + k) what forces gave from the first state to each: to the energy, then to momentum maps.
+    """Return (n, 1 + k) work of the forces from the first state to each, and their impulses on the momentum maps.
 
     Raises:
-        MethodError: where no forces act, and for methods that do not integrate along a curve.
-        StateError: if the states do not stand at whole steps, or steps taken again lead elsewhere.
+        MethodError: if no forces act, or the method has no curve of positions.
+        StateError: if the states are not at whole steps, or recomputed steps differ.
         StepFailedError: if Newton's iteration does not converge.
     """
     stepper = states.stepper

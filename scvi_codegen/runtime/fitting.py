@@ -1,7 +1,7 @@
-"""Parameters and initial states from measured motions: nonlinear least squares with the exact derivatives of the steps.
+"""Parameter estimation: nonlinear least squares with exact derivatives of the steps, single or multiple shooting.
 
-The motion goes from measurement to measurement by equal steps no longer than h, so that it is known at each of their
-times, and what is minimised is a smooth function of the unknowns whose slopes are those of the computed states.
+Between measurements the trajectory takes equal steps no longer than h, so that every measurement time is a step end.
+The cost is a smooth function of the unknowns, and its gradient is exact for the computed states.
 """
 
 from __future__ import annotations
@@ -28,32 +28,34 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
-"""Beside the largest change that an unknown makes by its own size: what is smaller tells nothing but rounding."""
+"""Sensitivity relative to the largest below which an unknown counts as undetermined."""
 NEARER = 4
-"""Iterations of Gauss and Newton from what was found by steps half as long."""
+"""Gauss-Newton iterations from the solution with half the step size."""
 NOTICED = 1e-6
-"""Of its size: by how much steps half as long may move one of which nothing is said."""
+"""Relative change of an unknown with half the step size below which no warning is issued."""
 SHARE = 0.1
-"""Of a direction that changes nothing: an unknown with less of it is not named."""
+"""Fraction of the largest entry of a null direction from which on an unknown is named."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit:
-    """What measurements say of a motion.
+    """Result of a parameter estimation.
 
     Attributes:
-        names: of the k unknowns: parameters, then coordinates and momenta of the initial state.
-        values: (k,) of the unknowns.
-        covariance: (k, k) of their errors, to first order, those at bounds taken as known, with not numbers in their
-            place; none are numbers where there are no more measurements than unknowns and no noise is given.
-        at_bounds: names of the unknowns that a bound holds, not the measurements.
-        parameters: of the motion, all of them by name; q, p: (m,) its initial state.
-        t: (n,) times of the measurements, the initial state being that at ``start``.
-        observed: names of the c quantities measured.
-        computed, residuals: (n, c) what the motion has there; what the measurements have beyond it.
-        deviations: (c,) standard deviations of the noise, as given, else as the residuals tell.
-        evaluations: how often the motion was computed.
-        jumps: (segments - 1, 2m) what is left between the end of each segment and the start of the next.
+        names: names of the k unknowns: parameters, then coordinates and momenta of the initial state.
+        values: (k,) estimates.
+        covariance: (k, k) covariance of the estimates, to first order. Unknowns at bounds count as known, with NaN in
+            their rows and columns; all NaN without surplus measurements and without ``deviations``.
+        at_bounds: names of the unknowns at a bound.
+        parameters: all parameters of the system by name.
+        q, p: (m,) initial state.
+        start: time of the initial state.
+        t: (n,) times of the measurements.
+        observed: names of the c measured quantities.
+        computed, residuals: (n, c) computed values, and measured minus computed values.
+        deviations: (c,) standard deviations of the noise, as passed or estimated from the residuals.
+        evaluations: number of trajectory evaluations.
+        jumps: (segments - 1, 2m) remaining discontinuities between consecutive segments.
     """
 
     names: tuple[str, ...]
@@ -74,7 +76,7 @@ class Fit:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """By the names of the unknowns."""
+        """Standard errors by the names of the unknowns."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def __str__(self) -> str:
@@ -88,7 +90,7 @@ class Fit:
 
     @property
     def plot(self) -> ResidualPlot:
-        """``fit.plot()``, ``fit.plot("residuals.png")``: the residuals over time, beside the noise; Matplotlib axes."""
+        """Plot of the residuals over time with the noise level: ``fit.plot()``, ``fit.plot("residuals.png")``."""
         return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
 
 
@@ -120,37 +122,36 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     segments: int = 1,
 ) -> Fit:
-    """Find parameters and the initial state of a motion from measurements, by nonlinear least squares.
+    """Estimate parameters and the initial state of a trajectory from measurements, by nonlinear least squares.
 
     Args:
-        stepper: system and method.
-        t: (n,) times, ascending.
-        measured: (n,) or (n, c) values; not a number where nothing was measured.
-        q, p, velocity: (m,) the initial state, one of p and velocity: a first guess, or, without ``state``, known.
-        h: steps are no longer than this.
-        parameters: first guesses of those unknown, values of the others; by default those of the system.
-        unknown: names of the parameters to find, by default all but those of inputs; the others are known.
-        state: whether the initial state is to be found, too.
+        stepper: the compiled stepper.
+        t: (n,) ascending times.
+        measured: (n,) or (n, c) values; NaN for missing measurements.
+        q, p, velocity: (m,) initial state, with one of p and velocity: initial guess, or known if ``state`` is false.
+        h: largest step size.
+        parameters: initial guesses of the unknown parameters, values of the others; defaults of the system otherwise.
+        unknown: names of the parameters to estimate, by default all but those of inputs.
+        state: whether to estimate the initial state as well.
         start: time of the initial state, by default that of the first measurement.
-        observed: what the columns of ``measured`` are, coordinates and momenta (``"p_x"``, or of a Hamiltonian their
-            own names); by default the coordinates in order.
-        deviations: number or (c,), standard deviations of the noise; by default the same for all, and told by what is
-            left.
+        observed: names of the columns of ``measured``, coordinates and momenta (``"p_x"``, or the names of the
+            Hamiltonian); by default the coordinates in order.
+        deviations: number or (c,), standard deviations of the noise; by default equal and estimated from the residuals.
         inputs: as of :meth:`Stepper.drive`.
-        bounds: (least, greatest) by names of unknowns, infinite where there is none.
-        segments: into how many parts a record is cut that is long beside the time in which nearby motions part, or
-            whose guess soon runs out of phase (multiple shooting): the state at the start of each is unknown, too, and
-            first guessed from the measurements where all coordinates are measured. They come to join in stages.
+        bounds: (lower, upper) by names of unknowns; infinite for no bound.
+        segments: number of segments for multiple shooting, for records long relative to the Lyapunov time or guesses
+            that soon lose phase. The initial state of each segment is unknown and initially guessed from the
+            measurements if all coordinates are measured. Continuity is enforced in stages.
 
     Returns:
-        A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` says where steps of h, not the measurements, tell an
-        unknown: where half as long ones would move it by more than its standard error.
+        A :class:`Fit`. An :class:`~scvi_codegen.AccuracyWarning` is issued if half the step size would change an
+        unknown by more than its standard error.
 
     Raises:
-        FitError: where the measurements do not tell an unknown, or no least squares are found.
-        MethodError: with constraints, in transformed time, and where a monitor chooses the steps.
-        StateError: on wrong shapes, names or numbers.
-        StepFailedError: if a step of the first guess fails.
+        FitError: if the measurements do not determine an unknown, or least squares do not converge.
+        MethodError: if the system has constraints or a monitor, or its time is transformed.
+        StateError: if a shape, name or number is invalid.
+        StepFailedError: if a step of the initial guess fails.
     """
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
@@ -169,7 +170,7 @@ def fit(
 def _solved(
     model: _Model, chain: Chain, x: Array, bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[Chain, Array, NDArray[np.bool_], int]:
-    """The segments as they join, the unknowns, which of them a bound holds, and how many motions that took."""
+    """Return the joined segments, the unknowns, a mask of those at bounds, and the number of evaluations."""
     from scipy.optimize import least_squares  # here: slow to import
 
     own, count = model.bounded(bounds), len(x) - len(model.names)
@@ -190,12 +191,12 @@ def _solved(
 
 @dataclass(eq=False)
 class _Model:
-    """The motion as a function of the unknowns.
+    """Trajectory as a function of the unknowns.
 
     Attributes:
-        names, guess: (k,) of the unknowns.
-        places: (k,) where they stand among (q, p, parameters).
-        known: (2m + parameters,) values of all, those of the unknowns overwritten.
+        names, guess: (k,) names and initial guesses of the unknowns.
+        places: (k,) indices of the unknowns in (q, p, parameters).
+        known: (2m + parameters,) values; those of the unknowns are overwritten.
     """
 
     measurements: Measurements
@@ -215,7 +216,7 @@ class _Model:
         *,
         state: bool,
     ) -> _Model:
-        """From what users give."""
+        """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
         own = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
         wanted = tuple(own) if unknown is None else distinct(unknown, "unknown")
@@ -244,11 +245,11 @@ class _Model:
 
     @property
     def guess(self) -> Array:
-        """(k,) to begin with."""
+        """(k,) initial guesses."""
         return self.known[self.places]
 
     def bounded(self, given: Mapping[str, tuple[float, float]]) -> Limits:
-        """(k,) and (k,) the least and the greatest of all unknowns, infinite where nothing is given."""
+        """Return (k,) lower and (k,) upper bounds of all unknowns; infinite for no bound."""
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for name, ends in given.items():
             if name not in self.names:
@@ -264,7 +265,7 @@ class _Model:
         return low, high
 
     def fit(self, chain: Chain, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
-        """What was found; ``held``: (unknowns,) by a bound."""
+        """Return the result; ``held`` is the (unknowns,) mask of those at bounds."""
         measurements, values, count = self.measurements, chain.values(x), len(self.names)
         m = measurements.stepper.dimension
         scaled, slopes = chain.scaled(x), chain.slopes(x)
@@ -293,9 +294,9 @@ class _Model:
 
 
 def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
-    """What there is to say of the unknown that steps half as long move most, in standard errors, or nothing.
+    """Return a warning if half the step size changes an unknown by more than its standard error, else "".
 
-    What moves by less than a millionth of its size is left alone: data without noise have no errors.
+    Changes below a millionth of the size of an unknown are ignored: noise-free data have no errors.
     """
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
     count, found = len(fitted.names), x.copy()
@@ -322,15 +323,15 @@ def _of_inputs(stepper: Stepper) -> set[str]:
 
 
 def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray[np.bool_]) -> None:
-    """Raise :class:`FitError` for unknowns that can change and leave all that is measured as it is.
+    """Raise :class:`FitError` for unknowns that can change without changing the computed measurements.
 
-    Each by its own size, so that units do not matter.
+    Columns are scaled by the size of the unknowns, so units do not matter.
 
     Args:
-        names: of the first unknowns; states at later nodes have none.
-        slopes: (rows, unknowns).
-        sizes: (unknowns,) of each, 0 where it is not known.
-        held: (unknowns,) by a bound.
+        names: names of the first unknowns; states of later segments have none.
+        slopes: (rows, unknowns) Jacobian of the residuals.
+        sizes: (unknowns,) typical sizes, 0 if unknown.
+        held: (unknowns,) mask of those at bounds.
     """
     if held.all():
         return
@@ -358,7 +359,7 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
 
 
 def _as_known(names: Sequence[str]) -> str:
-    """Return the advice that says how to take an unknown as known."""
+    """Return advice on treating an unknown as known."""
     return (
         f"Take {names[0] if len(names) == 1 else 'one of them'} as known: list only the parameters to find in unknown=["
         "...] (by default all are) and give values of the others in parameters={...}; state=False keeps the initial "

@@ -54,15 +54,15 @@ class GlobalError:
     """Differences between a run and others with different steps, and the estimate of its global error.
 
     Attributes:
-        requested: the wanted bound of the global error.
+        requested: requested bound of the relative global error.
         tolerance: local tolerance of the returned run, 0 for round-off.
-        t: (n,) times at which the runs were compared: at most 512 of the kept states.
-        differences: (n,) the largest of ``|dq| / |q|`` and ``|dp| / |p|`` there. The sizes are the largest up to that
-            time, at least that of the first sixteenth of the run.
-        estimate: five times the largest difference, at least the unit round-off. No bound where it is above about
-            0.1: such runs have nothing in common.
-        confirmed_until: the last time up to which five times each difference is at most the requested error.
-        runs: number of runs made.
+        t: (n,) times at which the runs were compared: at most 512 of the saved states.
+        differences: (n,) the larger of ``|dq| / |q|`` and ``|dp| / |p|``. The norms are the largest up to that time, at
+            least those of the first sixteenth of the run.
+        estimate: five times the largest difference, at least the unit round-off; meaningless above about 0.1, where the
+            runs are uncorrelated.
+        confirmed_until: last time up to which five times each difference is at most the requested error.
+        runs: number of runs.
     """
 
     requested: float
@@ -75,7 +75,7 @@ class GlobalError:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the requested error is confirmed for the whole run."""
+        """Return whether the requested error is confirmed for the whole run."""
         return self.estimate <= max(self.requested, float(np.finfo(float).eps))
 
     @property
@@ -112,7 +112,7 @@ class Confirmed:
 
 
 def checked_error(error: Any, others: Mapping[str, Any], *, monitored: bool = False) -> float:
-    """Return the wanted global error as a number; raise StateError beside other choices of the step size."""
+    """Return the requested global error as a number; raise StateError if combined with another step-size option."""
     wanted = checked_number(error, "the global error")
     if not 0.0 < wanted < 1.0:
         raise StateError(f"error={wanted:g} is no bound for the relative global error: give a number between 0 and 1")
@@ -131,7 +131,7 @@ def checked_error(error: Any, others: Mapping[str, Any], *, monitored: bool = Fa
 
 
 def _nudged(values: Any, number: int) -> Any:
-    """Return an initial vector, or several by name, changed by about the last place, in each run otherwise."""
+    """Return an initial vector, or several by name, perturbed by about the last place, differently for each run."""
     if values is None:
         return None
     if isinstance(values, Mapping):
@@ -151,12 +151,12 @@ def confirmed_run(
     """Return the run whose global error is at most ``wanted``, or the most accurate one with a warning.
 
     Args:
-        wanted: the bound.
-        integrate: makes the run that is returned.
-        again: makes the other one, without events.
+        wanted: bound of the relative global error.
+        integrate: function that makes the returned run.
+        again: function that makes the runs for comparison, without events.
         state: q, and p or the velocity.
-        common: arguments of both, the initial time ``t`` among them.
-        kept: arguments of the run that is returned: where it ends, which states it keeps.
+        common: arguments of both, including the initial time ``t``.
+        kept: arguments of the returned run only: its end and its output options.
 
     Raises:
         StepFailedError: if the most accurate run fails.
@@ -200,7 +200,7 @@ def confirmed_run(
 def _accurate(
     run: Callable[[float], Result], tolerance: float, *, last: bool
 ) -> tuple[Result | None, float, tuple[float, ...]]:
-    """Return the run of a tolerance, which may be another one, and the tolerances of those to compare it with.
+    """Return a run, its tolerance (which may differ from the requested one) and the tolerances of the other runs.
 
     ``None`` if the run fails while smaller tolerances remain.
     """
@@ -213,7 +213,7 @@ def _accurate(
 
 
 def _compared(run: Callable[[float], Any], found: Any, start: float) -> tuple[Array, Array]:
-    """Return times, and at each the relative difference of the found run and another, made up to the last of them."""
+    """Return times, and the relative differences of the returned run and another one that ends at the last time."""
     q, p = _rows(found.q), _rows(found.p)
     most = max(2, min(MOST_SAMPLES, MOST_NUMBERS // q.shape[1]))
     chosen = np.unique(np.linspace(0, len(found.t) - 1, most).astype(int))
@@ -239,20 +239,20 @@ def _compared(run: Callable[[float], Any], found: Any, start: float) -> tuple[Ar
 
 
 def _rows(values: Any) -> Array:
-    """Return states as rows, those of several arrays side by side."""
+    """Return states as rows; several arrays are concatenated."""
     if isinstance(values, Mapping):
         return np.concatenate([each.reshape(len(each), -1) for each in values.values()], axis=1)
     return np.asarray(values)
 
 
 def _sizes(states: Array, early: NDArray[np.bool_]) -> Array:
-    """Return the largest norm up to each state, at least that of the early ones."""
+    """Return the largest norm up to each state, at least that of the early states."""
     norms = _norms(states)
     return np.maximum.accumulate(np.maximum(norms, norms[early].max(initial=0.0)))
 
 
 def _norms(rows: Array) -> Array:
-    """Return the norm of each row; squares of its numbers relative to its largest are not infinite, nor all 0."""
+    """Return the norm of each row, scaled so that squares neither overflow nor underflow."""
     units = abs(rows).max(axis=1, initial=0.0)
     with np.errstate(invalid="ignore"):
         return np.asarray(units * np.linalg.norm(rows / np.where(units == 0.0, 1.0, units)[:, None], axis=1))
@@ -267,7 +267,7 @@ def _relative(one: Array, other: Array, sizes: Array) -> Array:
 def _estimated(
     wanted: float, tolerance: float, compared: tuple[Array, Array], before: GlobalError | None, start: float, runs: int
 ) -> GlobalError:
-    """Return what the differences, and those from other runs before, say of the error of the returned run."""
+    """Return the error estimate from these differences and those of earlier comparisons."""
     t, differences = compared
     if before is not None:
         differences = np.maximum(differences, before.differences)

@@ -1,4 +1,4 @@
-"""Where a run goes whose steps choose their own length."""
+"""Step plan of a run with adaptive steps: target time, tolerance or step in transformed time."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["Goal"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Goal:
-    """The time to reach, and how steps are chosen.
+    """Target time and step-size control of a run.
 
     Attributes:
-        t_end: the time.
-        tolerance: the relative error allowed to the end of each step, 0: round-off.
-        tau: in place of it the length of steps where a monitor chooses what they last.
+        t_end: target time.
+        tolerance: largest relative error of a step; 0 for round-off.
+        tau: instead of a tolerance, the constant step of fictitious time of a monitor; 0 otherwise.
     """
 
     t_end: float
@@ -27,7 +27,7 @@ class Goal:
 
     @classmethod
     def checked(cls, t_end: float, tolerance: float | None) -> Goal:
-        """As users give it; StateError for anything but a time and a relative error."""
+        """Construct from user arguments; raise ``StateError`` unless they are a finite time and a relative error."""
         if tolerance is None:
             return cls(t_end=checked_number(t_end, "t_end"))
         allowed = checked_number(tolerance, "the tolerance")
@@ -36,7 +36,7 @@ class Goal:
 
     @classmethod
     def monitored(cls, monitor: str, h: float | None, t_end: float | None, tolerance: float | None) -> Goal:
-        """Where a run leads whose steps a monitor chooses."""
+        """Construct the step plan of a stepper with a monitor from user arguments."""
         if h is None or t_end is None or tolerance is not None:
             raise StateError(
                 f"the monitor {monitor} chooses how long steps are: give their length h in the time that it transforms "

@@ -1,8 +1,8 @@
-"""How the states of a run depend on its start and its parameters: changes carried along, slopes carried back.
+"""Derivatives of a trajectory with respect to its initial state and parameters: tangent and adjoint propagation.
 
-Derivatives are those of the computed map, lengths of steps held. They are made from the kept states; where several
-steps lie between these, they are taken again, from each kept state to the next, so that runs of many steps need little
-memory (checkpoints). That a step solved anew leads where it led in the run is checked.
+Derivatives are those of the computed map with step sizes held fixed. They are evaluated from the saved states; steps
+between these are recomputed from each saved state to the next (checkpointing), so long runs need little memory.
+Recomputed steps are checked against the run.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ __all__ = [
 ]
 
 MOST_STEPS = 1024
-"""Of a piece, where all states are kept."""
+"""Largest number of steps of a segment processed at once."""
 SAME_LENGTH = 1e-9
-"""Of a step: by how much rounded times may seem to change it."""
+"""Relative difference of step sizes that rounding of times may cause."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Gradient:
-    """How a function of the states of a run, or c of them, depends on what the run started from.
+    """Gradient of one function, or of c functions, of the states of a run.
 
     Attributes:
-        q, p: (m,) or (m, c) slopes by the initial state.
-        parameters: (k,) or (k, c) by the parameters, in the order of ``stepper.parameters``.
-        t: number or (c,) by the initial time, which moves all times.
-        h: the same by the length of all steps; ``None`` of a run whose steps have several.
+        q, p: (m,) or (m, c) derivatives with respect to the initial state.
+        parameters: (k,) or (k, c) with respect to the parameters, in the order of ``stepper.parameters``.
+        t: number or (c,) with respect to the initial time, which shifts all times.
+        h: number or (c,) with respect to the common step size; ``None`` if step sizes differ.
     """
 
     q: Array
@@ -65,12 +65,12 @@ class Gradient:
 
 
 def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
-    """(n, 2m, k) what becomes of (2m, k) directions of (q, p), or (2m + parameters + 2, k) of all that is given.
+    """Return (n, 2m, k) tangent vectors at the states, from (2m, k) directions of (q, p) or (2m + parameters + 2, k).
 
-    Without any, of all 2m of (q, p): the derivative of each state.
+    Without directions the full state-transition matrices of (q, p) are returned.
 
     Raises:
-        StateError: for directions of another shape, and states that do not stand at whole steps.
+        StateError: if the directions have another shape, or the states are not at whole steps.
     """
     size = 2 * states.stepper.dimension
     given = np.eye(size) if directions is None else finite(directions, "directions")
@@ -79,10 +79,10 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
 
 
 def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
-    """(k, given) changes of all that a run starts from: directions of (q, p), or of (q, p, parameters, t, h).
+    """Return (k, given) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
 
     Raises:
-        StateError: for directions of another shape.
+        StateError: if the directions have another shape.
     """
     size, given = 2 * stepper.dimension, stepper.given
     if directions.ndim not in (1, 2) or len(directions) not in (size, given):
@@ -96,13 +96,13 @@ def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
 
 
 def sensitivity(states: KeptStates) -> Sensitivity:
-    """Of all states, by all that the run started from."""
+    """Return the derivatives of all states with respect to all inputs of the run."""
     columns, _ = forward(states, np.eye(states.stepper.given))
     return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
 
 
 def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
-    """The transpose of :func:`sensitivity` applied to (n, 2m) or (n, 2m, c) slopes of functions by the states."""
+    """Return the vector-Jacobian product of the run with (n, 2m) or (n, 2m, c) cotangents of the states."""
     slopes = checked_slopes(states.stepper, len(states), cotangents)
     seeds = seeds_of(states.stepper, slopes)
     found = backward(states, seeds, np.zeros_like(seeds[0]))
@@ -110,7 +110,7 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
 
 
 def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
-    """(n, c, given) from (n, 2m) or (n, 2m, c), or, of times, too, (n, 2m + 1) or (n, 2m + 1, c)."""
+    """Return (n, c, given) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
     size = slopes.shape[1]
     seeds = np.zeros((len(slopes), slopes[0].size // size, stepper.given))
     seeds[:, :, stepper.told[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
@@ -118,7 +118,7 @@ def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
 
 
 def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
-    """(c, given) slopes at the start, from those by each state and, now, by all that is behind the last."""
+    """Return (c, given) adjoints at the start, from the seeds of each state and the adjoints ``now`` after the last."""
     time = time_of(states)
     states, by_ends = time.states, time.seeded(seeds)
     for first, last in reversed(list(pieces(states))):
@@ -133,10 +133,10 @@ def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
 
 
 def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
-    """(n, 2m) or (n, 2m, c) as they are, in transformed time also with a slope by t behind those by (q, p).
+    """Return validated (n, 2m) or (n, 2m, c) cotangents; in transformed time they may include one of t.
 
     Raises:
-        StateError: for another shape than of so many states.
+        StateError: if the shape does not match the number of states.
     """
     size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
     sizes = {size, len(stepper.told)}
@@ -149,7 +149,7 @@ def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike)
 
 
 def gradient_of(states: KeptStates, found: Array) -> Gradient:
-    """From (given, ..) slopes."""
+    """Construct from (given, ..) derivatives."""
     m = states.stepper.dimension
     return Gradient(
         q=found[:m],
@@ -161,7 +161,7 @@ def gradient_of(states: KeptStates, found: Array) -> Gradient:
 
 
 def finite(given: ArrayLike, name: str) -> Array:
-    """An array of numbers; StateError where some are none."""
+    """Return a validated array of finite numbers."""
     array = real_array(given, name)
     if not np.isfinite(array).all():
         raise StateError(f"there are {name} that are not finite")
@@ -169,7 +169,7 @@ def finite(given: ArrayLike, name: str) -> Array:
 
 
 def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
-    """(n, told, count) what becomes of (count, given) changes at the start, and (count, given) at the end."""
+    """Return (n, told, count) tangent vectors at the states, and (count, given) at the end, from (count, given)."""
     time, told = time_of(states), states.stepper.told
     states, now = time.states, time.begun(changes)
     found = np.empty((len(states), len(told), len(now)))
@@ -186,14 +186,14 @@ def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
 
 
 def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
-    """Along the steps of a piece, whose ends are held against the states it is made of."""
+    """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
     ends = states.stepper.linearise(starts, vectors, states.parameters, states.options, back=back)
     known = np.concatenate([starts.q, starts.p], axis=1)
     refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 
 
 def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
-    """First and last number of kept states: with no steps between them but those that are kept, or just two."""
+    """Yield the first and last index of segments whose steps are all saved, or of two consecutive saved states."""
     spans, lengths = np.diff(states.stepped), states.lengths[:-1]
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
     first = 0
@@ -207,7 +207,7 @@ def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
 
 
 def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
-    """The steps of a piece, and (steps + 1,) the number of the kept state at each of their ends, -1 where none is."""
+    """Return the steps of a segment, and (steps + 1,) indices of the saved states at their ends, -1 if not saved."""
     length, span = float(states.lengths[first]), float(states.stepped[last] - states.stepped[first])
     count = steps_between(length, span) if last == first + 1 else 1
     if count == 1:
@@ -240,7 +240,7 @@ def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArra
 
 
 def _has_one_length(states: KeptStates) -> bool:
-    """Whether all steps are of h."""
+    """Return whether all steps have size h."""
     if states.goal is not None:
         return False
     spans = np.diff(states.stepped)

@@ -1,6 +1,6 @@
-"""What is summed over the steps of a motion, or of many at once, while small changes of it grow.
+"""Accumulation of the growth of tangent vectors along one or many trajectories.
 
-Changes on their way are Q R: Q orthonormal, R with columns of length 1 and the logarithms of what they had.
+Tangent vectors are represented as Q R: orthonormal Q, and R with columns of length 1 and separate logarithms of norms.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["SERIES", "Growth", "apart", "triangles"]
 
 SERIES = ("lengths", "greatest", "stretches", "rates", "mean_rates")
-"""What is told at each time that is kept, as :class:`~scvi_codegen.runtime.deviations.Deviations` describes it."""
+"""Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.deviations.Deviations`."""
 
 APART = 1e3
-"""How much longer one change may grow than another within a piece: what it costs of their digits."""
+"""Largest ratio of growth between tangent vectors within a segment; bounds the loss of significant digits."""
 
 
 class Growth:
-    """Logarithms of lengths and of diagonals of R, and the integrals of MEGNO.
+    """Logarithms of norms and of the diagonal of R, and the integrals of MEGNO.
 
     Args:
-        t: (n,) times to keep.
-        stretches: (k,) or (K, k) logarithms of the diagonal of R at the start, lengths being 1.
+        t: (n,) times of saved values.
+        stretches: (k,) or (K, k) logarithms of the diagonal of R at the start, where norms are 1.
 
     Attributes:
-        found: (5, n, k) or (5, n, K, k) :data:`SERIES` at these times; not numbers where nothing was reached.
+        found: (5, n, k) or (5, n, K, k) values of :data:`SERIES`; NaN at times that were not reached.
     """
 
     def __init__(self, t: Array, stretches: Array) -> None:
@@ -38,13 +38,13 @@ class Growth:
         self.found[:, 0] = [nothing, nothing, stretches, nothing, nothing]
 
     def add(self, t: Array, numbers: NDArray[np.intp], grown: Array, stretched: Array) -> None:
-        """Steps that follow each other; the moment of each is taken at its middle.
+        """Add consecutive steps; the integrals use the trapezoidal rule.
 
         Args:
             t: (steps + 1,) times at their ends.
-            numbers: (steps,) of the time to keep at the end of each, -1 where none is.
-            grown, stretched: (steps, .., k) logarithms since the first began; of the second only those are needed that
-                are kept, and the last.
+            numbers: (steps,) index of the saved value at the end of each step, -1 for none.
+            grown, stretched: (steps, .., k) logarithms relative to the start of the first step; of ``stretched`` only
+                the saved rows and the last are used.
         """
         times = np.abs(t - self.start).reshape(-1, *[1] * self.lengths.ndim)
         lengths = self.lengths + grown
@@ -69,7 +69,7 @@ class Growth:
 
 
 def triangles(images: Array) -> Array:
-    """(.., k, k) the R of each of (.., 2m, k)."""
+    """Return the (.., k, k) factors R of (.., 2m, k) matrices."""
     if images.shape[-1] == 1:
         found: Array = np.linalg.norm(images, axis=-2)[..., np.newaxis]
     else:
@@ -78,7 +78,7 @@ def triangles(images: Array) -> Array:
 
 
 def apart(images: Array) -> NDArray[np.bool_]:
-    """(..) whether what became of a frame, by the R (.., k, k) of it, is no longer known to nearly all digits."""
+    """Return (..) flags of the factors R (.., k, k) whose tangent vectors lost too many significant digits."""
     largest = np.abs(images).max(axis=(-2, -1))
     least = np.abs(np.diagonal(images, axis1=-2, axis2=-1)).min(axis=-1)
     parted: NDArray[np.bool_] = ~(np.maximum(largest, 1.0) <= APART * np.minimum(least, 1.0))

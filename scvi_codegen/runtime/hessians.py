@@ -1,4 +1,4 @@
-"""Second derivatives of functions of the states of a run: changes go forward, slopes and their changes back."""
+"""Second derivatives of functions of the states of a run: tangent propagation, then second-order adjoints."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ __all__ = ["bent_back", "checked_function", "hessian_product"]
 def hessian_product(
     states: KeptStates, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None
 ) -> Gradient:
-    """The derivative of the gradient of F, a function of the states, along directions.
+    """Return the Hessian-vector product of a function F of the states along directions.
 
-    With J the derivative of all states, F' and F'' the slopes of F: J^T F'' J v, and F' times the second derivative of
-    the states along v (tangent over adjoint).
+    With J the Jacobian of all states and F', F'' the derivatives of F, the result is J^T F'' J v plus F' contracted
+    with the second derivative of the states along v (tangent over adjoint).
 
     Args:
         cotangents: (n, 2m) F'.
-        directions: of (q, p), or of (q, p, parameters, t, h).
-        curvatures: (n, 2m, 2m) F'', of each state.
+        directions: directions v of (q, p), or of (q, p, parameters, t, h).
+        curvatures: (n, 2m, 2m) F'' at each state.
     """
     slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
@@ -47,7 +47,7 @@ def hessian_product(
 def checked_function(
     stepper: LinearisedMethod, count: int, cotangents: ArrayLike, curvatures: ArrayLike | None
 ) -> tuple[Array, Array]:
-    """(n, 2m) and (n, 2m, 2m) first and second slopes of one function of so many states."""
+    """Return validated (n, 2m) first and (n, 2m, 2m) second derivatives of one function of ``count`` states."""
     size, slopes = 2 * stepper.dimension, checked_slopes(stepper, count, cotangents)
     if slopes.ndim == 3:
         raise StateError(f"cotangents are those of one function, ({count}, {size}), not {slopes.shape}")
@@ -59,12 +59,12 @@ def checked_function(
 
 
 def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, now: Array) -> Array:
-    """(2, k, given) slopes at the start and their changes, where what is behind the last state has those of ``now``.
+    """Return (2, k, given) adjoints at the start and their tangents, from those ``now`` after the last state.
 
     Args:
-        slopes, bends: (n, 2m), (n, 2m, 2m) of the function.
-        changes: (k, given) at the start.
-        now: (2, k, given).
+        slopes, bends: (n, 2m) and (n, 2m, 2m) derivatives of the function.
+        changes: (k, given) tangent vectors at the start.
+        now: (2, k, given) adjoints and their tangents after the last state.
     """
     between = list(pieces(states))
     at_starts = _changes_at_starts(states, between, changes)
@@ -84,7 +84,7 @@ def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, n
 
 
 def _changes_at_starts(states: KeptStates, between: list[tuple[int, int]], changes: Array) -> list[Array]:
-    """What the directions have become at the start of each piece."""
+    """Return the tangent vectors at the start of each segment."""
     found = [changes]
     for first, last in between[:-1]:
         starts, numbers = starts_of(states, first, last)
@@ -96,7 +96,7 @@ def _changes_at_starts(states: KeptStates, between: list[tuple[int, int]], chang
 
 
 def _seeds(slopes: Array, bends: Array, moved: Array) -> Array:
-    """(n, 2, k, given) slopes of F by n states, and how they change with them."""
+    """Return (n, 2, k, given) derivatives of F with respect to n states, and their tangents."""
     size = slopes.shape[1]
     seeds = np.zeros((len(slopes), 2, *moved.shape[1:]))
     seeds[:, 0, :, :size] = slopes[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""States between those kept of a run over arrays: steps of the method itself from the kept state before."""
+"""Dense output of runs over arrays: steps of the method from the saved state before each time."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ State = Mapping[str, Numbers]
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """How a run goes on from a kept state: of what, by which steps.
+    """Data for continuing a run from a saved state.
 
     Attributes:
-        problem: with the parameters from there on.
-        h: of steps of one length.
-        goal: of others.
-        options: of the solver.
+        problem: the problem with the parameters from there on.
+        h: fixed step size.
+        goal: step plan for adaptive steps, else ``None``.
+        options: solver options.
     """
 
     problem: IndexedProblem
@@ -39,11 +39,11 @@ class Departure:
 
     @classmethod
     def of(cls, run: IndexedRun) -> Departure:
-        """That of a run as it stands."""
+        """Construct from the current state of a run."""
         return cls(run.problem, run.h, run.goal, run.options)
 
     def begin(self, t: float, q: State, p: State, *, h: float | None = None, t_end: float | None = None) -> IndexedRun:
-        """A run from a state, by steps of h, or to a time by others."""
+        """Return a run from a state, with fixed steps h or with adaptive steps to t_end."""
         goal = replace(self.goal, t_end=t_end) if self.goal and t_end is not None else None
         length = 0.0 if goal else self.h if h is None else h
         return IndexedRun(self.problem, q, (p, "momenta"), h=length, t=t, goal=goal, options=self.options)
@@ -52,7 +52,7 @@ class Departure:
 def states_between(
     departures: tuple[Departure, ...], t: Numbers, q: State, p: State, times: Numbers
 ) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-    """Positions and momenta at (n,) times within (k,) kept ones, by name; raises as :meth:`IndexedTrajectory.at`."""
+    """Return positions and momenta by name at (n,) times; raises as :meth:`IndexedTrajectory.at`."""
     flat = within(times.ravel(), t[0], t[-1])
     forward = math.copysign(1.0, t[-1] - t[0])
     left = np.searchsorted(forward * t, forward * flat, side="right") - 1
@@ -69,7 +69,7 @@ def states_between(
 
 
 def _shaped(states: Sequence[State], kept: State, shape: tuple[int, ...]) -> dict[str, Numbers]:
-    """Arrays of states by name, of the shape of the times."""
+    """Return arrays by name, stacked to the shape of the times."""
     return {
         name: np.array([state[name] for state in states]).reshape(*shape, *values.shape[1:])
         for name, values in kept.items()
@@ -79,7 +79,7 @@ def _shaped(states: Sequence[State], kept: State, shape: tuple[int, ...]) -> dic
 def _behind(
     departure: Departure, t: float, start: tuple[State, State], times: NDArray[np.float64]
 ) -> Iterator[tuple[dict[str, Numbers], dict[str, Numbers]]]:
-    """States at times in the order of the run: so many whole steps, and a part of one; or steps to each."""
+    """Yield the states at sorted times: whole steps and one partial step, or adaptive steps to each time."""
     if departure.goal is not None:
         for time in times:
             run = departure.begin(t, *start, t_end=float(time))

@@ -1,4 +1,4 @@
-"""States of runs over arrays and their constraints: how far they are off, the nearest that is on, what holds them."""
+"""Constraints of runs over arrays: residuals, projection, Lagrange multipliers, initial consistency."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", 
 
 
 MOST_DENSE = 64
-"""Coordinates, and constraints, whose Jacobian is made row by row to find its rank."""
+"""Largest numbers of coordinates and of constraints for which the rank of the dense Jacobian is checked."""
 
 
 class RunOfArrays(Protocol):
-    """What is asked of a run.
+    """Interface required of a run.
 
     Attributes:
-        problem: what moves.
-        options: of the solver.
-        state: positions and momenta, in a row.
+        problem: the problem.
+        options: solver options.
+        state: positions and momenta in one vector.
     """
 
     problem: IndexedProblem
@@ -42,23 +42,23 @@ class RunOfArrays(Protocol):
 
     @property
     def t(self) -> float:
-        """The time."""
+        """Current time."""
         ...
 
     def call(self, name: str, *arguments: Any) -> int:
-        """What a function of C says of it."""
+        """Call a C function with the current state and return its status."""
         ...
 
 
 def constraint_values(run: RunOfArrays) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
-    """g, and its rate, of each constraint as it was written, an array over its loops."""
+    """Return g and its rate for each constraint, as arrays over its loops."""
     found = np.zeros(_count(run)), np.zeros(_count(run))
     run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
     return _apart(run, found[0]), _apart(run, found[1])
 
 
 def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
-    """Multipliers lambda of the forces G^T lambda that keep the state on each constraint, an array over its loops."""
+    """Return the multipliers lambda of the forces G^T lambda of each constraint, as arrays over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
         raise StateError(f"the constraints of {run.problem.interface.system} leave no forces here ({STATUS[status]})")
@@ -66,10 +66,10 @@ def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
 
 
 def consistent(run: RunOfArrays) -> None:
-    """Put the state a run begins with on the constraints: silently by what rounding and typing explain, or say so.
+    """Project the initial state of a run onto the constraints; warn unless rounding explains the distance.
 
     Raises:
-        StateError: if it is far off, and where there is no state near that meets them.
+        StateError: if the state is far from the constraints, or the projection fails.
     """
     g, rate = constraint_values(run)
     before, moved = project(run)
@@ -90,10 +90,10 @@ def consistent(run: RunOfArrays) -> None:
 
 
 def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
-    """Put the state on the constraints; returned are the one before, and how far positions and momenta were off.
+    """Project the state onto the constraints; return the previous state and the relative changes of q and of p.
 
     Raises:
-        StateError: where there is no state near that meets them.
+        StateError: if the projection fails.
     """
     before, report = run.state.copy(), run.problem.binding.new("report *")
     status = run.call("project", run.problem.struct, run.problem.binding.options(run.options), report)
@@ -110,7 +110,7 @@ def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
 
 
 def check_reachable(run: RunOfArrays) -> None:
-    """Raise :class:`StateError` where changed parameters put constraints elsewhere; momenta follow rates that jump."""
+    """Raise :class:`StateError` if changed parameters move position constraints; momenta follow rates that jump."""
     before, (moved, _) = project(run)
     if moved > TYPED:
         run.state[:] = before
@@ -122,7 +122,7 @@ def check_reachable(run: RunOfArrays) -> None:
 
 
 def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
-    """What :func:`refusal` returns, "" where there are too many numbers for dense linear algebra."""
+    """Return the message of :func:`refusal`; "" if the system is too large for dense linear algebra."""
     n, count = len(run.state) // 2, _count(run)
     if max(n, count) > MOST_DENSE:
         return ""
@@ -134,7 +134,7 @@ def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
         run.state[:n] = q
         for k, rate in enumerate(rates):
             run.state[n:] = 0.0
-            run.state[n:][k - 1 : k] = masses[k - 1 : k]  # nothing moves before the first
+            run.state[n:][k - 1 : k] = masses[k - 1 : k]  # k = 0: velocity 0, the slice is empty
             run.call("constraint_values", run.problem.struct, pointer(g), pointer(rate))
         return g, (rates[1:] - rates[0]).T
 
@@ -156,12 +156,12 @@ def _count(run: RunOfArrays) -> int:
 
 
 def _shapes(run: RunOfArrays) -> list[list[int]]:
-    """Of each constraint as it was written."""
+    """Return the shape of the loops of each constraint."""
     return [_shape(loops, run.problem.arrays.sizes) for loops in run.problem.interface.constraints]
 
 
 def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
-    """By constraints as they were written."""
+    """Split a vector into one array per constraint."""
     found, start = [], 0
     for shape in _shapes(run):
         size = int(np.prod(shape))
@@ -171,7 +171,7 @@ def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
 
 
 def _shape(loops: Sequence[Loop], sizes: Mapping[str, int]) -> list[int]:
-    """An axis a loop, but one alone of two that are a pair."""
+    """Return one axis per loop; the two loops of a pair share one axis."""
     outer = {loop.behind for loop in loops}
     spans = [(loop, loop.end.at(sizes) - loop.first.at(sizes)) for loop in loops if loop.index not in outer]
     return [span * (span - 1) // 2 if loop.behind else span for loop, span in spans]

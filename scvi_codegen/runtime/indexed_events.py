@@ -1,9 +1,9 @@
-"""Zeros of functions of the state along a run over arrays.
+"""Event detection along a run over arrays.
 
-A function is a formula of the grammar of sums over indices, in coordinates, velocities, momenta, parameters and t. It
-is looked at after every step; where its sign changed, the step is taken again in parts, of which each is as accurate as
-the method, until the zero is found to the last bit of its time (Brent's method). Two zeros within a step are not seen,
-but where a run starts at a zero and moves away from it: a ball that was thrown back returns within a step.
+An event function is a formula in index notation of coordinates, velocities, momenta, parameters and t. It is evaluated
+after every step. After a sign change the step is repeated in parts, each as accurate as the method, until the zero is
+located to the last bit of its time (Brent's method). Two zeros within one step are missed, except when a run starts at
+a zero and leaves it: a ball that bounces and returns within a step is detected.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
 __all__ = ["IndexedCrossings", "IndexedSearch"]
 
 Sample: TypeAlias = tuple[float, float]
-"""A part of a step, and a function there."""
+"""Fraction of a step, and the function value there."""
 LAST_BIT = 2.0**-52
-"""Of a step."""
+"""Machine precision, relative to a step."""
 TIE = 2.0**-30
-"""Of a step: crossings nearer to each other may be one."""
+"""Fraction of a step within which crossings of different events count as simultaneous."""
 AT_ZERO, AT_REST = 16.0 * LAST_BIT, 4.0 * LAST_BIT
-"""Of the change of a function in a step: what the search for a zero leaves, and a change that may be rounding."""
+"""Fractions of the change of a function in a step: remainder of a located zero, and change explained by rounding."""
 PROBES = tuple(2.0**-place for place in range(40, -1, -1))
-"""Parts of a first step at which a function that starts at a zero is looked at."""
+"""Fractions of a first step at which a function that starts at a zero is evaluated."""
 RATE_PART = 2.0**-50
-"""Of a first step, which tells the rates of the state by its low words: shorter than to any probe."""
+"""Fraction of a first step over which state rates are computed from low words; shorter than any probe."""
 LEAST_DIFFERENCE, RELATIVE_DIFFERENCE = 2.0**-10, 2.0**-17
-"""Of the first step, and of the coordinates: over what a rate is a difference."""
+"""Increments of the finite differences: fraction of the first step, and relative to the coordinates."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IndexedCrossings:
-    """The crossings of one event, in the order of the run.
+    """Crossings of one event, in the order of the run.
 
     Attributes:
-        event: what was looked for.
+        event: the event.
         t: (k,) times.
-        q, p: (k, ..) positions and momenta by the name of their array.
+        q, p: (k, ..) positions and momenta by array name.
     """
 
     event: Event
@@ -63,16 +63,16 @@ class IndexedCrossings:
         return len(self.t)
 
     def chosen(self, which: NDArray[np.bool_]) -> IndexedCrossings:
-        """Return some of the crossings, by (k,) truth values."""
+        """Return the crossings selected by a (k,) boolean mask."""
         q, p = ({name: each[which] for name, each in part.items()} for part in (self.q, self.p))
         return replace(self, t=self.t[which], q=q, p=p)
 
 
 class IndexedSearch:
-    """Looks for the zeros of functions along a run, step by step.
+    """Search for zeros of event functions along a run, step by step.
 
     Raises:
-        EventError: for what is no formula, for an index that leaves its array, and where a function is not finite.
+        EventError: if a formula is invalid, an index leaves its array, or a function is not finite.
     """
 
     def __init__(self, run: IndexedRun, events: Sequence[Event]) -> None:
@@ -85,7 +85,7 @@ class IndexedSearch:
         self.started = False
 
     def step(self) -> None:
-        """One step of the run, or the part of it that leads to a terminal event."""
+        """Take one step of the run, or the part of it up to a terminal event."""
         run, before, values = self.run, self.run.mark, self.values
         run.advance(1)
         self.values = self._values(run)
@@ -109,16 +109,16 @@ class IndexedSearch:
                 return
 
     def _take(self, k: int, there: IndexedRun) -> bool:
-        """Keep a crossing; return whether it ends the run."""
+        """Record a crossing; return whether it ends the run."""
         self.found[k].append((there.t, there.q, there.p))
         self.remaining[k] -= 1
         return self.remaining[k] == 0
 
     def _leaves_zero(self, before: IndexedMark, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
-        """Samples between the ends of a first step that begins at a zero, on the side from which the run came to it.
+        """Return samples within a first step that begins at a zero, as if the run had come from the other side.
 
         Raises:
-            EventError: for a terminal event, where the run returns within a rounding error.
+            EventError: if the run returns to a terminal event within a rounding error.
         """
         (_, old), (_, new) = ends
         start = self.run.apart(h)
@@ -143,7 +143,7 @@ class IndexedSearch:
         return found
 
     def _rounding(self, start: IndexedRun, k: int, old: float) -> float:
-        """By how much a function changes if coordinates change by an ulp, up or down."""
+        """Return the change of a function when coordinates change by one ulp up or down."""
         rng, found = np.random.default_rng(0), 0.0
         for _ in range(4):
             ulps = LAST_BIT * np.abs(start.state) * rng.choice([-1.0, 1.0], start.state.size)
@@ -153,7 +153,7 @@ class IndexedSearch:
     def _first_change(
         self, before: IndexedMark, start: IndexedRun, k: int, h: float, noise: float
     ) -> tuple[float, float]:
-        """dg/dt h of a function at the start of a step, and its uncertainty; zeros where g is undefined near it."""
+        """Return h dg/dt at the start of a step and its uncertainty; zeros if g is undefined nearby."""
         n, part, next_ = start.problem.count, RATE_PART, self._part(before, RATE_PART * h)
         low = [np.concatenate([run._numbers["carry_q"], run._numbers["carry_p"]]) for run in (start, next_)]
         along_q = ((next_.state - start.state) + (low[1] - low[0])) / part
@@ -169,12 +169,12 @@ class IndexedSearch:
         return by_q + by_rest, noise / size + (noise / LEAST_DIFFERENCE if by_rest else 0.0)
 
     def _difference(self, start: IndexedRun, k: int, dt: float, along: Numbers, size: float) -> float:
-        """The central difference of a function along a direction."""
+        """Return the central difference of a function along a direction."""
         above, below = (self._moved(start, k, start.t + part * dt, part * along) for part in (size, -size))
         return (above - below) / (2.0 * size)
 
     def _moved(self, start: IndexedRun, k: int, t: float, change: Numbers) -> float:
-        """A function at a changed state."""
+        """Return a function at a perturbed state."""
         state, when = start.state.copy(), start.t
         start.state += change
         start._run.t = t
@@ -185,7 +185,7 @@ class IndexedSearch:
             start._run.t = when
 
     def crossings(self) -> tuple[IndexedCrossings, ...]:
-        """What was found, by event."""
+        """Return the crossings by event."""
         names = [array.name for array in self.run.interface.coordinates]
         return tuple(
             IndexedCrossings(
@@ -198,13 +198,13 @@ class IndexedSearch:
         )
 
     def _end(self, before: IndexedMark, there: IndexedRun) -> None:
-        """The run stands where a terminal event ended it."""
+        """Leave the run at the state of a terminal event."""
         self.run.rewind(before)
         self.run.stand_at(there)
         self.ended = True
 
     def _zero(self, before: IndexedMark, k: int, h: float, left: Sample, right: Sample) -> float:
-        """The part of a step after which a function first has its new sign, or is 0; between two samples."""
+        """Return the fraction of a step, between two samples, at which a function is 0 or first has its new sign."""
         from scipy.optimize import brentq  # here: slow to import
 
         known = dict((left, right))
@@ -218,7 +218,7 @@ class IndexedSearch:
         return part
 
     def _part(self, before: IndexedMark, h: float) -> IndexedRun:
-        """The state after a part of a step."""
+        """Return the state after a partial step."""
         run = self.run.apart(h)
         run.rewind(replace(before, moments={**before.moments, "h": h}))
         run.goal = None
@@ -236,12 +236,12 @@ class IndexedSearch:
 
 
 def _crosses(event: Event, old: float, new: float) -> bool:
-    """Whether a sign changed, in the direction that is looked for; zeros at the beginning of a step are none."""
+    """Return whether a sign changed in the direction of the event; a zero at the start of a step does not count."""
     return old != 0.0 and old * new <= 0.0 and (event.direction == 0 or (new > old) == (event.direction > 0))
 
 
 class _Function:
-    """A function of the state."""
+    """Event function of the state."""
 
     def __init__(self, run: IndexedRun, event: Event) -> None:
         interface, arrays = run.interface, run.problem.arrays
@@ -269,12 +269,12 @@ class _Function:
 
 
 def _velocities(interface: IndexedInterface) -> dict[str, str]:
-    """The array of velocities by that of its coordinates."""
+    """Return the names of the velocity arrays by coordinate array."""
     return {} if interface.momenta else {array.name: f"{array.name}_dot" for array in interface.coordinates}
 
 
 def _momenta(interface: IndexedInterface) -> dict[str, str]:
-    """The array of momenta by that of its coordinates."""
+    """Return the names of the momentum arrays by coordinate array."""
     own = [array.name for array in interface.momenta] or [f"p_{array.name}" for array in interface.coordinates]
     return dict(zip((array.name for array in interface.coordinates), own, strict=True))
 
@@ -295,7 +295,7 @@ def _terms(interface: IndexedInterface, event: Event) -> tuple[IndexedTerm, ...]
 
 
 def _arrays_of(run: IndexedRun, names: set[str]) -> dict[str, NDArray[np.float64]]:
-    """Arrays of a state by name, those that occur."""
+    """Return the arrays of a state that occur in ``names``."""
     found = {**run.q, **run.problem.arrays.fields}
     for others, state in ((_velocities(run.interface), "velocity"), (_momenta(run.interface), "p")):
         if names & set(others.values()):

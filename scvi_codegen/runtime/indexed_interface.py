@@ -1,4 +1,4 @@
-"""What a caller must know of an integrator of sums over indices, and the arrays of a run held against it."""
+"""Interface of an integrator of an indexed system, and validation of the arrays of a run."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ Places = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedInterface:
-    """Names and shapes.
+    """Names and shapes of a generated integrator.
 
     Attributes:
-        prefix: beginning of every exported C name.
-        title, system, method: in words.
+        prefix: prefix of every exported C name.
+        title, system, method: descriptive names.
         sizes: names of sizes, in the order of the C struct.
-        coordinates, fields, tables: arrays in that order.
-        momenta: of a Hamiltonian.
-        parameters, defaults: numbers.
-        field_defaults: what fields are filled with unless they are given.
-        maps: what symmetries conserve.
-        accesses: every access of an array, with the loops around it.
-        depends_on_time: whether energy is not conserved.
-        inputs: names of functions of time given as data, each five of the parameters.
-        solver: of the equations of a step, in a word.
-        constraints: the loops of each.
-        conserves_energy: whether the motion of a Lagrangian does.
-        continued: whether steps are guessed from those before, not begun with the forces that these ended with.
+        coordinates, fields, tables: array declarations, in that order.
+        momenta: momentum arrays of a Hamiltonian system.
+        parameters, defaults: names and default values of scalar parameters.
+        field_defaults: fill values of fields that are not passed.
+        maps: momentum maps.
+        accesses: every array access, with the loops around it.
+        depends_on_time: whether L or H depends on t explicitly.
+        inputs: names of inputs; each occupies five parameters.
+        solver: solver of the stage equations.
+        constraints: loops of each constraint.
+        conserves_energy: whether the Lagrangian system conserves energy.
+        continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
     """
 
     prefix: str
@@ -73,13 +73,13 @@ class IndexedInterface:
 
     @property
     def integrator(self) -> str:
-        """What a saved run is of, in words: one of another solver has other memory."""
+        """Identification of saved runs; runs of another solver have another memory layout."""
         return f"{self.title}, {self.solver}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunArrays:
-    """What a run is over: sizes, positions, fields and tables by name, numbers in the order of the parameters."""
+    """Data of a run: sizes, positions, fields and tables by name, and scalar parameters in order."""
 
     sizes: dict[str, int]
     state: dict[str, Numbers]
@@ -94,10 +94,10 @@ def read_arrays(
     parameters: Mapping[str, ArrayLike] | None,
     tables: Mapping[str, ArrayLike] | None,
 ) -> RunArrays:
-    """The arrays of a run, held against their declarations and each other.
+    """Return the arrays of a run, validated against their declarations and each other.
 
     Raises:
-        StateError: on wrong names, shapes and numbers, and where an index would leave its array.
+        StateError: if a name, shape or number is invalid, or an index would leave its array.
     """
     places, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.coordinates]
@@ -116,10 +116,10 @@ def read_arrays(
 def read_state(
     interface: IndexedInterface, given: ArrayLike | Mapping[str, ArrayLike], what: str
 ) -> dict[str, Numbers]:
-    """Arrays of coordinates (or of velocities, momenta) by name, from a mapping, or the only one as such.
+    """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
 
     Raises:
-        StateError: for names, numbers of axes and numbers that do not fit.
+        StateError: if a name, a number of axes or a value is invalid.
     """
     names = [array.name for array in interface.coordinates]
     if not isinstance(given, Mapping):
@@ -131,7 +131,7 @@ def read_state(
 
 
 def number_values(interface: IndexedInterface, given: Mapping[str, ArrayLike]) -> list[float]:
-    """The numbers among the parameters, in order."""
+    """Return the scalar parameters in order."""
     known = dict(zip(interface.parameters, interface.defaults, strict=True))
     _check_named(given, [*known, *(field.name for field in interface.fields)], "parameters", whole=False)
     return [checked_number(given.get(name, value), name) for name, value in known.items()]
@@ -140,7 +140,7 @@ def number_values(interface: IndexedInterface, given: Mapping[str, ArrayLike]) -
 def field_values(
     interface: IndexedInterface, given: Mapping[str, ArrayLike], sizes: Mapping[str, int]
 ) -> dict[str, Numbers]:
-    """The arrays among the parameters by name, in full; a number fills one."""
+    """Return the field arrays by name, in full shape; a scalar fills its array."""
     found = {}
     for array, default in zip(interface.fields, interface.field_defaults, strict=True):
         values = real_array(given.get(array.name, default), array.name)
@@ -153,7 +153,7 @@ def field_values(
 
 
 def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | None) -> dict[str, Places]:
-    """The tables by name: read-only copies, so that no index changes after it was checked."""
+    """Return read-only copies of the tables by name, so that indices cannot change after validation."""
     _check_named(given or {}, [table.name for table in interface.tables], "tables", whole=True)
     found = {}
     for table in interface.tables:
@@ -177,16 +177,16 @@ def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | No
 
 
 def _kept(array: NDArray[Any]) -> NDArray[Any]:
-    """The array, read-only from here on: the C code keeps a pointer to it."""
+    """Make an array read-only and return it: C code keeps a pointer to it."""
     array.flags.writeable = False
     return array
 
 
 def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[str]) -> dict[str, int]:
-    """The value of every size, from the shapes of arrays.
+    """Return the value of every size, from the shapes of arrays.
 
     Raises:
-        StateError: where two arrays say different things, and where none says any.
+        StateError: if two arrays imply different values, or none implies any.
     """
     found: dict[str, tuple[int, Array]] = {}
     for array, shape in arrays:
@@ -201,12 +201,12 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
 
 
 def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, Places]) -> None:
-    """Raise :class:`StateError` where, with these sizes and tables, an access leaves its array, or an index a table."""
+    """Raise :class:`StateError` if an access leaves its array, or an index its table, for these sizes and tables."""
     rows = {table.name: table for table in interface.tables}
     for access, loops in interface.accesses:
         spans = {loop.index: loop for loop in loops}
         if any(loop.end.at(sizes) <= loop.first.at(sizes) for loop in loops):
-            continue  # nothing is summed
+            continue  # empty loop
         for k, place in enumerate(access.places):
             if place.table:
                 _check_span(f"{place}", _span(spans[place.index], sizes), rows[place.table], 0, sizes)
@@ -215,7 +215,7 @@ def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables
 
 
 def table_limits(interface: IndexedInterface, sizes: Mapping[str, int]) -> list[tuple[str, list[int]]]:
-    """Of each table and each of its columns the length of the shortest axis that its numbers are places on."""
+    """Return for each table and column the length of the shortest axis that its entries index."""
     found = {table.name: [2**31] * table.axes[1].number for table in interface.tables}
     for access, _ in interface.accesses:
         for axis, place in zip(access.array.axes, access.places, strict=True):
@@ -228,7 +228,7 @@ def table_limits(interface: IndexedInterface, sizes: Mapping[str, int]) -> list[
 def _places(
     place: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, Places], length: int
 ) -> tuple[int, int]:
-    """The first and the last place on an axis of a length."""
+    """Return the smallest and the largest index on an axis of a given length."""
     if place.table:
         column = tables[place.table][:, place.column]
         return int(column.min()), int(column.max())
@@ -242,7 +242,7 @@ def _places(
 
 
 def _span(loop: Loop, sizes: Mapping[str, int]) -> tuple[int, int]:
-    """The first and the last value of an index."""
+    """Return the first and the last value of a loop index."""
     return loop.first.at(sizes), loop.end.at(sizes) - 1
 
 

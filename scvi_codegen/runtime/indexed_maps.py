@@ -1,4 +1,4 @@
-"""Values of momentum maps of arrays."""
+"""Momentum maps of arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["momentum_of"]
 
 
 def momentum_of(q: Numbers, p: Numbers, of: IndexedMap) -> float:
-    """Of positions and momenta of one array."""
+    """Return the value of a momentum map from the positions and momenta of its array."""
     if of.phase:
         return float(np.sum(q**2 + p**2) / 2)
     if of.component is None:

@@ -1,4 +1,4 @@
-"""Memory of runs over arrays: numbers on the boundary of a vector, places, and what constraints need of both."""
+"""Memory of runs over arrays: SIMD-aligned vectors, index arrays and workspace of constraints."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from scvi_codegen.runtime.indexed_interface import Numbers
 __all__ = ["MOMENTS", "STATE", "IndexedMark", "aligned", "held_memory"]
 
 CHOICE = ("rung", "change", "change_before", "direction", "rejected", "error_before")
-"""Of steps that choose their length."""
+"""Fields of the C struct that control adaptive steps."""
 MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
-"""Of a run, beside its arrays."""
+"""Scalar fields of the C struct of a run."""
 STATE = ("q", "p", "carry_q", "carry_p")
-"""Arrays of numbers that change from step to step, but for what guesses are made of."""
+"""Arrays of the state: positions, momenta and their compensation terms."""
 ALIGNMENT = 64
-"""Bytes: those of the widest vector."""
+"""Alignment in bytes, the size of the widest SIMD register."""
 
 
 @dataclass(frozen=True, slots=True)
 class IndexedMark:
-    """A state of a run: its arrays, its numbers, sweeps up to it."""
+    """Snapshot of a run: arrays, scalar fields and total solver iterations."""
 
     arrays: Mapping[str, Numbers]
     moments: Mapping[str, Any]
@@ -35,7 +35,7 @@ class IndexedMark:
 
 
 def aligned(count: int) -> Numbers:
-    """So many zeros, the first on the boundary of a vector."""
+    """Return ``count`` zeros, aligned to a SIMD register."""
     try:
         memory = np.zeros(count + ALIGNMENT // 8)
     except (MemoryError, ValueError) as error:
@@ -45,12 +45,12 @@ def aligned(count: int) -> Numbers:
 
 
 def held_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, NDArray[Any]]:
-    """What a run whose states are held by constraints needs beside, by the name of its place in the C struct.
+    """Allocate the memory of constraints, by the name of its pointer in the C struct.
 
     Args:
-        binding: of the integrator.
-        run, problem: C structs; the numbers of constraints, entries and pairs are entered in the first.
-        n: the number of coordinates.
+        binding: binding of the integrator.
+        run, problem: C structs; the counts of constraints, entries and pairs are stored in ``run``.
+        n: number of coordinates.
     """
     binding.function("constraint_sizes")(problem, run)
     count, entries = run.constraints, run.entries

@@ -1,4 +1,4 @@
-"""What runs over arrays are of: sizes, tables and parameters, as C takes them."""
+"""Problem data of runs over arrays: sizes, tables and parameters in a C struct."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["IndexedProblem"]
 
 
 class IndexedProblem:
-    """The C struct, and the arrays that it points to.
+    """C struct of a problem and the arrays to which it points.
 
     Attributes:
-        interface, binding: of the integrator.
-        arrays: what it is made from; its state is that of the start.
-        awaited: inputs that nobody gave: no step is made before.
-        struct: of C.
+        interface, binding: those of the integrator.
+        arrays: the data of the problem; its state is the initial one.
+        awaited: inputs that are not set; steps require all inputs to be set.
+        struct: the C struct.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class IndexedProblem:
 
     @property
     def count(self) -> int:
-        """Of coordinates."""
+        """Number of coordinates."""
         return int(self.binding.function("coordinates")(self.struct))
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Numbers and arrays by name."""
+        """Scalar and array parameters by name."""
         return self._numbers | self.arrays.fields
 
     @property
@@ -58,10 +58,10 @@ class IndexedProblem:
         return dict(zip(self.interface.parameters, self.arrays.numbers, strict=True))
 
     def with_parameters(self, given: Mapping[str, ArrayLike] | Sequence[float] | Numbers) -> Self:
-        """The same with others: by name, the rest staying; or all numbers in order.
+        """Return the problem with other parameters: by name, the others unchanged; or all scalars in order.
 
         Raises:
-            StateError: for names, shapes and numbers that do not fit.
+            StateError: if a name, shape or number is invalid.
         """
         missing = inputs_not_given(self.interface, given)
         if not isinstance(given, Mapping):
@@ -72,10 +72,10 @@ class IndexedProblem:
         return self._with(replace(self.arrays, numbers=numbers, fields=fields), missing)
 
     def held(self, inputs: Mapping[str, float]) -> Self:
-        """The same with inputs held at numbers.
+        """Return the problem with inputs set to constant values.
 
         Raises:
-            StateError: for a name that is no input.
+            StateError: if a name is no input.
         """
         values: dict[str, float] = {}
         for name, value in inputs.items():
@@ -88,6 +88,6 @@ class IndexedProblem:
         return self._with(replace(self.arrays, numbers=numbers), missing)
 
     def _with(self, arrays: RunArrays, missing: tuple[str, ...]) -> Self:
-        """The same with other numbers, of which these inputs are not yet some."""
+        """Return the problem with other arrays, in which the inputs ``missing`` are still not set."""
         awaited = tuple(name for name in self.awaited if name in missing)
         return type(self)(self.interface, self.binding, arrays, awaited)

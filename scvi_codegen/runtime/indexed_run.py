@@ -1,4 +1,4 @@
-"""A run over arrays of any size: its memory, steps, energy."""
+"""Run of an indexed system: its memory, steps and energy."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ FAILURES_BY_SOLVER = {
 
 
 class IndexedRun(OneThread):
-    """The memory of a run; made by :meth:`IndexedStepper.start`.
+    """Run of an indexed system; made by :meth:`IndexedStepper.start`.
 
     Args:
-        problem: what moves.
+        problem: problem data.
         q: positions by name, of the shapes of the problem.
-        moving: momenta, velocities or nothing, by name, and what they are.
-        h, t: the step, 0 where steps choose their length; the time.
-        goal: where such steps lead.
-        options: when sweeps end.
-        threads: how many share each step.
+        moving: momenta, velocities or ``None``, by name, and the word ``"momenta"`` or ``"velocities"``.
+        h, t: step size (0 for adaptive steps) and initial time.
+        goal: step plan of adaptive steps.
+        options: convergence criterion of the solver.
+        threads: number of threads per step.
 
     Attributes:
-        problem: its parameters may change on the way.
-        goal, options, threads: as given.
-        state: positions and momenta of all coordinates, in a row.
-        iterations: sweeps of all steps yet.
+        problem: current problem data; its parameters may change during the run.
+        goal, options, threads: as above.
+        state: positions and momenta of all coordinates in one vector.
+        iterations: total solver iterations.
     """
 
     def __init__(
@@ -92,17 +92,17 @@ class IndexedRun(OneThread):
 
     @property
     def interface(self) -> IndexedInterface:
-        """Names and shapes."""
+        """Names and shapes of the integrator."""
         return self.problem.interface
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Value of each size."""
+        """Values of the sizes by name."""
         return self.problem.arrays.sizes
 
     def _start(self, state: Mapping[str, Numbers], moving: tuple[Any, str], h: float, t: float) -> None:
         n = self.problem.count
-        self.state, rest_of = aligned(2 * n), aligned(2 * n)  # of a Hamiltonian momenta stand behind positions
+        self.state, rest_of = aligned(2 * n), aligned(2 * n)  # Hamiltonian kernels expect p directly after q
         self._numbers = {"q": self.state[:n], "p": self.state[n:], "carry_q": rest_of[:n], "carry_p": rest_of[n:]}
         self._numbers["inverse_mass"] = aligned(n)
         self._numbers["work"] = aligned(n * self._binding.constant("WORK"))
@@ -138,12 +138,12 @@ class IndexedRun(OneThread):
         h: float | None = None,
         goal: Goal | None = None,
     ) -> None:
-        """Go on with other parameters (arrays of them, too), another step, another goal; what is not given stays.
+        """Set parameters (scalars and arrays), step size or step plan; what is omitted is unchanged.
 
-        Momenta stay where masses change.
+        Momenta are unchanged if masses change.
 
         Raises:
-            StateError: for names, shapes and numbers that do not fit.
+            StateError: if a name, shape or number is invalid.
         """
         if parameters is not None:
             self._take(self.problem.with_parameters(parameters))
@@ -152,7 +152,7 @@ class IndexedRun(OneThread):
         self.goal = goal or self.goal
 
     def _take(self, problem: IndexedProblem) -> None:
-        """Go on with another of the same sizes, by forces of its own: those that were kept are others, guesses stay."""
+        """Set another problem of equal sizes; reused forces are discarded, an extrapolated predictor is kept."""
         former, self.problem = self.problem, problem
         self._run.guess *= self.interface.continued
         self._find_masses()
@@ -165,12 +165,12 @@ class IndexedRun(OneThread):
 
     @alone
     def set_inputs(self, **inputs: float) -> None:
-        """Go on with inputs held at numbers: between the samples of a controller."""
+        """Set inputs to constant values for the following steps (zero-order hold)."""
         self._take(self.problem.held(inputs))
 
     @alone
     def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
-        """A run of its own from the present state, to the last bit, by other steps."""
+        """Return an independent run from the present state, bitwise equal, with another step size or step plan."""
         beside: dict[str, Any] = {"goal": goal, "options": self.options, "threads": self.threads}
         other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **beside)
         for name in ("carry_q", "carry_p"):
@@ -180,21 +180,21 @@ class IndexedRun(OneThread):
 
     @property
     def mark(self) -> IndexedMark:
-        """The present state, for :meth:`rewind`."""
+        """Snapshot of the present state for :meth:`rewind`."""
         kept = {name: self._numbers[name].copy() for name in STATE}
         moments = {name: getattr(self._run, name) for name in MOMENTS}
         return IndexedMark(kept, moments, self.iterations)
 
     @alone
     def stand_at(self, other: IndexedRun) -> None:
-        """The state and the time of another run of the same problem; no step more, and the next without a guess."""
+        """Copy state and time of another run of the same problem; keep the step count, reset the predictor."""
         for name in STATE:
             self._numbers[name][:] = other._numbers[name]
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
     @alone
     def rewind(self, mark: IndexedMark) -> None:
-        """Back to a state; the next step begins without a guess."""
+        """Restore a snapshot; the predictor of the next step is reset."""
         for name, values in mark.arrays.items():
             self._numbers[name][:] = values
         for name, value in mark.moments.items():
@@ -210,35 +210,35 @@ class IndexedRun(OneThread):
 
     @property
     def t(self) -> float:
-        """Time."""
+        """Current time."""
         return float(self._run.t)
 
     @property
     def h(self) -> float:
-        """The step."""
+        """Step size."""
         return float(self._run.h)
 
     @property
     def steps(self) -> int:
-        """Steps yet."""
+        """Number of completed steps."""
         return int(self._run.step)
 
     @property
     def q(self) -> dict[str, Numbers]:
-        """Positions by the name of their array, copies."""
+        """Copies of the positions by array name."""
         return self._arrays(self._numbers["q"])
 
     @property
     def p(self) -> dict[str, Numbers]:
-        """Momenta by the name of the array of their coordinates, copies."""
+        """Copies of the momenta by the name of the coordinate array."""
         return self._arrays(self._numbers["p"])
 
     @property
     def velocity(self) -> dict[str, Numbers]:
-        """Velocities by the name of the array of their coordinates.
+        """Velocities by the name of the coordinate array.
 
         Raises:
-            StateError: where a Hamiltonian is given.
+            StateError: if the system is defined by a Hamiltonian.
         """
         if self.interface.momenta:
             raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
@@ -246,12 +246,12 @@ class IndexedRun(OneThread):
 
     @property
     def carries(self) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-        """What rounding cut off positions and momenta, as ``q`` and ``p``."""
+        """Compensation terms (compensated summation) of positions and momenta, as ``q`` and ``p``."""
         return self._arrays(self._numbers["carry_q"]), self._arrays(self._numbers["carry_p"])
 
     @property
     def inverse_masses(self) -> dict[str, Numbers]:
-        """1/m of every coordinate by the name of its array, copies; nothing where a Hamiltonian is given."""
+        """Copies of 1/m of every coordinate by array name; empty for a Hamiltonian."""
         return {} if self.interface.momenta else self._arrays(self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
@@ -265,61 +265,61 @@ class IndexedRun(OneThread):
 
     @property
     def energies(self) -> tuple[float, float, float]:
-        """Kinetic and potential energy of the present state, and their sum, in twice the precision; 0, H and H."""
+        """Kinetic, potential and total energy in double-double arithmetic; 0, H, H for a Hamiltonian."""
         found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
         self._binding.function("energies")(self.problem.struct, self.t, *pointers, self._binding.pointer(found))
         return (float(found[0]), float(found[1]), float(found[2]))
 
     @property
     def energy(self) -> float:
-        """Their sum."""
+        """Total energy of the present state."""
         return self.energies[2]
 
     @property
     def momentum_maps(self) -> Numbers:
-        """What symmetries conserve (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`), (count,)."""
+        """(count,) conserved quantities (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`)."""
         q, p = self.q, self.p
         return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.maps])
 
     @property
     @alone
     def multipliers(self) -> tuple[Numbers, ...]:
-        """The lambda with which G^T lambda keep the state on its constraints: of each as written, over its loops.
+        """Lagrange multipliers lambda of the forces G^T lambda, an array over the loops of each constraint.
 
         Raises:
-            MethodError: for a system without constraints.
+            MethodError: if the system has no constraints.
         """
         return multipliers(self)
 
     @property
     @alone
     def constraint_values(self) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
-        """How far the state is off: g, and its rate g_q v + g_t, as the multipliers; raises as these."""
+        """Constraint residuals g and rates g_q v + g_t, in the shape of the multipliers; raises as these."""
         return constraint_values(self)
 
     @property
     def step_error(self) -> float:
-        """An estimate of the error of the end of the worst step, relative to the largest coordinate."""
+        """Estimated error of the worst step, relative to the largest coordinate."""
         return float(self._binding.function("step_error")(self._run))
 
     @property
     def step_error_t(self) -> float:
-        """When that step began."""
+        """Start time of the worst step."""
         return float(self._run.error_t)
 
     @property
     def rejected(self) -> int:
-        """Steps that were tried and taken again, shorter."""
+        """Number of rejected steps."""
         return int(self._run.rejected)
 
     @property
     def arrived(self) -> bool:
-        """Whether the goal is reached."""
+        """Return whether the target time is reached."""
         return self.goal is not None and self.t == self.goal.t_end and self._run.t_low == 0.0
 
     @alone
     def save(self) -> bytes:
-        """All of it, arrays and tables, for :meth:`IndexedStepper.restore`: a file of NumPy's (.npz)."""
+        """Return the whole run as bytes in NumPy's format (.npz), for :meth:`IndexedStepper.restore`."""
         saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
         saved |= {"moments": [float(getattr(self._run, name)) for name in MOMENTS], "iterations": self.iterations}
@@ -340,10 +340,10 @@ class IndexedRun(OneThread):
         goal: Goal | None = None,
         threads: int = 1,
     ) -> Self:
-        """The run that :meth:`save` gave.
+        """Return the run saved by :meth:`save`.
 
         Raises:
-            StateError: for other bytes, and for a run of another integrator, or of the other kind of steps.
+            StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
         """
         found = read_saved(saved, interface, to_a_goal=goal is not None)
         with telling_of_damage():
@@ -363,15 +363,15 @@ class IndexedRun(OneThread):
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
     ) -> None:
-        """So many steps; of those that choose their length no more than lead to the goal.
+        """Take ``steps`` steps; adaptive steps end at the target time.
 
         Args:
-            steps: their number.
-            progress: called now and then with the number of steps of the run.
-            stop: asked as often whether to end before.
+            steps: number of steps.
+            progress: called after each chunk with the number of steps of the run.
+            stop: called as often; the run ends early if it returns true.
 
         Raises:
-            StepFailedError: if one fails; the run stands before it.
+            StepFailedError: if a step fails; the run is left at the state before it.
         """
         steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
         report = self._binding.new("report *")
@@ -391,11 +391,11 @@ class IndexedRun(OneThread):
             portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
 
     def call(self, name: str, *arguments: Any) -> int:
-        """What a function of C says of the run."""
+        """Call a C function with the run as its first argument and return its status."""
         return int(self._binding.function(name)(self._run, *arguments) or 0)
 
     def _steps(self, size: int, report: Any) -> int:
-        """The status of so many."""
+        """Take steps and return the status of the last one."""
         problem, goal = self.problem.struct, self.goal
         if goal is None:
             return self.call("advance", problem, size, self._options, report)

@@ -1,4 +1,4 @@
-"""Saved runs over arrays: bytes that hold all of a run, and the checks of what is read back."""
+"""Saved runs over arrays: serialisation to bytes and validation when reading."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ RANGES = {
     "direction": (-1, 1),
     **dict.fromkeys(("rung", "change", "change_before"), (-(2**16), 2**16)),
 }
-"""The least and the greatest of each whole number that C takes: some of them choose a part of the memory."""
+"""Smallest and largest values of whole numbers that C uses as indices or states."""
 FINITE = ("t", "t_low", "h")
-"""Numbers that are finite in every run; estimates of errors may be NaN."""
+"""Fields that are finite in every run; error estimates may be NaN."""
 COMPUTED = ("inverse_mass", "places", "columns")
-"""Arrays that follow from the problem, and are not read back: places of others would lead out of the memory."""
+"""Arrays computed from the problem and not restored: foreign indices could address memory out of bounds."""
 CHECKSUM = "checksum"
 
 
 def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInterface) -> bytes:
-    """What a run is over and its own arrays by name as a file of NumPy's (.npz), with a checksum of all of them."""
+    """Return the data and the arrays of a run as NumPy's format (.npz), with a checksum."""
     saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
     saved |= {f"field {name}": array for name, array in arrays.fields.items()}
     saved |= {"integrator": interface.integrator, "parameters": arrays.numbers, **run}
@@ -45,10 +45,10 @@ def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInt
 
 
 def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) -> dict[str, NDArray[Any]]:
-    """The arrays of :func:`saved_bytes`.
+    """Return the arrays of :func:`saved_bytes`.
 
     Raises:
-        StateError: for other bytes, changed ones, and those of another integrator, or of the other kind of steps.
+        StateError: if the bytes are invalid or damaged or belong to another integrator or another kind of steps.
     """
     if not isinstance(saved, bytes):
         raise StateError(f"a saved run is bytes, not {type(saved).__name__}")
@@ -68,7 +68,7 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) ->
 
 
 def saved_arrays(found: Mapping[str, NDArray[Any]], interface: IndexedInterface) -> RunArrays:
-    """What the saved run is over, checked as that of a new one."""
+    """Return the validated problem data of a saved run."""
     numbers = dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
     return read_arrays(
         interface,
@@ -80,20 +80,20 @@ def saved_arrays(found: Mapping[str, NDArray[Any]], interface: IndexedInterface)
 
 @contextmanager
 def telling_of_damage() -> Iterator[None]:
-    """Turn what damaged bytes raise anywhere below into a :class:`StateError`."""
+    """Convert exceptions caused by damaged bytes to :class:`StateError`."""
     try:
         yield
     except StateError:
         raise
-    except Exception as error:  # of zipfile, zlib, NumPy's parser of headers and conversions: no list of them is whole
+    except Exception as error:  # zipfile, zlib, NumPy's header parser and conversions raise many types
         raise _not_saved(repr(error)) from error
 
 
 def restore_memory(run: Any, arrays: Mapping[str, NDArray[Any]], saved: Mapping[str, NDArray[Any]]) -> None:
-    """Put saved numbers into the C struct of a run and its arrays, after a check of each.
+    """Copy validated saved values into the C struct and the arrays of a run.
 
     Raises:
-        StateError: for numbers that no run has.
+        StateError: if a value is impossible in a run.
     """
     moments = dict(zip(MOMENTS, np.asarray(saved["moments"], dtype=float).tolist(), strict=True))
     for name, value in moments.items():

@@ -1,4 +1,4 @@
-"""A compiled integrator of sums over indices, and what its runs give."""
+"""Compiled integrator of an indexed system."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ __all__ = ["IndexedStepper"]
 
 
 class IndexedStepper:
-    """One method for one system of any number of coordinates, compiled once for all.
+    """Compiled integrator of an indexed system, for any number of coordinates.
 
     Args:
-        controlled: gives the text with steps that choose their length; ``None`` where there are none.
+        controlled: function that returns the source with adaptive steps, or ``None``.
 
     Attributes:
-        source: the C text.
+        source: the C source.
         interface: names and shapes.
-        flags: of the C compiler.
+        flags: flags of the C compiler.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class IndexedStepper:
 
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
-        """What symmetries conserve: shifts and turns of whole arrays."""
+        """Names of the conserved quantities: translations and rotations of whole arrays."""
         return tuple(each.name for each in self.interface.maps)
 
     @cached_property
@@ -83,7 +83,7 @@ class IndexedStepper:
 
     @cached_property
     def _controlled(self) -> Binding:
-        """With steps that choose their length."""
+        """Binding of the library with adaptive steps."""
         source = self._controlled_text()
         if source is None:
             raise MethodError(
@@ -115,11 +115,11 @@ class IndexedStepper:
         options: SolverOptions | None = None,
         threads: int | None = None,
     ) -> IndexedRun:
-        """A run by steps of h, or of their own lengths to t_end; arguments as of :meth:`integrate`.
+        """Return a run with fixed steps h, or with adaptive steps to t_end; arguments as of :meth:`integrate`.
 
         Raises:
-            StateError: on wrong names, shapes and numbers, and where an index would leave its array.
-            MethodError: where steps have no error that would choose their length.
+            StateError: if a name, shape or number is invalid, or an index would leave its array.
+            MethodError: if the method has no adaptive steps.
         """
         goal, binding = _goal(h, t_end, tolerance), self._binding if t_end is None else self._controlled
         arrays, moving = self._given(q, p, velocity, parameters, tables)
@@ -139,7 +139,7 @@ class IndexedStepper:
         return run
 
     def _threads(self, given: int | None) -> int:
-        """As many as are wanted; those of constraints have one."""
+        """Return the number of threads; systems with constraints use one."""
         threads = checked_count(1 if given is None else given, "threads", least=1, most=MOST_THREADS)
         if threads > 1 and self.interface.constraints:
             raise MethodError("steps that constraints hold are made by one thread: leave out threads")
@@ -155,11 +155,11 @@ class IndexedStepper:
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
     ) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-        """The nearest state (q, p) that meets the constraints, in the metric of the masses, by name of array.
+        """Return the nearest state (q, p) on the constraint manifold by array name, in the metric of the masses.
 
         Raises:
-            MethodError: for a system without constraints.
-            StateError: if none is found, or constraints depend on each other there.
+            MethodError: if the system has no constraints.
+            StateError: if the projection fails, or if the constraints are linearly dependent there.
         """
         if not self.interface.constraints:
             raise MethodError(f"{self.interface.system} has no constraints")
@@ -170,7 +170,7 @@ class IndexedStepper:
         return run.q, run.p
 
     def _given(self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any) -> tuple[RunArrays, tuple[Any, str]]:
-        """Arrays of a run, and what it begins with beside positions."""
+        """Return the validated arrays of a run, and its initial momenta or velocities with their kind."""
         if velocity is not None and self.interface.momenta:
             raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
         if p is not None and velocity is not None:
@@ -187,10 +187,10 @@ class IndexedStepper:
         options: SolverOptions | None = None,
         threads: int | None = None,
     ) -> IndexedRun:
-        """The run whose :meth:`IndexedRun.save` gave these bytes, to go on as it would have; give its goal again.
+        """Restore a run saved by :meth:`IndexedRun.save`; it continues bitwise equally if ``t_end`` is passed again.
 
         Raises:
-            StateError: for bytes that are no saved run, or one of another integrator.
+            StateError: if the bytes are no saved run or belong to another integrator.
         """
         goal = None if t_end is None else Goal.checked(t_end, tolerance)
         binding = self._controlled if goal else self._binding
@@ -219,46 +219,46 @@ class IndexedStepper:
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> IndexedTrajectory:
-        """Run ``steps`` steps of h, or to t_end, and keep every ``save_every``-th state, the initial one first.
+        """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
         Args:
-            q: initial positions: an array of the declared shape, or several by name. Their lengths are the sizes.
-            p, velocity: momenta, or velocities in their place, in the same way; by default 0.
-            h: step, negative to go back.
-            steps, save_every: numbers of steps.
-            t_end: in place of ``steps``: where to go. Without h by adaptive steps; the last ends there exactly. With h
-                by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
-            tolerance: error of the end of such a step, relative to the largest coordinate; by default round-off.
+            q: initial positions: an array of the declared shape, or several by name; their shapes determine the sizes.
+            p, velocity: initial momenta or velocities, in the same form; by default 0.
+            h: fixed step size, negative to integrate backward.
+            steps, save_every: number of steps, and steps between saved states.
+            t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly; with
+                h the last step is shorter unless t_end - t is a multiple of h (within 1e-9).
+            tolerance: relative error of an adaptive step with respect to the largest coordinate; by default round-off.
             t: initial time.
-            parameters: numbers, and arrays of them, by name; others keep their defaults.
-            tables: (rows, columns) whole numbers by name; (rows,) do for a single column.
-            observe: what is kept of a state in place of all of it: a function of the run, whose ``t``, ``q``, ``p``,
-                ``velocity``, ``energy`` are those of the moment; a number or an array, always of one shape.
-            options: when sweeps end.
-            threads: how many share each step, by default one; states are the same to the last bit. They pay where a
-                step takes longer than some tens of microseconds, and are begun at every state that is kept.
-            progress: called now and then with the number of steps done.
-            events: zeros to find, as ``events`` of the trajectory; a terminal one ends it. An
-                :class:`~scvi_codegen.Event`, its function alone, ``"q[0] - 1"``, ``"sum(i in N, q[i]**2) - 5"``, of
-                coordinates, velocities, momenta, parameters and t, or several.
+            parameters: scalars and arrays by name; others have their defaults.
+            tables: (rows, columns) whole numbers by name; (rows,) suffices for a single column.
+            observe: function of the run that returns the data to save instead of the whole state, a number or an array
+                of constant shape; the run's ``t``, ``q``, ``p``, ``velocity``, ``energy`` are the current ones.
+            options: convergence criterion of the solver.
+            threads: number of threads per step, by default one; results are bitwise equal. Threads pay off if a step
+                takes longer than some tens of microseconds; they are started again at every saved state.
+            progress: called with the number of completed steps.
+            events: zero crossings to detect, stored in ``events`` of the trajectory; a terminal one ends the run. One
+                or several :class:`~scvi_codegen.Event` or functions, ``"q[0] - 1"``, ``"sum(i in N, q[i]**2) - 5"``,
+                of coordinates, velocities, momenta, parameters and t.
             error, check_growth: as of :meth:`Stepper.integrate`; error needs all states, without ``observe``.
 
         Returns:
-            :class:`IndexedTrajectory`, steps // every + 1 states; the one at t_end or at a terminal event is kept, too.
+            :class:`IndexedTrajectory` of steps // save_every + 1 states, plus that at t_end or at a terminal event.
 
         Raises:
-            StateError: on wrong names, shapes and numbers, where an index would leave its array, and for observations
-                that are no real numbers or change their shape.
-            EventError: for an event that is no formula, or is not finite.
-            MethodError: where steps have no error that would choose their length.
-            StepFailedError: if a step fails; its ``trajectory`` holds the states before.
+            StateError: if a name, shape or number is invalid, an index would leave its array, or an observation is not
+                real or changes its shape.
+            EventError: if an event function is invalid or not finite.
+            MethodError: if the method has no adaptive steps.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         save_every = checked_count(save_every, "save_every", least=1)
         check_inputs_given(self.interface, parameters)
         if h is not None and t_end is not None:
             if steps is not None:
                 raise StateError(f"the run ends after steps={steps} or at t_end={t_end:g}: give one of the two")
-            steps_to(t, t_end, h)  # refuses an end that they do not lead to
+            steps_to(t, t_end, h)  # raises if h has the wrong sign
         elif h is not None and steps is None:
             raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
         if h is None and steps is not None:
@@ -314,19 +314,19 @@ class IndexedStepper:
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> IndexedTrajectory:
-        """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
+        """Integrate a system with inputs; steps end at the breakpoints of inputs, which preserves the order.
 
         Args:
             inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
-            h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
-            steps, t_end: with h one of both; without it ``t_end``.
+            h: fixed step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
+            steps, t_end: with h one of both; without h ``t_end``.
             q, p, velocity, tolerance, save_every, t, parameters, tables: as of :meth:`integrate`.
-            observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are kept, too.
+            observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are also saved.
             error, check_growth: as of :meth:`integrate`.
 
         Raises:
-            StateError: for inputs that are not given for all of the run, or make no function of time.
-            StepFailedError: if a step fails; its ``trajectory`` holds the states before.
+            StateError: if inputs do not cover the run or define no function of time.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         save_every = checked_count(save_every, "save_every", least=1)
         data, end = checked_inputs(self.interface, inputs), end_of(t, h, steps, t_end)
@@ -358,7 +358,7 @@ class IndexedStepper:
 
 
 def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal | None:
-    """Where steps lead that choose their length."""
+    """Return the step plan of adaptive steps, ``None`` for fixed steps."""
     if (h is None) == (t_end is None):
         raise StateError(
             "the step h, for steps of one length, or t_end, for those that choose theirs: give one of them"
@@ -371,7 +371,7 @@ def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal
 
 
 def _said(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
-    """What was kept, after what is to be said of its worst step, of its energy and of the growth of errors."""
+    """Return the trajectory, after warnings about its step size, its energy and its error growth."""
     found = record.trajectory()
     check.warn(found)
     warn_of_long_steps(found, remedy="")
@@ -381,7 +381,10 @@ def _said(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
 
 
 def _say_lost_energy(found: IndexedTrajectory) -> None:
-    """Of steps that chose their length or tell no error; a Hamiltonian has no part that says how large it is."""
+    """Warn of an energy error of adaptive runs, and of fixed-step runs without an error estimate.
+
+    For a Hamiltonian the kinetic part, which sets the scale, is 0.
+    """
     (first, last), size = found.energies[[0, -1], 2], 2.0 * found.energies[[0, -1], 0].max()
     if found.goal is not None:
         warn_of_energies(first, last, size)

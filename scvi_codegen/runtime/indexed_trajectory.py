@@ -1,4 +1,4 @@
-"""What is kept of a run over arrays: states, energies, momentum maps; and how it is kept as the run goes on."""
+"""Trajectory of a run over arrays: states, energies, momentum maps; and their recording during the run."""
 
 from __future__ import annotations
 
@@ -29,23 +29,24 @@ __all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IndexedTrajectory(Confirmed):
-    """States along a run of k kept states, the initial one first.
+    """States along a run at k times, beginning with the initial one.
 
     Attributes:
         t: (k,) times.
-        q, p: positions and momenta by the name of their array, (k, ..) each; where a run was observed, the first and
-            the last state alone.
-        observed: (k, ..) what the observer returned, or ``None``.
-        energies: (k, 3) kinetic and potential energy, and their sum.
-        maps: (k, count) what symmetries conserve, in the order of ``stepper.momentum_map_names``.
-        inverse_masses: 1/m of every coordinate, of the shape of one state; nothing where a Hamiltonian is given.
-        h: step, or that of the last where steps choose their length; steps: their number; iterations: sweeps of all.
-        step_error, step_error_t: an estimate of the error of the end of the worst step, relative to the largest
-            coordinate, and when it began; not numbers for explicit methods.
-        goal: where steps lead that choose their length; rejected: those that were taken again, shorter.
-        events: what was found of each event, in their order.
-        departures: how the run goes on from each state, for those between.
-        confirmation: the comparison with a second run where ``error=`` asked for one, else ``None``.
+        q, p: positions and momenta by array name, (k, ..) each; only the first and the last state with ``observe``.
+        observed: (k, ..) values that ``observe`` returned, or ``None``.
+        energies: (k, 3) kinetic, potential and total energy.
+        maps: (k, count) conserved quantities, in the order of ``stepper.momentum_map_names``.
+        inverse_masses: 1/m of every coordinate, in the shape of one state; empty for a Hamiltonian.
+        h: step size, that of the last step if adaptive.
+        steps, iterations: numbers of steps and of solver iterations.
+        step_error, step_error_t: estimated error of the worst step, relative to the largest coordinate, and its start
+            time; NaN for explicit methods.
+        goal: step plan of adaptive steps, else ``None``.
+        rejected: number of rejected adaptive steps.
+        events: crossings of each event, in their order.
+        departures: data for dense output after each state.
+        confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
     """
 
     t: Numbers
@@ -79,13 +80,13 @@ class IndexedTrajectory(Confirmed):
     @overload
     def __getitem__(self, rows: int) -> tuple[float, dict[str, Numbers], dict[str, Numbers]]: ...
     def __getitem__(self, rows: slice | int) -> Self | tuple[float, dict[str, Numbers], dict[str, Numbers]]:
-        """Return some of the states as a trajectory, for a slice; t, and q and p by array, of one state, for a number.
+        """Return a trajectory for a slice, or t, q and p of one state for an index.
 
-        Events outside the times of a slice are left out; ``steps`` and ``step_error`` stay those of the whole run.
+        Events outside the times of a slice are omitted; ``steps`` and ``step_error`` remain those of the whole run.
 
         Raises:
-            IndexError: for a state that is not there, and for a slice that is empty or goes backward.
-            StateError: where states were not kept.
+            IndexError: if an index is out of range, or a slice is empty or descending.
+            StateError: if states were not saved.
         """
         if len(self.departures) < len(self.t):
             raise StateError("states of an observed run are not kept: leave out observe, or index t and observed")
@@ -104,12 +105,12 @@ class IndexedTrajectory(Confirmed):
         )
 
     def at(self, t: ArrayLike) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-        """Positions and momenta at (n,) times between those kept, (n, ..) by the name of their array.
+        """Return dense output: positions and momenta by array name, (n, ..) at (n,) times.
 
-        By steps of the method itself from the kept state before, the last of them shorter.
+        Computed by steps of the method from the saved state before, the last of them shorter.
 
         Raises:
-            StateError: for times outside, and where states were not kept.
+            StateError: if a time is outside the run, or states were not saved.
             StepFailedError: if such a step fails.
         """
         if len(self.departures) < len(self.t):
@@ -118,33 +119,33 @@ class IndexedTrajectory(Confirmed):
 
     @property
     def velocity(self) -> dict[str, Numbers]:
-        """Velocities by the name of the array of their coordinates, of the shape of ``p``.
+        """Velocities by the name of the coordinate array, in the shape of ``p``.
 
         Raises:
-            StateError: where a Hamiltonian is given.
+            StateError: if the system is defined by a Hamiltonian.
         """
         if not self.inverse_masses:
             raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
         return {name: p * self.inverse_masses[name] for name, p in self.p.items()}
 
     def energy(self) -> Numbers:
-        """Energy p . v - L, or H, at each state (k,)."""
+        """Return the (k,) energies p . v - L, or H."""
         return self.energies[:, 2]
 
     def energy_error(self) -> float:
-        """The largest change of the energy over all kept states, relative to the sizes of its two parts."""
+        """Return the largest change of the energy, relative to the largest sum of its absolute parts."""
         largest = float(np.max(np.abs(self.energies[:, :2]).sum(axis=1)))
         return float(np.max(np.abs(self.energy() - self.energy()[0]))) / (largest or 1.0)
 
     def momentum_maps(self) -> Numbers:
-        """What symmetries conserve, at each state (k, count)."""
+        """Return the (k, count) conserved quantities."""
         return self.maps
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write ``.npz``, whole or not at all: arrays t, q_NAME and p_NAME of every array, energies, maps, observed, h.
+        """Write ``.npz`` atomically: arrays t, q_NAME and p_NAME of every array, energies, maps, observed, h.
 
         Raises:
-            StateError: for another suffix.
+            StateError: if the suffix is another.
         """
         check_npz(path)
         states = {f"{key}_{name}": values for key in "qp" for name, values in getattr(self, key).items()}
@@ -154,12 +155,12 @@ class IndexedTrajectory(Confirmed):
 
 
 class IndexedRecord:
-    """What is kept of a run as it goes.
+    """Recorder of a run.
 
     Args:
-        run: at its start.
-        observe: what is kept of a state in place of all of it.
-        events: zeros of functions to look for.
+        run: the run at its start.
+        observe: function that returns the data to save instead of the whole state.
+        events: events to detect.
     """
 
     def __init__(
@@ -185,10 +186,10 @@ class IndexedRecord:
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] | None = None,
     ) -> None:
-        """The first state, every so many-th of so many steps or of those that lead to a goal, and the one there.
+        """Record the initial state and every ``save_every``-th state up to step ``steps`` or the target time.
 
         Raises:
-            StepFailedError: if one fails; its ``trajectory`` holds the states before.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         self.take(keep=True)
         self.go_on(steps, save_every, progress=progress, stop=stop)
@@ -202,7 +203,7 @@ class IndexedRecord:
         stop: Callable[[], bool] | None = None,
         to_end: bool = False,
     ) -> None:
-        """The same without the first state; the last is kept, too, if it is wanted."""
+        """Continue recording as :meth:`follow`; with ``to_end`` the last state is saved as well."""
         run, last = self.run, self.run.steps
         self.departures[-1] = Departure.of(run)
         while run.steps < steps and not self.ended and not (stop and stop()):
@@ -220,7 +221,7 @@ class IndexedRecord:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is at its goal, or at an event that ends it."""
+        """Return whether the run is at its target time or at a terminal event."""
         return self.run.arrived or (self.search is not None and self.search.ended)
 
     def _advance(self, steps: int, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
@@ -235,7 +236,7 @@ class IndexedRecord:
                 return
 
     def take(self, *, keep: bool) -> None:
-        """The present state, whole if nobody observes or it is to be kept."""
+        """Save the present state, in full without an observer or with ``keep``."""
         self.t.append(self.run.t)
         self.energies.append(self.run.energies)
         self.maps.append(self.run.momentum_maps)
@@ -252,7 +253,7 @@ class IndexedRecord:
         return found
 
     def trajectory(self) -> IndexedTrajectory:
-        """All of it."""
+        """Return the recorded trajectory."""
         run = self.run
         names = [array.name for array in run.interface.coordinates]
         return IndexedTrajectory(
@@ -276,6 +277,6 @@ class IndexedRecord:
 
 
 def check_npz(path: str | os.PathLike[str]) -> None:
-    """Raise :class:`StateError` for a file of another format."""
+    """Raise :class:`StateError` unless the suffix is ``.npz``."""
     if Path(path).suffix.lower() != ".npz":
         raise StateError(f"trajectories of arrays are saved as .npz, not as {str(path)!r}")

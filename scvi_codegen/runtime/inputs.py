@@ -1,4 +1,4 @@
-"""States and parameters as users give them, checked against the names and shapes of an integrator's interface."""
+"""Validation of states and parameters against the interface of an integrator."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
-"""By name, others keeping their defaults, or all in order."""
+"""Parameters by name (others have their defaults), or all in order."""
 
 
 class TakesInputs(Protocol):
-    """What is asked of an interface for its inputs."""
+    """Part of an interface that concerns inputs."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names."""
+        """Names of the inputs."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names."""
+        """Names of the parameters."""
 
     @property
     def energy_parameter(self) -> str:
-        """Of transformed time, or nothing."""
+        """Name of the energy parameter of transformed time, or ""."""
 
 
 def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
-    """Return a finite, contiguous (m,) copy; of one coordinate a number will do."""
+    """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
     array, coordinates = real_array(value, name), interface.coordinates
     if array.ndim == 0 and interface.dimension == 1:
         array = array.reshape(1)
@@ -67,7 +67,7 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
 def checked_states(
     interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike, *, second: str = "p"
 ) -> tuple[Array, Array, Array]:
-    """(n,) times and (n, m) positions and momenta (or what ``second`` names), contiguous, of one state or many."""
+    """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
     positions, momenta = real_array(q, "q"), real_array(p, second)
     if positions.ndim <= 1:
         positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
@@ -86,7 +86,7 @@ def checked_states(
 
 
 def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
-    """(k,) values in order."""
+    """Return the (k,) parameter values in order."""
     names, values = interface.parameters, np.array(interface.defaults, dtype=float)
     if parameters is None:
         return values
@@ -105,27 +105,27 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
 
 
 def inputs_not_given(interface: TakesInputs, parameters: Any) -> tuple[str, ...]:
-    """The inputs of which parameters say nothing; all in order say everything."""
+    """Return the names of inputs that the parameters do not set; parameters in order set all."""
     if parameters is not None and not isinstance(parameters, Mapping):
         return ()
     return tuple(name for name in interface.inputs if f"{name}_0" not in (parameters or {}))
 
 
 def check_inputs_given(interface: TakesInputs, parameters: Any) -> None:
-    """Raise :class:`StateError` where a step would take an input for 0 that nobody gave."""
+    """Raise :class:`StateError` if an input is not set."""
     if missing := inputs_not_given(interface, parameters):
         raise missing_input(missing[0])
 
 
 def check_left_to_inputs(interface: TakesInputs, parameters: Any) -> None:
-    """Raise :class:`StateError` for parameters, given by name, that the data of inputs say."""
+    """Raise :class:`StateError` if named parameters belong to inputs given as data."""
     for k in columns_of_inputs(interface):
         if isinstance(parameters, Mapping) and (name := interface.parameters[k]) in parameters:
             raise StateError(f"{name} is a part of the input {name[:-2]}, which is given as data: leave it out")
 
 
 def missing_input(name: str) -> StateError:
-    """How it is said."""
+    """Return the error for an input that is not set."""
     return StateError(
         f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
         f"run.set_inputs({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
@@ -133,7 +133,7 @@ def missing_input(name: str) -> StateError:
 
 
 def no_input(name: str, inputs: Collection[str]) -> StateError:
-    """How it is said that a system does not have an input of this name."""
+    """Return the error for an unknown input name."""
     if inputs:
         return StateError(f"{name!r} is no input of this system, which has {', '.join(inputs)}{closest(name, inputs)}")
     return StateError(
@@ -143,12 +143,12 @@ def no_input(name: str, inputs: Collection[str]) -> StateError:
 
 
 def columns_of_inputs(interface: TakesInputs) -> list[int]:
-    """Places of the parameters that inputs are made of: coefficients by power, and the breakpoint they count from."""
+    """Return the indices of the parameters of inputs: coefficients by power, and the breakpoint they refer to."""
     return [interface.parameters.index(f"{name}_{part}") for name in interface.inputs for part in "0123t"]
 
 
 def parameter_index(interface: Interface, name: str) -> int:
-    """The place of a parameter; StateError with the nearest name if there is none."""
+    """Return the index of a parameter; raise ``StateError`` with the nearest name if unknown."""
     names = interface.parameters
     if name in names:
         return names.index(name)

@@ -1,6 +1,6 @@
-"""A compiled method for one system: steps, Legendre transforms, energies, each a function of its arguments alone.
+"""Compiled method for one system: steps, Legendre transforms and energies as pure functions of their arguments.
 
-All calls into C release the GIL and share nothing, so one integrator may be used from many threads.
+All C calls release the GIL and share no state, so one integrator may be used from many threads.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from scvi_codegen.runtime.linearised import LinearisedMethod
 __all__ = ["Integrator"]
 
 TOLD = 1e-3
-"""Of the largest velocity: how far one may be off that its momentum tells."""
+"""Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
 
 class Integrator(LinearisedMethod):
-    """What a compiled method computes."""
+    """Computations of a compiled method."""
 
     def step(
         self,
@@ -45,20 +45,21 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
-        """One step from (q, p) at t to t + h, a function of its arguments alone.
+        """Return the state after one step from (q, p) at t to t + h, a pure function of its arguments.
 
         Args:
             q, p: (m,) positions and momenta.
-            h: step size, negative to go back; in transformed time of tau.
+
+            h: step size, negative to integrate backward; step of tau in transformed time.
             t: time.
-            parameters: by name (others keep their defaults) or all in order.
-            options: convergence of the stage equations.
+            parameters: values by name (others have their defaults) or all in order.
+            options: convergence criterion of the solver.
 
         Returns:
             (q1, p1), each (m,).
 
         Raises:
-            StateError: on wrong shapes, names or non-finite numbers.
+            StateError: if a shape or name is invalid, or a number is not finite.
             StepFailedError: if the stage equations cannot be solved.
         """
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
@@ -78,7 +79,7 @@ class Integrator(LinearisedMethod):
         options: SolverOptions | None,
         found: Sequence[Array],
     ) -> None:
-        """Have C solve the equations of a step and fill the arrays ``found``; StepFailedError if it does not."""
+        """Solve the equations of a step in C and fill the arrays ``found``; raise ``StepFailedError`` on failure."""
         report = binding.new("report *")
         status = binding.function(name)(
             checked_number(t, "the time t"),
@@ -93,19 +94,19 @@ class Integrator(LinearisedMethod):
             raise step_failure(status, report, step=0, h=h)
 
     def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
-        """(k,) values in order; in transformed time the energy is that of the state (q, p) unless it is given."""
+        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
         values = self._parameters(parameters)
         if not self.has_energy(parameters):
             values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
         return values
 
     def has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
-        """Whether the energy that transformed time needs is among the parameters given; true where it needs none."""
+        """Return whether the parameters contain the energy required by transformed time, or none is required."""
         name = self.interface.energy_parameter
         return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
 
     def rates(self, q: ArrayLike, p: ArrayLike, parameters: Parameters = None) -> Array:
-        """(n,) rates dt/dtau at (n, m) states; 1 where time is not transformed."""
+        """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
         _, positions, momenta = checked_states(self.interface, q, p, 0.0)
         found = np.ones(positions.size // self.dimension)
         if not self.interface.energy_parameter:
@@ -117,11 +118,11 @@ class Integrator(LinearisedMethod):
         return found
 
     def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """Momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
+        """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
         return self._transform("momentum", q, v, t, parameters, "v")
 
     def velocity(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """Velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from rest).
+        """Return velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from v = 0).
 
         Returns:
             (m,), or (n, m) for (n, m) states with one time or (n,) times.
@@ -131,19 +132,19 @@ class Integrator(LinearisedMethod):
     def momenta_given(
         self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
     ) -> ArrayLike:
-        """The momenta of a state that is given by one of p and velocity.
+        """Return the momenta of a state specified by p or by velocity.
 
         Raises:
-            StateError: if both or none are given.
+            StateError: unless exactly one of both is passed.
         """
         name, given = self.momentum_or_velocity(p, velocity)
         return given if name == "p" else self.initial_momentum(q, given, t, parameters)
 
     def initial_momentum(self, q: ArrayLike, velocity: ArrayLike, t: float, parameters: Parameters) -> Array:
-        """Return the (m,) momentum of a state that a run starts from.
+        """Return the (m,) momentum of the initial state of a run.
 
         Raises:
-            StateError: where the mass matrix is singular along the velocity, so that the momentum does not tell it.
+            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
         """
         p, v = self._transform("momentum", q, velocity, t, parameters, "velocity"), np.asarray(velocity, dtype=float)
         dropped = (p == 0.0) & (v != 0.0)
@@ -165,10 +166,10 @@ class Integrator(LinearisedMethod):
         )
 
     def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
-        """The one of both that is given, with its name.
+        """Return the name and the value of the one of both that is passed.
 
         Raises:
-            StateError: if both or none are given.
+            StateError: unless exactly one of both is passed.
         """
         if p is not None and velocity is None:
             return "p", p
@@ -177,16 +178,16 @@ class Integrator(LinearisedMethod):
         raise StateError(f"give p or velocity, {'one' if p is None else 'not both'} of them, beside q")
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
-        """Energy p.v - L of the system itself: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
+        """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
         result = self.energies_of(times, positions, momenta, self._parameters(parameters))
         return float(result[0]) if np.ndim(q) == 1 else result
 
     def energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
-        """(n,) of states as trajectories have them, which need no check: contiguous (n,), (n, m), (n, m) and (k,).
+        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
 
         Raises:
-            StateError: beyond the domain of L.
+            StateError: if a state is outside the domain of L.
         """
         result = np.empty(len(t))
         status = self.binding.function("energies")(
@@ -205,13 +206,13 @@ class Integrator(LinearisedMethod):
         return result
 
     def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
-        """What symmetries conserve, k numbers in the order of ``momentum_map_names``.
+        """Return the k conserved quantities in the order of ``momentum_map_names``.
 
         Returns:
             (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
 
         Raises:
-            StateError: on wrong shapes, names or numbers.
+            StateError: if a shape, name or number is invalid.
         """
         values = self.momentum_maps_and_sizes(q, p, t, parameters)[0]
         return values[0] if np.ndim(q) == 1 else values
@@ -219,7 +220,7 @@ class Integrator(LinearisedMethod):
     def momentum_maps_and_sizes(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
     ) -> tuple[Array, Array]:
-        """The same, (n, k), and the roots of the sums of the squares of their terms, beside which rounding is small."""
+        """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
         values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
         if not values.size:
@@ -247,11 +248,11 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> float:
-        """L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
+        """Return L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
 
         Raises:
-            MethodError: for methods without a discrete Lagrangian.
-            StepFailedError: if no curve is found.
+            MethodError: if the method has no discrete Lagrangian.
+            StepFailedError: if the boundary-value problem is not solved.
         """
         return self._discrete_legendre(q0, q1, h, t, parameters, options)[2]
 
@@ -265,7 +266,7 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
-        """F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        """Return F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
 
     def discrete_legendre_plus(
@@ -278,7 +279,7 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array]:
-        """F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, section 1.2. Raises as :meth:`discrete_lagrangian`."""
+        """Return F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
 
     def exchanged(
@@ -291,13 +292,14 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> tuple[Array, Array, Array]:
-        """A step, and what forces give in it: energy first, then what each of ``impulse_names`` receives.
+        """Return the state after a step, the work of the forces in it, and their impulses on ``impulse_names``.
 
-        Integrals of f . v and f . xi along the step's own curve by the method's own quadrature: (q1, p1, given), (m,),
-        (m,) and (1 + k,). J1 - J0 is what is given to J, to round-off for SVI and their kin (forced Noether theorem).
+        The integrals of f . v and f . xi along the curve of the step use the method's own quadrature. Returned are q1
+        (m,), p1 (m,) and (1 + k,) values. J1 - J0 equals the impulse to round-off for SVI and related methods (forced
+        discrete Noether theorem).
 
         Raises:
-            MethodError: where no forces act, and for methods that do not integrate along a curve.
+            MethodError: if no forces act, or the method has no curve of positions.
             StepFailedError: if Newton's iteration does not converge.
         """
         if not self.interface.exchange_names:
@@ -321,7 +323,7 @@ class Integrator(LinearisedMethod):
         *,
         options: SolverOptions | None = None,
     ) -> Array:
-        """The discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
+        """Solve the discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
 
         Raises as :meth:`discrete_lagrangian`.
         """
@@ -362,7 +364,7 @@ class Integrator(LinearisedMethod):
         return result
 
     def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
-        """In transformed time between p and dq/dt, on the level of the state's own energy."""
+        """Transform between p and dq/dt in transformed time, on the energy surface of the state."""
         if not self.interface.energy_parameter:
             return self._called(name, t, q, other, values)
         if name == "velocity":

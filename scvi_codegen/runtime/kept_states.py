@@ -1,4 +1,4 @@
-"""States kept along a run, with all that leads from one to the next."""
+"""Saved states of a run with the data needed for dense output, events and derivatives."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ Array = NDArray[np.float64]
 
 
 def checked_row(row: Any, count: int) -> int:
-    """Return the number of a state from the start, where negative ones count from the end; IndexError if none is there.
+    """Return a row index counted from the start; negative indices count from the end.
 
     Raises:
-        TypeError: for anything but a whole number.
+        IndexError: if the index is out of range.
+        TypeError: if the index is not a whole number.
     """
     if isinstance(row, bool) or not hasattr(row, "__index__"):
         raise TypeError(f"states are indexed by whole numbers and slices, as in run[-1] and run[10:], not by {row!r}")
@@ -34,7 +35,7 @@ def checked_row(row: Any, count: int) -> int:
 
 
 def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
-    """Return first, end and stride of a slice of that many states; IndexError if it is empty or goes backward."""
+    """Return first, end and stride of a slice of ``count`` states; raise IndexError if it is empty or descending."""
     first, last, stride = rows.indices(count)
     if stride < 0 or first >= last:
         raise IndexError(f"a slice of a trajectory goes forward and holds at least one state, unlike {rows}")
@@ -43,11 +44,11 @@ def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeptStates:
-    """What states between these, and crossings, are found from; other fields as of :class:`Trajectory`.
+    """Saved states with the data for dense output and events; other fields as of :class:`Trajectory`.
 
     Attributes:
-        lengths: (n,) of the step that follows each state, not a number for a state between two steps.
-        tau: (n,) of each state where time is transformed, else ``None``; lengths are then of tau.
+        lengths: (n,) size of the step that follows each state, NaN for a state within a step.
+        tau: (n,) values of tau in transformed time, else ``None``; ``lengths`` are then steps of tau.
     """
 
     t: Array
@@ -63,12 +64,12 @@ class KeptStates:
 
     @property
     def stepped(self) -> Array:
-        """(n,) what lengths are differences of: tau, or t."""
+        """(n,) independent variable of the steps: tau or t."""
         return self.t if self.tau is None else self.tau
 
     @property
     def forward(self) -> float:
-        """1, or -1 for a run back in time."""
+        """1, or -1 for a run backward in time."""
         return math.copysign(1.0, self.t[-1] - self.t[0])
 
     def __len__(self) -> int:

@@ -1,9 +1,10 @@
-"""What transformed time adds to derivatives: runs that start on a level of the energy, and that end at a time.
+"""Derivatives of runs in transformed time: initial states on an energy surface, and ends at a fixed time.
 
-Each step has its derivative at the energy of the run, and of the time it takes. The energy is that of the first state,
-whose changes it follows. And where a run was to end at a time, or an event ended it, the length of its last step, in
-tau, is what brings it there: with w the slopes of the end of that step by its length, w_t that of the time, a change v
-of the end leaves v - w v_t / w_t (implicit function theorem). The time of the start moves all times and nothing else.
+Each step has derivatives with respect to the energy of the run, and derivatives of its physical time. The energy is
+that of the first state and varies with it. If a run ends at t_end or at an event, the size of its last step in tau is
+determined by that time: with w the derivative of the end with respect to this size and w_t that of the time, a
+variation v of the end becomes v - w v_t / w_t (implicit function theorem). The initial time shifts all times and
+nothing else.
 """
 
 from __future__ import annotations
@@ -20,43 +21,43 @@ from scvi_codegen.runtime.linearised import Starts
 __all__ = ["OwnTime", "TransformedTime", "time_of"]
 
 T = -2
-"""Where among all that is given stands t."""
+"""Index of t among the variables (q, p, parameters, t, h)."""
 
 
 @dataclass(frozen=True)
 class OwnTime:
-    """A run whose time is its own: nothing is added.
+    """Run without time transformation: the maps below are identities.
 
     Attributes:
-        states: of the run, those that stand at the ends of steps.
+        states: states of the run at the ends of steps.
     """
 
     states: KeptStates
 
     def begun(self, changes: Array) -> Array:
-        """(k, given) changes that the first step is given, of those of all that the run starts from."""
+        """Return (k, given) variations of the variables of the first step, from those of the initial data."""
         return changes
 
     def ended(self, found: Array, now: Array, changes: Array) -> tuple[Array, Array]:
-        """(n, told, k) changes of all states and (k, given) at the end, of those that the steps lead to."""
+        """Return (n, told, k) variations of all states and (k, given) at the end, from those of the steps."""
         return found, now
 
     def seeded(self, seeds: Array) -> Array:
-        """(n, k, given) slopes by the ends of steps, of those by states: the transpose of :meth:`ended`."""
+        """Return (n, k, given) cotangents of the step ends from those of the states: the transpose of :meth:`ended`."""
         return seeds
 
     def pulled(self, slopes: Array, seeds: Array) -> Array:
-        """(k, given) slopes by all that the run starts from: the transpose of :meth:`begun`."""
+        """Return (k, given) cotangents of the initial data: the transpose of :meth:`begun`."""
         return slopes
 
 
 @dataclass(frozen=True)
 class TransformedTime(OwnTime):
-    """A run in transformed time.
+    """Run in transformed time.
 
     Attributes:
-        ends_at_a_time: whether its last state is held at a time: at t_end, or at that of a terminal event.
-        repeated: whether the last state is the one before once more, as a step ended there.
+        ends_at_a_time: whether the time of the last state is fixed, by t_end or a terminal event.
+        repeated: whether the last state repeats the one before, because a step ended exactly there.
     """
 
     ends_at_a_time: bool
@@ -64,20 +65,20 @@ class TransformedTime(OwnTime):
 
     @classmethod
     def of(cls, states: KeptStates) -> TransformedTime:
-        """Of the states of a run."""
+        """Construct from the states of a run."""
         held = len(states) > 1 and bool(np.isnan(states.lengths[-1]))
         repeated = held and bool(states.stepped[-1] == states.stepped[-2])
         return cls(_before_last(states) if repeated else states, held, repeated)
 
     @cached_property
     def level(self) -> Array:
-        """(given,) slopes of the energy by all that the run starts from."""
+        """(given,) gradient of the energy with respect to the initial data."""
         states = self.states
         return states.stepper.level(states.q[0], states.p[0], states.parameters)
 
     @cached_property
     def last_step(self) -> Array:
-        """(given,) slopes of the end of the last step by its length, over that of the time; 0 where none is held."""
+        """(given,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
         states, given = self.states, self.states.stepper.given
         if not self.ends_at_a_time or len(states) < 2:
             return np.zeros(given)
@@ -90,14 +91,14 @@ class TransformedTime(OwnTime):
         return slopes
 
     def begun(self, changes: Array) -> Array:
-        """See :meth:`OwnTime.begun`: the energy goes with the start."""
+        """Add the variation of the energy; see :meth:`OwnTime.begun`."""
         found = changes.copy()
         found[:, self.states.stepper.energy_place] += changes @ self.level
         found[:, T] = 0.0
         return found
 
     def ended(self, found: Array, now: Array, changes: Array) -> tuple[Array, Array]:
-        """See :meth:`OwnTime.ended`."""
+        """Project the variation of the end onto the fixed final time; see :meth:`OwnTime.ended`."""
         now = now - now[:, T, np.newaxis] * self.last_step
         last = now[:, self.states.stepper.told].T[np.newaxis]
         found = np.concatenate([found if self.repeated else found[:-1], last])
@@ -105,7 +106,7 @@ class TransformedTime(OwnTime):
         return found, now
 
     def seeded(self, seeds: Array) -> Array:
-        """See :meth:`OwnTime.seeded`."""
+        """Apply the transpose of :meth:`ended`; see :meth:`OwnTime.seeded`."""
         found = seeds.copy()
         found[-1, :, T] -= seeds[-1] @ self.last_step
         if self.repeated:
@@ -113,14 +114,14 @@ class TransformedTime(OwnTime):
         return found[: len(self.states)]
 
     def pulled(self, slopes: Array, seeds: Array) -> Array:
-        """See :meth:`OwnTime.pulled`."""
+        """Apply the transpose of :meth:`begun`; see :meth:`OwnTime.pulled`."""
         found = slopes + slopes[:, self.states.stepper.energy_place, np.newaxis] * self.level
         found[:, T] = seeds[:, :, T].sum(axis=0)
         return found
 
 
 def time_of(states: KeptStates) -> OwnTime:
-    """How the time of a run goes."""
+    """Return the treatment of time for the states of a run."""
     return OwnTime(states) if states.tau is None else TransformedTime.of(states)
 
 

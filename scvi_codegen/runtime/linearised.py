@@ -1,8 +1,8 @@
-"""Steps with their derivatives: how what they end at changes with what they start from, and the transpose.
+"""Derivatives of steps: Jacobian-vector and vector-Jacobian products along a chain of steps.
 
-A step maps (q, p, parameters, t, h) to (q1, p1, parameters, t1, h). The derivative of that map carries changes along
-a chain of steps, its transpose carries slopes back, with the same factors: all other derivatives are made from it. In
-transformed time the energy, on whose level steps are taken, is one of the parameters, and t1 an integral along them.
+A step maps (q, p, parameters, t, h) to (q1, p1, parameters, t1, h). The Jacobian of this map propagates tangent vectors
+along a chain of steps and its transpose propagates cotangents back, with the same factorisation; all other derivatives
+are composed of these. In transformed time the energy is one of the parameters, and t1 is an integral along the step.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ __all__ = ["LinearisedMethod", "Sensitivity", "Starts"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sensitivity:
-    """How states depend on what they came from: of a step without n, of a run for each of its n states.
+    """Derivatives of states with respect to their initial data: of one step without n, of a run for each of n states.
 
     Attributes:
-        state: (n, 2m, 2m) derivatives of (q, p) by the (q, p) at the start.
-        parameters: (n, 2m, k) by the parameters, in the order of ``stepper.parameters``.
-        t: (n, 2m) by the time of the start, which moves all times.
-        h: (n, 2m) by the length of all steps; ``None`` of a run whose steps have several.
-        times: in transformed time the same of the times of the states, without the axis of 2m; else ``None``.
+        state: (n, 2m, 2m) with respect to the initial (q, p).
+        parameters: (n, 2m, k) with respect to the parameters, in the order of ``stepper.parameters``.
+        t: (n, 2m) with respect to the initial time, which shifts all times.
+        h: (n, 2m) with respect to the common step size; ``None`` if step sizes differ.
+        times: in transformed time the derivatives of the times of the states, without the axis of 2m; else ``None``.
     """
 
     state: Array
@@ -42,7 +42,7 @@ class Sensitivity:
 
     @classmethod
     def of(cls, columns: Array, dimension: int, *, stretched: bool = True) -> Sensitivity:
-        """From (..., told, 2m + k + 2) derivatives of what is told by all that is given."""
+        """Construct from (..., told, 2m + k + 2) derivatives of outputs with respect to all variables."""
         size = 2 * dimension
         states, times = columns[..., :size, :], columns[..., size:, :]
         told = cls._of(states, size, stretched=stretched)
@@ -62,10 +62,10 @@ class Sensitivity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Starts:
-    """Where n steps start, and where the last ends.
+    """Initial data of n steps, and the end of the last.
 
     Attributes:
-        t, h: (n,) times and lengths.
+        t, h: (n,) times and step sizes.
         q, p: (n + 1, m) states.
     """
 
@@ -76,52 +76,52 @@ class Starts:
 
     @classmethod
     def chain(cls, q: Array, p: Array, t: Array, h: Array) -> Starts:
-        """Of steps that follow each other from (q, p); the other states are not known yet."""
+        """Construct for consecutive steps from (q, p), with memory for the other states."""
         starts = cls(np.ascontiguousarray(t), np.ascontiguousarray(h), *np.empty((2, len(h) + 1, len(q))))
         starts.q[0], starts.p[0] = q, p
         return starts
 
     def part(self, first: int, last: int) -> Starts:
-        """Of the steps from ``first`` until before ``last``: the same memory."""
+        """Return a view of the steps ``first`` to ``last`` - 1."""
         steps, states = slice(first, last), slice(first, last + 1)
         return Starts(self.t[steps], self.h[steps], self.q[states], self.p[states])
 
 
 class LinearisedMethod(CompiledMethod):
-    """A compiled method with the derivatives of its steps, in a library of their own, compiled when first asked for."""
+    """Compiled method with the derivatives of its steps, in a separate library that is compiled on first use."""
 
     @property
     def given(self) -> int:
-        """Numbers that a step starts from: (q, p), parameters, t and h."""
+        """Number of variables of a step: (q, p), parameters, t and h."""
         return self.tangent.constant("GIVEN")
 
     @property
     def told(self) -> NDArray[np.intp]:
-        """Where among these stands what a state tells: (q, p), and in transformed time, behind them, t."""
+        """Indices of the outputs among the variables: (q, p), and in transformed time also t."""
         clock = [self.given - 2] if self.interface.energy_parameter else []
         return np.array([*range(2 * self.dimension), *clock], dtype=np.intp)
 
     @property
     def energy_place(self) -> int:
-        """The same of the energy, of which there is one in transformed time alone."""
+        """Index of the energy parameter of transformed time among the variables."""
         return 2 * self.dimension + self.parameters.index(self.interface.energy_parameter)
 
     @abstractmethod
     def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
-        """(k,) values in order; in transformed time the energy is that of the state (q, p) unless it is given."""
+        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
 
     @abstractmethod
     def has_energy(self, parameters: Parameters) -> bool:
-        """Whether the energy that transformed time needs is among the parameters given; true where it needs none."""
+        """Return whether the parameters contain the energy required by transformed time, or none is required."""
 
     def check_steps_of_h(self, what: str) -> None:
-        """Raise :class:`MethodError` where runs have steps of other lengths, for what is made of steps of h."""
+        """Raise :class:`MethodError` for steppers whose step size is not the fixed h."""
         if self.interface.monitor:
             raise MethodError(f"{what} has steps of h, not of lengths that a monitor chooses: compile without one")
         self.check_own_time(what)
 
     def check_own_time(self, what: str) -> None:
-        """Raise :class:`MethodError` in transformed time, for what is told of motions in their own."""
+        """Raise :class:`MethodError` in transformed time."""
         if self.interface.energy_parameter:
             raise MethodError(
                 f"{what} is told in the time of the motion, not in transformed time: compile the system itself, for "
@@ -129,10 +129,10 @@ class LinearisedMethod(CompiledMethod):
             )
 
     def level(self, q: Array, p: Array, parameters: Array) -> Array:
-        """(given,) slopes of the energy of a state by all that a step starts from; 0 where time is not transformed.
+        """Return the (given,) gradient of the energy of a state by all variables; 0 if time is not transformed.
 
         Raises:
-            StateError: where the energy has none.
+            StateError: if the gradient is undefined.
         """
         found, name = np.zeros(self.given), self.interface.energy_parameter
         if not name:
@@ -155,10 +155,10 @@ class LinearisedMethod(CompiledMethod):
         *,
         options: SolverOptions | None = None,
     ) -> Array:
-        """d(q1, p1) / d(q0, p0) of a step, (2m, 2m), exact: of the map that its equations define.
+        """Return the (2m, 2m) Jacobian d(q1, p1) / d(q0, p0) of one step, exact for the computed map.
 
-        Symplectic to round-off where the step is; in transformed time where the energy is given: else it is that of
-        (q0, p0), and changes with them. Compiled when first asked for.
+        It is symplectic to round-off if the step is. In transformed time this holds if the energy is passed as a
+        parameter; otherwise it is the energy of (q0, p0) and varies with them. Compiled on first use.
 
         Raises:
             StepFailedError: if Newton's iteration does not converge.
@@ -176,10 +176,10 @@ class LinearisedMethod(CompiledMethod):
         *,
         options: SolverOptions | None = None,
     ) -> Sensitivity:
-        """Derivatives of (q1, p1) by the state, the parameters, the time and the length of a step, as :meth:`jacobian`.
+        """Return the derivatives of (q1, p1) with respect to the state, the parameters, t and h of a step.
 
-        Inputs are parameters, five each. Where constraints have parameters, the state is held and not moved to them. In
-        transformed time ``times`` tells of t1.
+        Raises as :meth:`jacobian`. Inputs are parameters, five each. If constraints depend on parameters, the initial
+        state is not projected again. In transformed time ``times`` contains the derivatives of t1.
         """
         return Sensitivity.of(self._columns(q, p, h, t, parameters, options, self.given), self.dimension)
 
@@ -193,7 +193,7 @@ class LinearisedMethod(CompiledMethod):
         options: SolverOptions | None,
         count: int,
     ) -> Array:
-        """(told, count) derivatives by the first of what is given."""
+        """Return (told, count) derivatives with respect to the first ``count`` variables."""
         q0, p0 = checked_vector(self.interface, q, "q"), checked_vector(self.interface, p, "p")
         starts = Starts.chain(q0, p0, np.array([checked_number(t, "the time t")]), np.array([checked_step(h)]))
         check_inputs_given(self.interface, parameters)
@@ -216,19 +216,19 @@ class LinearisedMethod(CompiledMethod):
         chained: bool = False,
         back: bool = False,
     ) -> tuple[Array, Array]:
-        """Carry vectors along steps, in place.
+        """Propagate tangent vectors (JVP) or cotangents (VJP) along steps, in place.
 
         Args:
-            starts: of n steps.
-            vectors: (n + 1, count, 2m + k + 2) changes of (q, p, parameters, t, h): to those in i + 1 is added what
-                step i makes of those in i.
+            starts: initial data of n steps.
+            vectors: (n + 1, count, 2m + k + 2) variations of (q, p, parameters, t, h): the image of row i under step i
+                is added to row i + 1.
             parameters: (k,) values in order.
-            options: as of a step.
-            chained: whether the steps follow each other: all states of ``starts`` but the first are written.
-            back: by the transpose: to those in i is added what step i makes of those in i + 1, slopes by what is given.
+            options: solver options.
+            chained: whether the steps are consecutive: all states of ``starts`` but the first are computed and stored.
+            back: apply the transpose: the image of row i + 1 is added to row i.
 
         Returns:
-            (n, m) positions and momenta at the ends of the steps, solved anew.
+            (n, m) recomputed positions and momenta at the ends of the steps.
 
         Raises:
             StepFailedError: if Newton's iteration does not converge.
@@ -255,17 +255,17 @@ class LinearisedMethod(CompiledMethod):
     def bend(
         self, starts: Starts, changes: Array, vectors: Array, parameters: Array, options: SolverOptions | None
     ) -> None:
-        """Carry slopes back along steps, in place, and how they change where what the steps start from does.
+        """Propagate cotangents and their tangents (second-order adjoints) back along steps, in place.
 
         Args:
-            starts: of n steps.
-            changes: (n, count, 2m + k + 2) of (q, p, parameters, t, h) of each step, as :meth:`linearise` carries them.
-            vectors: (n + 1, 2, count, 2m + k + 2) slopes and their changes: to those in i is added what step i makes of
-                those in i + 1.
+            starts: initial data of n steps.
+            changes: (n, count, 2m + k + 2) tangent vectors at the start of each step, as of :meth:`linearise`.
+            vectors: (n + 1, 2, count, 2m + k + 2) cotangents and their tangents: the image of row i + 1 under step i
+                is added to row i.
             parameters, options: as of :meth:`linearise`.
 
         Raises:
-            MethodError: where there are no second derivatives.
+            MethodError: if second derivatives are unavailable.
             StepFailedError: if Newton's iteration does not converge.
         """
         binding = self.curvature

@@ -1,7 +1,7 @@
-"""The longest step of transformed time whose ends are as accurate as is wanted, found by short runs.
+"""Largest step of tau that meets a tolerance, determined by short pilot runs.
 
-Where a monitor fits, all steps of tau are about as hard as the first ones, so a few hundred of them tell. What they do
-not tell is seen in the run itself: its ``step_error`` is the largest of all its steps.
+With a suitable monitor all steps of tau have similar errors, so a few hundred steps suffice. Later violations appear in
+``step_error`` of the run, the largest error of all its steps.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from scvi_codegen.runtime.stepper import Stepper
 __all__ = ["ROUND_OFF", "longest_step", "too_wrong"]
 
 ROUND_OFF = 2.0**-53
-"""What is meant by a tolerance of 0."""
+"""Relative error meant by a tolerance of 0."""
 PILOT_STEPS = 256
 RUNGS = 4
-"""Steps tried between one and its double."""
+"""Step sizes tried between a step size and its double."""
 MOST_HALVINGS = 60
 ALLOWED = 10.0
-"""A run keeps what was promised for its start up to this factor."""
+"""Factor by which the error of a run may exceed the tolerance of its pilot run."""
 
 
 def longest_step(
@@ -44,21 +44,21 @@ def longest_step(
     parameters: Parameters = None,
     options: SolverOptions | None = None,
 ) -> float:
-    """The longest step of tau, to a fifth, at which no step of a pilot run has an estimated error beyond the tolerance.
+    """Return the largest step of tau, to a fifth, whose estimated errors in a pilot run do not exceed the tolerance.
 
     Args:
-        stepper: of a system in transformed time, or with a monitor.
+        stepper: stepper of a system in transformed time, or with a monitor.
         q, p: (m,) initial state.
-        span: of time, negative to go back; pilot runs do not go further.
-        tolerance: relative error of the end of a step, 0 for round-off.
+        span: duration of the run, negative for a run backward; pilot runs do not exceed it.
+        tolerance: relative error of a step, 0 for round-off.
         t, parameters, options: as of :meth:`Stepper.integrate`.
 
     Returns:
-        The step, with the sign of the span in transformed time, positive for a monitor.
+        The step, with the sign of the span in transformed time, positive with a monitor.
 
     Raises:
-        StateError: for numbers out of range, inputs that are not given, and where no step is short enough.
-        MethodError: for a method whose steps have no estimate of their error.
+        StateError: if a number is out of range, an input is not set, or no step is small enough.
+        MethodError: if the method has no error estimate.
     """
     length, wanted = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0 or not 0.0 <= wanted < 1.0:
@@ -77,14 +77,14 @@ def longest_step(
 
 
 class _Pilot(NamedTuple):
-    """The largest error of the first steps, and how many were taken."""
+    """Largest error of a pilot run, and its number of steps."""
 
     error: float
     steps: int
 
 
 def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> float:
-    """By doubling a first step while it is short, halving it while it is long, then between that and its double."""
+    """Bracket the step by doubling or halving, then refine it geometrically."""
     found = pilot(h)
     for _ in range(MOST_HALVINGS):
         if found.error <= allowed and found.steps <= 1:
@@ -104,7 +104,7 @@ def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> floa
 
 @unwarned()
 def _pilot(run: Run, end: float) -> _Pilot:
-    """The first steps; the error is infinite if one of them fails."""
+    """Take the first steps of a run; the error is infinite if a step fails."""
     error, done = 0.0, 0
     while done < PILOT_STEPS and not run.arrived and (run.goal or (end - run.t) * run.h > 0.0):
         size = max(1, done)
@@ -119,7 +119,7 @@ def _pilot(run: Run, end: float) -> _Pilot:
 
 
 def too_wrong(step_error: float, t: float, tolerance: float) -> str | None:
-    """What is to be said of a run whose steps were to keep a tolerance (0: round-off), or ``None`` if they did."""
+    """Return a message if a run exceeded its tolerance (0: round-off), else ``None``."""
     allowed = tolerance or ROUND_OFF
     if step_error <= ALLOWED * allowed:
         return None

@@ -1,7 +1,6 @@
-"""Measurements of a motion, and the steps that lead to them, with what their values change by.
+"""Measurements of a trajectory, and steps that end at the measurement times, with derivatives.
 
-The motion goes from measurement to measurement by equal steps no longer than h, so that it is known at each of their
-times. Breakpoints of inputs are ends of steps, too.
+Between measurements the trajectory takes equal steps no longer than h. Breakpoints of inputs are also ends of steps.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ __all__ = ["Measurements", "distinct", "state_names"]
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Measurements, and the steps that lead to them.
+    """Measurements, and the steps between them.
 
     Attributes:
-        measured, used: (n, c) values, and whether there is one.
-        columns: (c,) where they stand in (q, p).
-        pieces: steps with the same parameters: times and lengths.
-        places: (n,) after how many steps.
+        measured, used: (n, c) values, and mask of the values that exist.
+        columns: (c,) indices of the measured quantities in (q, p).
+        pieces: times and sizes of the steps, grouped by pieces of the inputs.
+        places: (n,) number of steps up to each measurement.
     """
 
     stepper: Stepper
@@ -60,7 +59,7 @@ class Measurements:
         h: float,
         inputs: Mapping[str, Input],
     ) -> Measurements:
-        """From what users give."""
+        """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
         stepper.check_steps_of_h("a motion that is fitted")
         if stepper.constraints:
             raise MethodError("motions with constraints are not fitted: an initial state does not vary freely on them")
@@ -86,23 +85,23 @@ class Measurements:
         return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, places)
 
     def halved(self) -> Measurements:
-        """The same by steps half as long."""
+        """Return the measurements with half the step size."""
         pieces = tuple((np.stack([t, t + h / 2], axis=1).ravel(), np.repeat(h / 2, 2)) for t, h in self.pieces)
         return replace(self, pieces=pieces, places=2 * self.places)
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
-        """(n, c) where there is a value."""
+        """(n, c) mask of the values that exist."""
         return np.isfinite(self.measured)
 
     def cut(self, count: int) -> tuple[Measurements, ...]:
-        """So many parts of about as many measurements, each from that at which the one before ends; at most n - 1."""
+        """Divide into at most n - 1 segments of about equally many measurements, each from the end of the previous."""
         firsts = np.unique(np.linspace(0, len(self.t), count, endpoint=False).astype(int))
         nodes = [0, *self.places[firsts[1:]].tolist(), int(self.places[-1])]
         return tuple(self._part(begin, end, last=end == nodes[-1]) for begin, end in pairwise(dict.fromkeys(nodes)))
 
     def _part(self, begin: int, end: int, *, last: bool) -> Measurements:
-        """Of the steps from one number until before another."""
+        """Return the measurements within the steps ``begin`` to ``end`` - 1."""
         pieces, done = [], 0
         for t, h in self.pieces:
             of = slice(max(begin - done, 0), max(end - done, 0))
@@ -115,11 +114,11 @@ class Measurements:
         return replace(own, pieces=steps, start=start)
 
     def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
-        """What the motion has at the measurements, and where it ends.
+        """Integrate and return the computed measurements and the final state, with derivatives.
 
         Returns:
-            (n, c) values at the measurements, (n, c, k) what they change by where the start does by (k, given); (2m,)
-            state at the end, (k, given) what that changes by, with all that goes on behind it.
+            (n, c) computed values, (n, c, k) their derivatives along the (k, given) initial variations, (2m,) final
+            state, (k, given) final variations.
         """
         m, done = self.stepper.dimension, 0
         values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows
@@ -142,7 +141,7 @@ class Measurements:
 def _steps(
     start: float, t: Array, h: float, inputs: Mapping[str, Input]
 ) -> tuple[tuple[tuple[Array, Array], ...], NDArray[np.intp]]:
-    """Steps to all times by way of the breakpoints of inputs, in pieces between these; after how many each time is."""
+    """Return the steps to all times, split at breakpoints of inputs, and the number of steps up to each time."""
     breaks = np.concatenate([np.empty(0), *(data.breakpoints for data in inputs.values())])
     breaks = np.unique(breaks[(breaks > start) & (breaks < t[-1])])
     nodes = np.unique(np.concatenate([[start], t, breaks]))
@@ -158,12 +157,12 @@ def _steps(
 
 
 def state_names(stepper: Stepper) -> tuple[str, ...]:
-    """Of coordinates and momenta, each once."""
+    """Return the names of coordinates and momenta."""
     return (*stepper.coordinates, *stepper.interface.momenta)
 
 
 def distinct(names: Sequence[str], what: str) -> tuple[str, ...]:
-    """As they are; StateError where one occurs twice."""
+    """Return the names; raise ``StateError`` if one occurs twice."""
     for k, name in enumerate(names):
         if name in names[:k]:
             raise StateError(f"{what} names '{name}' twice")

@@ -1,4 +1,4 @@
-"""All memory of an integration under way, one plain C struct: started, advanced, saved and restored bit for bit."""
+"""Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ __all__ = ["Memory", "fill"]
 
 
 UNHEARD_STEPS = 10**5
-"""Between looks at the keyboard."""
+"""Largest number of steps per call into C, between checks for Ctrl-C."""
 RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction"), 2**16
 """Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
 NEVER = LARGEST_COUNT
-"""No step's number: of states that are to be kept."""
+"""Output stride that saves no state."""
 
 
 class Memory(OneThread):
-    """A state, and what makes the next step cheap and the sums exact.
+    """State of a run: positions, momenta, compensation terms and the predictor for the next step.
 
     Attributes:
         stepper: the compiled integrator.
-        longest: the most time between states that were kept, so far.
+        longest: largest difference of t between consecutive saved states so far.
 
-    A step of a system with inputs requires that each of them was set (:meth:`set_inputs`, or its parameters). What C is
-    given with each call stays where it is as long as the run lasts, so that a call costs little more than its steps.
+    Steps of a system with inputs require every input to be set, by :meth:`set_inputs` or parameters. The arguments of
+    C calls are allocated once per run, so a call costs little more than its steps.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Memory(OneThread):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Self:
-        """At (q, p) and t, before the first step: of h, or one that chooses its length on the way to a goal."""
+        """Construct at (q, p) and t before the first step, with fixed step size or a step plan."""
         interface, binding = stepper.interface, stepper.binding
         q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
         memory = binding.new("run *")
@@ -107,7 +107,7 @@ class Memory(OneThread):
         options: SolverOptions | None = None,
         goal: Goal | None = None,
     ) -> Self:
-        """Where :meth:`save` gave these bytes; StateError for bytes that no run has, or none of the kind."""
+        """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
         memory = stepper.binding.new("run *")
         buffer = stepper.binding.buffer(memory)
         if not isinstance(saved, bytes):
@@ -132,7 +132,7 @@ class Memory(OneThread):
 
     @property
     def goal(self) -> Goal | None:
-        """Where steps that choose their length lead, ``None`` for steps of h."""
+        """Step plan of adaptive steps, ``None`` for fixed steps."""
         return self._goal
 
     @goal.setter
@@ -142,7 +142,7 @@ class Memory(OneThread):
 
     @property
     def h(self) -> float:
-        """Step size, 0 where steps choose their length."""
+        """Step size, 0 for adaptive steps."""
         return float(self._memory.h)
 
     @property
@@ -152,27 +152,27 @@ class Memory(OneThread):
 
     @property
     def options(self) -> SolverOptions | None:
-        """When the stage equations count as solved; ``None`` for the defaults."""
+        """Convergence criterion of the solver; ``None`` for the defaults."""
         return self._options
 
     @property
     def t(self) -> float:
-        """Time, as carried along: the sum of all steps, rounded."""
+        """Time, the rounded compensated sum of all steps."""
         return _time(self._memory)
 
     def left_to(self, end: float) -> float:
-        """Return the time from here to ``end``, counted with the low word of the run's time."""
+        """Return the time left to ``end``, computed with the low word of the run's time."""
         return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
 
     @alone
     def update(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
-        """Go on with other parameters, another step, another goal; what is not given stays.
+        """Set parameters, step size or step plan; what is omitted is unchanged.
 
         Args:
-            parameters: by name, others staying what they are; or all in order.
+            parameters: values by name, the others unchanged; or all in order.
 
         Raises:
-            StateError: for names and numbers that are none, and where constraints of positions would jump.
+            StateError: if a name or number is invalid, or position constraints would jump.
         """
         interface = self.stepper.interface
         missing = inputs_not_given(interface, parameters)
@@ -188,7 +188,7 @@ class Memory(OneThread):
             self.goal = goal
 
     def set_inputs(self, **inputs: float) -> None:
-        """Go on with inputs held at numbers: between the samples of a controller.
+        """Set inputs to constant values for the following steps (zero-order hold).
 
         >>> run.set_inputs(u=-1.5); run.advance(10)  # doctest: +SKIP
         """
@@ -207,14 +207,14 @@ class Memory(OneThread):
             self._awaited = tuple(name for name in self._awaited if name not in inputs)
 
     def _go_on_with(self, values: Array) -> None:
-        """These values of the parameters, unless constraints of positions jump with them."""
+        """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
         self._parameters[:] = values
 
     @property
     def steps(self) -> int:
-        """Steps done since the start."""
+        """Number of completed steps."""
         return int(self._memory.step)
 
     @property
@@ -229,12 +229,12 @@ class Memory(OneThread):
 
     @property
     def carries(self) -> tuple[Array, Array]:
-        """(m,) and (m,) what rounding cut off :attr:`q` and :attr:`p`, added to the next steps."""
+        """(m,) compensation terms of :attr:`q` and of :attr:`p`, added in the following steps."""
         return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
 
     @alone
     def resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
-        """How a run made elsewhere goes on here: after ``steps``, at a time, with what rounding cut off it, q and p."""
+        """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p."""
         self._memory.step = steps
         self._memory.t, self._memory.t_low = time
         for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
@@ -242,24 +242,24 @@ class Memory(OneThread):
 
     @alone
     def save(self) -> bytes:
-        """All of it, for :meth:`Stepper.restore` on the same kind of machine."""
+        """Return a bitwise copy of the run for :meth:`Stepper.restore` on the same kind of machine."""
         return bytes(self.stepper.binding.buffer(self._memory))
 
     def check_inputs(self) -> None:
-        """Raise :class:`StateError` for an input that the next step waits for."""
+        """Raise :class:`StateError` if an input is not set."""
         if self._awaited:
             raise missing_input(self._awaited[0])
 
     @alone
     def rewind(self, saved: bytes) -> None:
-        """Back to when :meth:`save` gave these bytes."""
+        """Restore the state saved by :meth:`save`."""
         self.stepper.binding.buffer(self._memory)[:] = saved
 
     def advance(self, steps: int) -> None:
-        """So many steps; of those that choose their length no more than lead to the goal.
+        """Take ``steps`` steps; adaptive steps end at the target time.
 
         Raises:
-            StepFailedError: if one fails; the run stands before it.
+            StepFailedError: if a step fails; the run is left at the state before it.
         """
         left = checked_count(steps, "steps", least=0)
         if not self._lock.acquire(False):  # as ``alone``, at half the cost
@@ -273,12 +273,12 @@ class Memory(OneThread):
             self._lock.release()
 
     def run_to_goal(self) -> None:
-        """Advance to the goal and keep nothing but the state there."""
+        """Advance to the target time without saving intermediate states."""
         while not self.arrived:
             self.advance(UNHEARD_STEPS)
 
     def _advance(self, steps: int, save_every: int, places: tuple[Any, ...]) -> int:
-        """Return the status of one call of C for ``steps`` steps, which writes every ``save_every``-th state."""
+        """Take steps in one C call that stores every ``save_every``-th state at ``places``; return the status."""
         if self._awaited and steps:
             self.check_inputs()
         status: int = self._go(*self._way, steps, save_every, *self._given, *places, self._report, self._workspace)
@@ -286,7 +286,7 @@ class Memory(OneThread):
 
     @property
     def iterations(self) -> int:
-        """Since the last state that was kept; the next one has these, too."""
+        """Number of solver iterations since the last saved state."""
         return int(self._memory.iterations)
 
     @iterations.setter
@@ -295,38 +295,38 @@ class Memory(OneThread):
 
     @property
     def arrived(self) -> bool:
-        """Whether the run stands at its goal."""
+        """Return whether the run has reached its target time."""
         return self.goal is not None and self.left_to(self.goal.t_end) == 0.0
 
     @property
     def rejected(self) -> int:
-        """Steps that were tried, and repeated shorter."""
+        """Number of rejected steps."""
         return int(getattr(self._memory, "rejected", 0))
 
     @property
     def step_error(self) -> tuple[float, float]:
-        """An estimate of the relative error of the worst step, and when that step began; not numbers without one."""
-        if not hasattr(self._memory, "error"):  # of version 0.1
+        """Estimated relative error of the worst step and its start time; NaN without an estimate."""
+        if not hasattr(self._memory, "error"):  # source generated by version 0.1
             return np.nan, np.nan
         error = float(self.stepper.binding.function("step_error")(self._memory))
         return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
 
     @property
     def leaving(self) -> bool:
-        """Whether it began at the origin and is near it yet: what its steps are wrong by is not known beside a size."""
+        """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
         return bool(getattr(self._memory, "leaving", 0))
 
 
 def fill(
     memory: Memory, steps: int, save_every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
 ) -> tuple[int, Any]:
-    """Advance by ``steps`` in one call of C, which fills the arrays with every ``save_every``-th state.
+    """Advance by ``steps`` in one C call and store every ``save_every``-th state in the arrays.
 
-    With a goal, by no more steps than lead there; the state there is stored whatever its number, and the report
-    says how many are ``stored``.
+    With a step plan the run ends at the target time and its last state is stored; ``stored`` in the report counts the
+    states.
 
     Returns:
-        The status, 0 unless a step failed, and the report, whose ``steps`` says how many were done.
+        The status, 0 unless a step failed, and the report, whose ``steps`` counts the completed steps.
     """
     pointer = memory.stepper.binding.pointer
     status = memory._advance(steps, save_every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
@@ -334,12 +334,12 @@ def fill(
 
 
 def _time(memory: Any) -> float:
-    """Of a run; version 0.1, whose text recorded runs may have, carried the start and the number of steps."""
+    """Return the time of a run; structs of version 0.1 store the start and the number of steps instead."""
     return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)
 
 
 def _check_memory(memory: Any) -> None:
-    """Raise :class:`StateError` for bytes that no run has."""
+    """Raise :class:`StateError` if the bytes cannot belong to a run."""
     numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
     counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
     rungs = {name: getattr(memory, name) for name in RUNGS if hasattr(memory, name)}

@@ -1,4 +1,4 @@
-"""What kept states say of nearby motions: derivatives by all that a run starts from, and indicators of chaos."""
+"""Derivatives of a trajectory with respect to its initial state and parameters, and chaos indicators."""
 
 from __future__ import annotations
 
@@ -21,82 +21,82 @@ __all__ = ["NearbyMotions"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NearbyMotions(KeptStates):
-    """:class:`KeptStates` with the exact derivatives of the computed map, lengths of steps held.
+    """:class:`KeptStates` with the exact derivatives of the computed map at fixed step sizes.
 
-    They stand at whole steps: states of ``t_eval`` have none. The last step of a run that a terminal event ended is
-    that to the time of the crossing, which is held, too: how it would move is not told. In transformed time lengths are
-    of tau, and the times of states move; but where a run ends, at t_end or an event, its time is held.
+    Derivatives require states at whole steps; states of ``t_eval`` have none. After a terminal event the size of the
+    last, partial step is also held fixed: the variation of the crossing time is not included. In transformed time the
+    steps of tau are fixed and the times of states vary, except the final time of a run (t_end or an event).
     """
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
-        """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
+        """Return (n, 2m, k) tangent vectors at the states, from (2m, k) initial directions of (q, p), by default all.
 
-        The exact derivative of the computed states, lengths of steps held (:meth:`Stepper.jacobian`). Directions may
-        be (2m + parameters + 2, k), too, of (q, p, parameters, t, h). In transformed time the energy is that of the
-        first state, and moves with it; one among the parameters is what is added to it.
+        They are exact derivatives of the computed states at fixed step sizes (:meth:`Stepper.jacobian`). Directions
+        may also be (2m + parameters + 2, k), of (q, p, parameters, t, h). In transformed time the energy is that of
+        the first state and varies with it; a direction of the energy parameter is added.
 
         Raises:
-            StateError: for directions of another shape, and states that do not stand at whole steps.
+            StateError: if the directions have another shape, or the states are not at whole steps.
         """
         return carried(self, directions)
 
     def sensitivity(self) -> Sensitivity:
-        """Derivatives of all states by the initial state, the parameters, the initial time and h, lengths held.
+        """Return the derivatives of all states with respect to the initial state, the parameters, t and h.
 
-        Of steps solved anew from the kept states, exact to round-off. For a few functions of the states
-        :meth:`pullback` costs less. In transformed time ``times`` tells of the times of the states. Raises as
+        Steps are recomputed from the saved states; derivatives are exact to round-off. For few functions of the states
+        :meth:`pullback` is cheaper. In transformed time ``times`` contains the derivatives of the times. Raises as
         :meth:`tangent`.
         """
         return sensitivity(self)
 
     def pullback(self, cotangents: ArrayLike) -> Gradient:
-        """The gradient of a function of the states by the initial state, the parameters, the initial time and h.
+        """Return the gradient of a function of the states with respect to the initial state, parameters, t and h.
 
-        One pass back along the run, whatever the number of parameters: the adjoint, exact to round-off of the computed
-        states. Where not all states are kept (``save_every``) the steps between them are taken again.
+        Discrete adjoint: one pass backward along the run, independent of the number of parameters, exact to round-off
+        for the computed states. Steps between saved states (``save_every``) are recomputed.
 
         Args:
-            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions. In
-                transformed time also (n, 2m + 1) or (n, 2m + 1, c), with those by the time of each.
+            cotangents: (n, 2m) derivatives of the function with respect to (q, p) of each state; (n, 2m, c) of c
+                functions. In transformed time also (n, 2m + 1) or (n, 2m + 1, c), with those with respect to t.
 
         Raises:
-            StateError: for another shape, and states that do not stand at whole steps.
+            StateError: if the shape is another, or the states are not at whole steps.
         """
         return pulled_back(self, cotangents)
 
     def hessian_product(
         self, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None = None
     ) -> Gradient:
-        """The Hessian of a function F of the states, by all that the run started from, times directions.
+        """Return the Hessian of a function F of the states, with respect to the initial data, times directions.
 
-        The derivative of :meth:`pullback` along directions, exact to round-off: once forward and back along the run
-        for all of them, whatever the number of parameters; with ``np.eye(stepper.given)`` the whole Hessian.
+        This is the derivative of :meth:`pullback` along the directions, exact to round-off, computed in one forward
+        and one backward pass for all of them; with ``np.eye(stepper.given)`` it is the whole Hessian.
 
         Args:
-            cotangents: (n, 2m) slopes of F by (q, p) of each state.
+            cotangents: (n, 2m) gradient of F with respect to (q, p) of each state.
             directions: (2m,) or (2m, k) of (q, p), or (2m + parameters + 2,) or (.., k) of (q, p, parameters, t, h).
-            curvatures: (n, 2m, 2m) second slopes of F by (q, p) of each state; without any, F is linear in the states.
+            curvatures: (n, 2m, 2m) Hessian of F with respect to (q, p) of each state; by default 0 (linear F).
 
         Returns:
-            A :class:`Gradient`, (m,) or (m, k) and so on: its changes along the directions.
+            A :class:`Gradient` of the products, (m,) or (m, k) for q, and so on.
 
         Raises:
-            MethodError: in transformed time, and with damping.
-            StateError: for another shape, and states that do not stand at whole steps.
+            MethodError: if time is transformed, or the system is damped.
+            StateError: if a shape is another, or the states are not at whole steps.
         """
         return hessian_product(self, cotangents, directions, curvatures)
 
     def deviations(self, count: int | None = None, *, directions: ArrayLike | None = None) -> Deviations:
-        """What becomes of small changes of the initial state: what all indicators of chaos are told from.
+        """Return the growth of tangent vectors along the run, from which all chaos indicators are computed.
 
         Args:
-            count: of changes, orthonormal and in general position, the same in every run; at most and by default 2m, or
-                as many as constraints leave.
-            directions: instead (2m,) or (2m, k) changes, which constraints allow; their lengths do not matter.
+            count: number of orthonormal tangent vectors in general position, the same in every run; at most and by
+                default 2m, or as many as constraints allow.
+            directions: instead (2m,) or (2m, k) tangent vectors admissible for the constraints; norms are irrelevant.
 
         Raises:
-            MethodError: in transformed time.
-            StateError: of a run of no steps, for other shapes, and states that do not stand at whole steps.
+            MethodError: if time is transformed.
+            StateError: if the run has no steps, a shape is another, or the states are not at whole steps.
         """
         if len(self) < 2:
             raise StateError("what nearby motions do takes a time that passes: this run has no steps")
@@ -104,28 +104,28 @@ class NearbyMotions(KeptStates):
 
     @takes(StateError, history=SWITCH)
     def lyapunov_exponents(self, *, history: bool = False) -> Array:
-        """(2m,) Lyapunov exponents of the time that the run covers, descending; raises as :meth:`deviations`.
+        """Return the (2m,) finite-time Lyapunov exponents of the run, descending; raises as :meth:`deviations`.
 
-        Of symplectic steps they are opposite in pairs, to round-off.
+        For symplectic steps they occur in pairs of opposite sign, to round-off.
 
         Args:
-            history: (n, 2m) of the time until each state instead; not numbers at the first.
+            history: return (n, 2m) exponents up to each state instead; NaN at the first state.
         """
         exponents = self.deviations().lyapunov_exponents()
         return exponents if history else exponents[-1]
 
     def megno(self) -> Array:
-        """(n,) MEGNO: 2 for regular motions, lambda t / 2 for chaotic ones; see :meth:`Deviations.megno`."""
+        """Return (n,) MEGNO: 2 for regular motion, lambda t / 2 for chaotic motion; see :meth:`Deviations.megno`."""
         return self.deviations(1).megno()
 
     def fli(self) -> Array:
-        """(n,) the fast Lyapunov indicator: log t or lambda t; see :meth:`Deviations.fli`."""
+        """Return (n,) the fast Lyapunov indicator: log t or lambda t; see :meth:`Deviations.fli`."""
         return self.deviations().fli()
 
     def gali(self, k: int = 2) -> Array:
-        """(n,) the generalized alignment index of k changes, 2 to 2m; see :meth:`Deviations.gali`."""
+        """Return (n,) the generalised alignment index of k tangent vectors, 2 to 2m; see :meth:`Deviations.gali`."""
         return self.deviations(checked_count(k, "k", least=2)).gali(k)
 
     def sali(self) -> Array:
-        """(n,) the smaller alignment index of two changes; see :meth:`Deviations.sali`."""
+        """Return (n,) the smaller alignment index of two tangent vectors; see :meth:`Deviations.sali`."""
         return self.deviations(2).sali()

@@ -1,4 +1,4 @@
-"""Derivatives of runs whose inputs are data: those of its pieces, one behind the other."""
+"""Derivatives of runs with inputs: those of the pieces between breakpoints, composed."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from scvi_codegen.runtime.linearised import LinearisedMethod
 __all__ = ["DrivenGradient", "NearbyDrivenMotions"]
 
 COEFFICIENTS = 4
-"""Of a piece of an input; its fifth parameter is the time from which they count, which is held."""
+"""Number of coefficients of a piece of an input; its fifth parameter is the reference time, which is held fixed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrivenGradient(Gradient):
-    """A :class:`Gradient` of a run with inputs: ``parameters`` has not numbers for those of inputs, ``h`` is ``None``.
+    """:class:`Gradient` of a run with inputs: NaN in ``parameters`` for those of inputs, ``h`` is ``None``.
 
     Attributes:
-        inputs: by the name of each, (k, 4) or (k, 4, c) slopes by its coefficients in each of its pieces that the run
-            goes through, in the order of the run: of powers of the time since the piece began, ascending.
+        inputs: by name, (k, 4) or (k, 4, c) derivatives with respect to the coefficients of each piece that the run
+            passes, in the order of the run: ascending powers of the time since the start of the piece.
     """
 
     inputs: dict[str, Array]
@@ -44,18 +44,18 @@ class DrivenGradient(Gradient):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearbyDrivenMotions:
-    """The exact derivatives of the computed states of a run with inputs, lengths of steps and breakpoints held.
+    """Exact derivatives of the computed states of a run with inputs, at fixed step sizes and breakpoints.
 
     Attributes:
-        pieces: from breakpoint to breakpoint, the first state of each the last of the one before.
+        pieces: trajectories between breakpoints; the first state of each is the last of the previous one.
     """
 
     pieces: tuple[KeptStates, ...]
 
     def tangent(self, directions: ArrayLike | None = None) -> Array:
-        """(n, 2m, k) what becomes of (2m, k) directions of (q, p) at the first state; all 2m without any.
+        """Return (n, 2m, k) tangent vectors at the states, from (2m, k) initial directions of (q, p), by default all.
 
-        Directions may be (2m + parameters + 2, k), too, of (q, p, parameters, t, h), with zeros for parameters of
+        Directions may also be (2m + parameters + 2, k), of (q, p, parameters, t, h), with zeros for the parameters of
         inputs and for h. Raises as :meth:`Trajectory.tangent`.
         """
         stepper = self._stepper
@@ -67,13 +67,14 @@ class NearbyDrivenMotions:
         return np.concatenate(found).reshape(-1, 2 * stepper.dimension, *given.shape[1:])
 
     def pullback(self, cotangents: ArrayLike) -> DrivenGradient:
-        """The gradient of a function of the states, by what the run started from, and by what its inputs are.
+        """Return the gradient of a function of the states with respect to the initial data and the inputs.
 
         Args:
-            cotangents: (n, 2m) slopes of the function by (q, p) of each state; (n, 2m, c) of c functions.
+            cotangents: (n, 2m) derivatives of the function with respect to (q, p) of each state; (n, 2m, c) of c
+                functions.
 
         Raises:
-            StateError: for another shape, and states that do not stand at whole steps.
+            StateError: if the shape is another, or the states are not at whole steps.
         """
         slopes = checked_slopes(self._stepper, self._places[-1] + 1, cotangents)
         seeds = seeds_of(self._stepper, slopes)
@@ -86,12 +87,12 @@ class NearbyDrivenMotions:
     def hessian_product(
         self, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None = None
     ) -> DrivenGradient:
-        """The Hessian of a function of the states times directions: as :meth:`Trajectory.hessian_product`.
+        """Return the Hessian of a function of the states times directions, as :meth:`Trajectory.hessian_product`.
 
         Args:
-            cotangents: (n, 2m) slopes of the function by (q, p) of each state.
+            cotangents: (n, 2m) gradient of the function with respect to (q, p) of each state.
             directions: as of :meth:`tangent`.
-            curvatures: (n, 2m, 2m) its second slopes by (q, p) of each state.
+            curvatures: (n, 2m, 2m) Hessian of the function with respect to (q, p) of each state.
         """
         slopes, bends = checked_function(self._stepper, self._places[-1] + 1, cotangents, curvatures)
         given = finite(directions, "directions")
@@ -111,23 +112,23 @@ class NearbyDrivenMotions:
 
     @property
     def _places(self) -> list[int]:
-        """(pieces + 1,) numbers of the states at their ends."""
+        """(pieces + 1,) indices of the states at their ends."""
         return list(accumulate((len(piece) - 1 for piece in self.pieces), initial=0))
 
     @property
     def _columns(self) -> list[int]:
-        """Where parameters of inputs stand among all that is given."""
+        """Indices of the parameters of inputs among all variables."""
         return [2 * self._stepper.dimension + k for k in columns_of_inputs(self._stepper.interface)]
 
     def _changes(self, directions: Array) -> Array:
-        """(k, given) at the start; StateError for changes of data."""
+        """Return (k, given) initial variations; raise ``StateError`` if they vary inputs or h."""
         changes = changes_of(self._stepper, directions)
         if changes[:, [*self._columns, -1]].any():
             raise StateError("inputs and the lengths of steps are data of a driven run: directions are 0 there")
         return changes
 
     def _back(self, along: Array) -> list[tuple[KeptStates, Array]]:
-        """Pieces from the last on, with what belongs to their states; what is between two, to the earlier one."""
+        """Return the pieces in reverse with the rows of their states; a shared state belongs to the earlier piece."""
         found: list[tuple[KeptStates, Array]] = []
         for piece, (first, last) in zip(self.pieces, pairwise(self._places), strict=True):
             own = along[first : last + 1].copy()
@@ -137,13 +138,13 @@ class NearbyDrivenMotions:
         return found[::-1]
 
     def _without_inputs(self, slopes: Array) -> Array:
-        """Slopes behind a piece, as the one before it has other inputs and lengths."""
+        """Return adjoints without those of inputs and h, which differ in the previous piece."""
         kept = slopes.copy()
         kept[..., [*self._columns, -1]] = 0.0
         return kept
 
     def _gradient(self, by_pieces: Sequence[Array], shape: tuple[int, ...]) -> DrivenGradient:
-        """From (k, given) slopes at the start of each piece."""
+        """Construct from (k, given) adjoints at the start of each piece."""
         stepper, m = self._stepper, self._stepper.dimension
         found = by_pieces[0].T.copy()
         found[self._columns] = np.nan

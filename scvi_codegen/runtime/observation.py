@@ -1,7 +1,7 @@
-"""Runs of which more is wanted than every so-many-th state: events, or states at given times.
+"""Runs with events, with output at given times, or with fixed steps to a final time.
 
-The run itself is the plain one, a portion at a time with all its states; the events are looked for between them, what
-is wanted is kept, and the rest forgotten. So states are the same, bit for bit, with events and without.
+The run advances in chunks with all states; events are searched between these states and only the requested states are
+saved. States are therefore bitwise equal with and without events.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ __all__ = ["Observation", "observed_until"]
 
 Array = NDArray[np.float64]
 NUMBERS = 2**18
-"""Of positions in a portion."""
+"""Largest number of positions in a chunk."""
 FIRST_STEPS = 64
 
 
 class Observation:
-    """What is kept of a run.
+    """Recorder of a run with events or with output at given times.
 
     Args:
-        run: to be advanced.
-        save_every: keep the present state and each whose step number is a multiple of this, if no times are given.
-        times: (n,) sorted as the run goes; keep the states at these.
-        end: of steps of h, also in transformed time, where the run ends, by a last step that is shorter.
+        run: the run to advance.
+        save_every: without ``times``, save the present state and those whose step number is a multiple of this.
+        times: (n,) output times, sorted in the direction of the run.
+        end: final time of fixed steps, also in transformed time; the last step is shorter.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Observation:
 
     @property
     def ended(self) -> bool:
-        """Whether the run ended inside of a step, which is not taken: by a terminal event, or where it was to end."""
+        """Return whether the run ended within a step, by a terminal event or at its final time."""
         return self.arrived or (self.search is not None and self.search.ended)
 
     def advance(
@@ -61,13 +61,13 @@ class Observation:
         progress: Callable[[int], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
     ) -> Trajectory:
-        """Advance by ``steps`` (``None``: to the end), or to the step in which a terminal event ends the run.
+        """Advance by ``steps`` (``None``: to the end) or to a terminal event; return the saved states.
 
-        ``stop`` is asked after each portion whether to end there.
+        ``stop`` is called after each chunk and ends the run if it returns true.
 
         Raises:
-            StepFailedError: with what was kept as ``trajectory``; the run stands before the failing step.
-            EventError: where an event function is not finite.
+            StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+            EventError: if an event function is not finite.
         """
         goal = self.run.goal
         on = steps is None and (goal or self.end is not None)
@@ -99,7 +99,7 @@ class Observation:
         return found
 
     def _portion(self, size: int) -> None:
-        """A portion of the run, its events and what is kept of it; a step that fails after a terminal event is none."""
+        """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
         before, failure = self.run.save(), None
         try:
             part = record(self.run, size)
@@ -118,19 +118,19 @@ class Observation:
             raise failure
 
     def _ended(self, part: Trajectory) -> Trajectory:
-        """The part with the state at which the event ended it."""
+        """Return the chunk with the state of the terminal event appended."""
         assert self.search is not None
         last = self.search.found[-1][-1]
         _, _, tau = self._inside(part, float(last["t"]))
         return self._closed(part, part.lengths, last["t"], last["q"], last["p"], tau)
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
-        """The part up to the end, by a last step of such a length; the run stands before that step."""
+        """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
         assert self.end is not None
         self.arrived = True
         whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
         part = record(self.run, whole)
-        while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: it is the step before
+        while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: the previous step is the last one
             self.run.rewind(before)
             whole -= 1
             part = record(self.run, whole)
@@ -143,9 +143,9 @@ class Observation:
         return self._closed(part, lengths, self.end, q, p, tau)
 
     def _inside(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
-        """The state at a time in the step that follows a part, and its tau; of plain time the last state.
+        """Return the state and tau at a time in the step after a chunk; without time transformation the last state.
 
-        Systems in transformed time do not depend on t, so that it is counted from the last state.
+        Systems in transformed time are autonomous, so t is counted from the last state.
         """
         if part.tau is None or (left := self.run.left_to(t)) == 0.0:
             return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
@@ -154,7 +154,7 @@ class Observation:
         return q, p, float(part.tau[-1]) + x * run.h
 
     def _closed(self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None) -> Trajectory:
-        """A part with one more state, inside of a step."""
+        """Return a chunk with one more state within a step appended."""
         return self._made(
             np.append(part.t, t),
             np.concatenate([part.q, [q]]),
@@ -165,7 +165,7 @@ class Observation:
         )
 
     def _keep(self, part: Trajectory, *, first: bool = False) -> None:
-        """What is wanted of a part, whose first state was dealt with unless it is the first of all."""
+        """Save the requested states of a chunk; its first state is already saved unless ``first``."""
         total = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
         self.iterations = int(total[-1])
         if self.times is not None:
@@ -189,7 +189,7 @@ class Observation:
         self.states.append((times, q, p, lengths_at(part, times), stepped, total[behind]))
 
     def trajectory(self) -> Trajectory:
-        """All that was kept so far."""
+        """Return all states saved so far."""
         t, q, p, lengths, stepped, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
         return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths, stepped)
 
@@ -209,7 +209,7 @@ def observed_until(
     t_eval: ArrayLike | None,
     progress: Callable[[int], None] | None,
 ) -> Trajectory:
-    """The trajectory of a run by steps of h to t_end, the last shorter, with the states kept that are asked for."""
+    """Return the trajectory of a run with fixed steps to t_end, with the requested output."""
     end = checked_number(t_end, "the time t_end")
     if steps is not None:
         raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")

@@ -1,4 +1,4 @@
-"""A lock that keeps a run to one thread: a second thread that enters is refused, because the C works on one struct."""
+"""Lock of a run: a second thread that enters raises an error, because C functions modify one struct."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Called = TypeVar("Called", bound=Callable[..., Any])
 
 
 def in_use() -> StateError:
-    """The error for a second thread."""
+    """Return the error for a second thread."""
     return StateError(
         "this run is being used by another thread: a run belongs to one thread at a time. Start a run for each thread "
         "(stepper.start(...), copy.copy(run)); the stepper itself may be shared"
@@ -24,17 +24,17 @@ def in_use() -> StateError:
 
 
 class OneThread:
-    """Base of runs; callbacks in the thread that holds the lock may enter again."""
+    """Base class of runs with a re-entrant lock, so that callbacks in the owning thread may call methods."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """Hold the run for several calls.
+        """Lock the run for several calls.
 
         Raises:
-            StateError: if another thread holds it.
+            StateError: if another thread has locked it.
         """
         if not self._lock.acquire(blocking=False):
             raise in_use()
@@ -45,7 +45,7 @@ class OneThread:
 
 
 def alone(method: Called) -> Called:
-    """Hold the run while a method of it works; the method then raises as :meth:`OneThread.alone`."""
+    """Decorate a method to lock its run; the method raises as :meth:`OneThread.alone`."""
 
     @functools.wraps(method)
     def held(self: Any, *given: Any, **named: Any) -> Any:

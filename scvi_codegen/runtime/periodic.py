@@ -1,10 +1,9 @@
-"""Periodic orbits: Newton's iteration on the end of a motion after a period, with the exact monodromy matrix.
+"""Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
 
-Such orbits are seldom alone: they may be begun anywhere on them, and belong to families, by energy or by another
-conserved quantity. Each step of the iteration is the shortest that meets the linearised equations, in the directions
-that these decide (Moore & Penrose), so that the orbit found is one near the guess, and no condition has to be thought
-of for what does not matter. What a motion keeps returns by itself: that much of the equations is left out
-(Munoz-Almaraz et al., Physica D 181 (2003) 1).
+Periodic orbits are not isolated: the initial point is arbitrary, and orbits form one-parameter families (by energy or
+another conserved quantity). Each Newton step is the minimum-norm solution of the linearised equations (Moore-Penrose
+inverse), so the iteration converges to a nearby orbit without phase conditions. Equations implied by conserved
+quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
 """
 
 from __future__ import annotations
@@ -32,19 +31,19 @@ __all__ = ["periodic_orbit"]
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 UNDECIDED = 1e-9
-"""Beside the largest singular value: directions in which the end moves along with the start."""
+"""Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
-"""Beside the size of the state, and what the monodromy makes of its rounding: where an orbit ends where it began."""
+"""Largest closing error, relative to the size of the state and the norm of the monodromy matrix."""
 KEPT = 1e-3
-"""Beside their sizes: how far slopes of an integral may change along a motion that keeps it, by the errors of steps."""
+"""Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
 BESIDE = 1e-6
-"""Beside the size of a state: where its neighbours are."""
+"""Increment of the finite differences of integrals, relative to the size of the state."""
 SETTLED = 1e-13
-"""Beside the size of state and period: a step that is rounding."""
+"""Newton step, relative to state and period, below which the iteration ends."""
 WORSE = 10.0
-"""Than before: what a defect may become on the way."""
+"""Largest factor by which a Newton step may increase the residual."""
 RESTING = 1e-6
-"""Beside the size of the state: how far a motion goes in a period that goes nowhere."""
+"""Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
 
 @takes(StateError, stepper=of("a compiled stepper", Stepper), hold=NAMES, fixed_period=SWITCH)
@@ -65,31 +64,31 @@ def periodic_orbit(
     parameters: Parameters = None,
     options: SolverOptions | None = None,
 ) -> PeriodicOrbit:
-    """Find the periodic orbit next to a guess, by Newton's iteration with the exact derivatives of the steps.
+    """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
 
     Args:
-        stepper: system and method.
-        q, p, velocity: (m,) a guess of a state on it, one of p and velocity.
-        period: a guess of its period, positive.
-        steps: of a period, as many whatever its length becomes.
-        h: instead, the longest step for the period guessed; its sign does not matter.
-        fixed_period: whether the period is as given: so it must be where the system depends on time.
-        energy: that of the orbit, if it is given.
-        hold: coordinates and momenta (``"p_x"``) of the state that stay as given: an amplitude, or a section such as
+        stepper: the compiled stepper.
+        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity.
+        period: initial guess of the period, positive.
+        steps: number of steps per period.
+        h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
+        fixed_period: keep the period fixed; required if the system depends on time.
+        energy: prescribed energy of the orbit.
+        hold: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
             ``["y"]``.
-        gain: (m,) what positions have gained after a period: 2 pi for an angle that turns, by default 0.
+        gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0.
         t, parameters, options: as of :meth:`Stepper.integrate`.
 
     Returns:
         A :class:`PeriodicOrbit`.
 
     Raises:
-        OrbitError: where the iteration does not close an orbit of that energy, or ends in a state at rest, and where
-            what depends on time is another after a period.
-        MethodError: in transformed time, where a monitor chooses the steps, with constraints, for an energy where
-            forces act, and for a period that is to be found of what depends on time.
-        StateError: on wrong shapes, names or numbers, and for inputs that are not given.
-        StepFailedError: if a step fails on the way round from the guess.
+        OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
+            system is not periodic in time with this period.
+        MethodError: if time is transformed, the stepper has a monitor or constraints, an energy is prescribed with
+            forces, or the period of a time-dependent system is free.
+        StateError: if a shape, name or number is invalid, or an input is not set.
+        StepFailedError: if a step from the initial guess fails.
     """
     search = _OrbitSearch.checked(
         stepper,
@@ -111,10 +110,10 @@ def periodic_orbit(
 
 @dataclass(frozen=True, eq=False)
 class _OrbitSearch:
-    """What an orbit has to meet, as a function of z = (q, p, period).
+    """Equations of a periodic orbit as a function of z = (q, p, period).
 
     Attributes:
-        free: (j,) places in z of what may change.
+        free: (j,) indices of the free entries of z.
     """
 
     stepper: Stepper
@@ -143,7 +142,7 @@ class _OrbitSearch:
         parameters: Parameters,
         options: SolverOptions | None,
     ) -> _OrbitSearch:
-        """From what users give."""
+        """Construct from validated arguments of :func:`periodic_orbit`."""
         interface, names = stepper.interface, (*state_names(stepper), "period")
         stepper.check_steps_of_h("a periodic orbit")
         check_inputs_given(interface, parameters)
@@ -172,9 +171,9 @@ class _OrbitSearch:
         )
 
     def orbit(self, guess: Array) -> PeriodicOrbit:
-        """The orbit next to a guess."""
+        """Return the orbit near a guess."""
         z, found = guess, self._closing(guess)
-        for iteration in range(MOST_ITERATIONS):  # noqa: B007  (how many there were is told)
+        for iteration in range(MOST_ITERATIONS):  # noqa: B007  (the count is reported)
             nearer = self._nearer(z, found)
             if nearer is None:
                 break
@@ -207,7 +206,7 @@ class _OrbitSearch:
         )
 
     def _check_energy(self, found: _Closing, allowed: float) -> None:
-        """Raise :class:`OrbitError` for an orbit that closes, but has another energy; ``allowed``: of its state."""
+        """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
         away, slopes = float(found.defects[-1]), found.slopes[-1]
         if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
             raise OrbitError(
@@ -216,7 +215,7 @@ class _OrbitSearch:
             )
 
     def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:
-        """Raise where what depends on time is another a period later: the next motion from there does not close."""
+        """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
         period = float(z[-1])
         if len(z) - 1 in self.free:
             raise MethodError(
@@ -232,10 +231,10 @@ class _OrbitSearch:
             )
 
     def _nearer(self, z: Array, found: _Closing) -> tuple[Array, _Closing] | None:
-        """A step of Newton's iteration, shortened until it helps; ``None`` where none does, or is left.
+        """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
 
-        It helps if what the same slopes would change next is less (Deuflhard's natural monotonicity): defects would be
-        those of the one direction in which motions part.
+        A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
+        natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
         inverse = np.zeros((len(z), len(found.defects)))
         inverse[self.free] = np.linalg.pinv(found.slopes[:, self.free], UNDECIDED)
@@ -254,7 +253,7 @@ class _OrbitSearch:
         return None
 
     def _closing(self, z: Array) -> _Closing:
-        """One motion of a period, with its derivatives."""
+        """Integrate one period and return the residuals with their derivatives."""
         stepper, m, size = self.stepper, self.stepper.dimension, len(z) - 1
         h = z[-1] / self.steps
         starts = Starts.chain(z[:m], z[m:-1], times_after(self.t, h, np.arange(self.steps))[0], np.full(self.steps, h))
@@ -276,9 +275,9 @@ class _OrbitSearch:
         return _Closing(end, error, wanted, rows, *derivatives)
 
     def _not_implied(self, z: Array, end: Array, monodromy: Array) -> Array:
-        """(2m, 2m) projection on the equations that are left: what a motion keeps returns by itself.
+        """Return the (2m, 2m) projection onto the equations not implied by conserved quantities.
 
-        Energy and momentum maps are kept if their slopes are carried from the start to those at the end.
+        Energy and momentum maps count as conserved if the monodromy matrix maps their gradients accordingly.
         """
         start, ends = (self._slopes_of_integrals(state, t) for state, t in ((z[:-1], self.t), (end, self.t + z[-1])))
         carried = ends @ monodromy
@@ -290,7 +289,7 @@ class _OrbitSearch:
         return projection
 
     def _slopes_of_integrals(self, state: Array, t: float) -> Array:
-        """(r, 2m) of the energy, first, and of the momentum maps, by differences: they show directions only."""
+        """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
         size, width = len(state), BESIDE * max(1.0, float(np.abs(state).max()))
         states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
         q, p = np.ascontiguousarray(states[:, : size // 2]), np.ascontiguousarray(states[:, size // 2 :])
@@ -307,14 +306,14 @@ class _OrbitSearch:
 
 @dataclass(frozen=True, eq=False)
 class _Closing:
-    """How far a motion is from closing.
+    """Residuals of the closing conditions.
 
     Attributes:
-        end: (2m,) where it ends.
-        error: the largest number of the end less the start.
-        defects: (r,) of what has to be 0.
-        slopes: (r, 2m + 1) of them by (q, p, period).
-        monodromy, by_period, by_time: derivatives of the end; the last, by all times, is 0 where nothing depends on it.
+        end: (2m,) state after one period.
+        error: largest entry of the end minus the start.
+        defects: (r,) residuals.
+        slopes: (r, 2m + 1) Jacobian of the residuals with respect to (q, p, period).
+        monodromy, by_period, by_time: derivatives of the end; the last is 0 for autonomous systems.
     """
 
     end: Array

@@ -1,4 +1,4 @@
-"""A periodic orbit: its motion, its Floquet multipliers, whether it is stable."""
+"""Periodic orbit: trajectory, Floquet multipliers and stability."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["PeriodicOrbit"]
 
 SYMPLECTIC = 1e-9
-"""Beside the square of a monodromy matrix: a larger defect is not rounding."""
+"""Symplecticity defect of a monodromy matrix, relative to its squared norm, above which it is not due to rounding."""
 SAME = 1e-6
-"""Beside 1: what may be rounding of a stability index."""
+"""Deviation of a stability index from 1 that rounding may cause."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PeriodicOrbit:
-    """A motion that ends where it began, of the computed map.
+    """Periodic orbit of the computed map.
 
     Attributes:
-        q, p: (m,) where it begins.
-        t: when.
-        period: after which it is there again.
-        steps: of a period, each of ``period / steps``.
-        monodromy: (2m, 2m) derivative of the end by the start.
-        residual: how far the end is from the start, the largest number.
-        iterations: of Newton.
+        q, p: (m,) initial state.
+        t: initial time.
+        period: the period.
+        steps: number of steps per period, each of size ``period / steps``.
+        monodromy: (2m, 2m) derivative of the end with respect to the start.
+        residual: largest entry of the end minus the start.
+        iterations: number of Newton iterations.
         parameters: (k,) in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
     """
@@ -51,7 +51,7 @@ class PeriodicOrbit:
     options: SolverOptions | None = field(default=None, repr=False)
 
     def run(self, *, save_every: int = 1) -> Trajectory:
-        """The motion of a period, ``save_every``-th state."""
+        """Return the trajectory of one period, every ``save_every``-th state."""
         return self.stepper.integrate(
             self.q,
             self.p,
@@ -65,39 +65,39 @@ class PeriodicOrbit:
 
     @property
     def energy(self) -> float:
-        """Where it begins."""
+        """Energy of the initial state."""
         return float(self.stepper.energy(self.q, self.p, self.t, self.parameters))
 
     @cached_property
     def multipliers(self) -> NDArray[np.complex128]:
-        """(2m,) Floquet multipliers, the eigenvalues of the monodromy matrix, the largest first.
+        """(2m,) Floquet multipliers, the eigenvalues of the monodromy matrix, in descending order of modulus.
 
-        Of those near 1, which are several for a motion that keeps its energy, only half of the digits are known.
+        Multiple eigenvalues at 1, caused by conserved quantities, are accurate to half of the digits only.
         """
         values = np.linalg.eigvals(self.monodromy).astype(complex)
         return values[np.argsort(-np.abs(values))]
 
     @property
     def reciprocal_error(self) -> float:
-        """How far sizes of multipliers are from the pairs s, 1/s of symplectic steps: the largest of s s' - 1."""
+        """Deviation of the moduli of multipliers from the pairs s, 1/s of symplectic maps: the largest |s s' - 1|."""
         sizes = np.abs(self.multipliers)
         return float(np.abs(sizes * sizes[::-1] - 1.0).max())
 
     @property
     def symplectic_error(self) -> float:
-        """How far the monodromy matrix is from symplectic, beside its square."""
+        """Symplecticity defect of the monodromy matrix, relative to its squared norm."""
         product = _inverse(self.monodromy) @ self.monodromy - np.eye(len(self.monodromy))
         return float(np.abs(product).max() / max(1.0, np.linalg.norm(self.monodromy, 2) ** 2))
 
     @cached_property
     def stability_indices(self) -> NDArray[np.complex128]:
-        """(m,) of each pair of multipliers s, 1/s its (s + 1/s)/2, the largest first: stable between -1 and 1.
+        """(m,) stability indices (s + 1/s)/2 of the pairs of multipliers s, 1/s, descending; stable between -1 and 1.
 
-        They are known to the digits of the monodromy matrix, also at 1 (Broucke, AIAA J. 7 (1969) 1003; Howell, Celest.
-        Mech. 32 (1984) 53).
+        They have the accuracy of the monodromy matrix, also at 1 (Broucke, AIAA J. 7 (1969) 1003; Howell, Celest. Mech.
+        32 (1984) 53).
 
         Raises:
-            MethodError: where steps are not symplectic.
+            MethodError: if the steps are not symplectic.
         """
         if self.symplectic_error > SYMPLECTIC:
             raise MethodError(f"multipliers are no pairs: the steps of '{self.stepper.title}' are not symplectic here")
@@ -110,7 +110,7 @@ class PeriodicOrbit:
 
     @property
     def stable(self) -> bool:
-        """Whether no multiplier is larger than 1, to rounding."""
+        """Return whether no multiplier exceeds 1 in modulus, up to rounding."""
         if self.symplectic_error > SYMPLECTIC:
             return bool(np.abs(self.multipliers).max() <= 1.0 + SAME)
         indices = self.stability_indices
@@ -118,7 +118,7 @@ class PeriodicOrbit:
 
 
 def _inverse(matrix: Array) -> Array:
-    """Of a symplectic matrix."""
+    """Return the inverse of a symplectic matrix."""
     m = len(matrix) // 2
     a, b, c, d = matrix[:m, :m], matrix[:m, m:], matrix[m:, :m], matrix[m:, m:]
     return np.block([[d.T, -b.T], [-c.T, a.T]])

@@ -1,4 +1,4 @@
-"""States of an integration, kept every so many steps, a portion at a time so that the keyboard is heard."""
+"""Run loop: advance a run in chunks and save every k-th state, so that Python regains control regularly."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["SLICE_SECONDS", "first_length", "record", "record_states", "record_until", "trajectory_of"]
 
 SLICE_SECONDS = 0.1
-"""Time between looks at the keyboard (and calls of ``progress``) during an integration."""
+"""Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
 
 
 def record(
     memory: Memory, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """The states of ``steps``, or of fewer if they lead to the goal of the run; all that do where left out."""
+    """Record ``steps`` steps, or up to the target time of adaptive steps (all steps to it if ``steps`` is omitted)."""
     if memory.goal is None:
         return record_states(memory, checked_count(steps, "steps", least=0), save_every=save_every, progress=progress)
     count = None if steps is None else checked_count(steps, "steps", least=0)
@@ -39,10 +39,10 @@ def record(
 def record_states(
     memory: Memory, steps: int, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``save_every``.
+    """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
 
     Raises:
-        StepFailedError: with the states kept so far as ``trajectory``; the memory stands before the failing step.
+        StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
     steps = checked_count(steps, "steps", least=0)
     save_every = checked_count(save_every, "save_every", least=1)
@@ -82,7 +82,7 @@ def record_states(
 
 
 def _tau(memory: Memory, first: int, save_every: int, count: int) -> Array | None:
-    """Of the state after ``first`` steps and those after it that ``save_every`` divides; 0 before the first step."""
+    """Return tau after ``first`` steps and at the following multiples of ``save_every``; 0 at the start."""
     if not memory.stepper.interface.energy_parameter:
         return None
     numbers = np.append(first, save_every * (first // save_every + np.arange(1, count)))
@@ -92,10 +92,10 @@ def _tau(memory: Memory, first: int, save_every: int, count: int) -> Array | Non
 def record_until(
     memory: Memory, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Advance to the goal, or by ``steps``; keep the present state, every so many-th, and the one at the goal.
+    """Advance to the target time, or by ``steps``; save every ``save_every``-th state, the present and the final one.
 
     Raises:
-        StepFailedError: with the states kept so far as ``trajectory``, where steps shrink to nothing.
+        StepFailedError: if a step fails or underflows; ``trajectory`` has the saved states.
     """
     save_every = checked_count(save_every, "save_every", least=1)
     pieces = [_Piece.of(memory)]
@@ -120,7 +120,7 @@ def record_until(
 
 
 class _Piece(NamedTuple):
-    """States, and iterations since the state before each."""
+    """States, and solver iterations since the previous state."""
 
     t: Array
     q: Array
@@ -138,12 +138,12 @@ class _Piece(NamedTuple):
 
     @classmethod
     def of(cls, memory: Memory) -> _Piece:
-        """The present state."""
+        """Return the present state."""
         return cls(np.array([memory.t]), memory.q[np.newaxis], memory.p[np.newaxis], np.zeros(1, dtype=np.int32))
 
 
 def _joined(memory: Memory, pieces: Sequence[_Piece], save_every: int) -> Trajectory:
-    """The trajectory of a run to its goal; with each state there, the steps between them have their lengths."""
+    """Return the trajectory of an adaptive run; step sizes are known if every state is saved."""
     t, q, p, iterations = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     lengths = np.full(len(t), np.nan)
     if save_every == 1:
@@ -162,7 +162,7 @@ def trajectory_of(
     events: tuple[Crossings, ...] = (),
     tau: Array | None = None,
 ) -> Trajectory:
-    """These states as states of this integration, each before a step of h if no lengths are given."""
+    """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
     step_error, step_error_t = memory.step_error
     return Trajectory(
         t=t,
@@ -185,5 +185,5 @@ def trajectory_of(
 
 
 def first_length(goal: Goal, t: Array) -> float:
-    """Of steps that choose their length the first between states, or the sign of all."""
+    """Return the first step size between states of an adaptive run, or the direction of the run."""
     return float(t[1] - t[0] if len(t) > 1 else goal.t_end - t[0])

@@ -1,4 +1,4 @@
-"""What follows from states: velocities, energies, momentum maps; not a number where one cannot be computed."""
+"""Derived quantities of states: velocities, energies, momentum maps; NaN where undefined."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["quantities"]
 
 
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
-    """Of (n,) times and (n, m) states: velocity (n, m), energy (n,), and momentum_map (n, c) if there are any."""
+    """Return the velocity (n, m), energy (n,) and, if there are any, momentum_map (n, c) of n states."""
     given = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
 
     def energies(rows: NDArray[np.intp]) -> Array:
@@ -42,7 +42,7 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
 
 
 def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:
-    """Fill in rows, all at once; where that fails, halves and halves of them, down to those that fail."""
+    """Fill rows in one call; on failure divide them recursively, so that only failing rows stay NaN."""
     try:
         into[rows] = compute(rows)
     except StateError:
@@ -51,7 +51,7 @@ def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.int
 
 
 def _velocities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> Array:
-    """(n, m) velocities, called as C without checks: an export may have many millions of states."""
+    """Return (n, m) velocities by unchecked C calls, for exports with many millions of states."""
     binding, (n, m) = stepper.binding, q.shape
     found = np.full((n, m), np.nan)
     positions, momenta = np.ascontiguousarray(q), np.ascontiguousarray(p)

@@ -1,7 +1,7 @@
-"""The steps of a run taken again, from each kept state to the next: for what a run does not store of them.
+"""Recomputation of the steps of a run from its saved states (checkpoint replay), for data that a run does not store.
 
-Newton's iteration solves them anew, from a straight line. That it found the run's own root is checked, not believed:
-where the steps from a kept state do not lead to the next, there is an error instead of an answer.
+Newton's iteration solves the steps again, from a linear initial guess. It may converge to another root of the stage
+equations; recomputed steps that do not end in the next saved state raise an error.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ __all__ = ["refuse_strays", "retaken", "steps_between"]
 Found = TypeVar("Found")
 
 SAME_STATE = 1e-6
-"""Of the largest number of a state: roots lie further apart, and rounding seldom grows so far between kept states."""
+"""Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
 
 
 def retaken(
     states: KeptStates, step: Callable[[Array, Array, float, float], tuple[Array, Array, Found]]
 ) -> Iterator[list[Found]]:
-    """What each step gives, step by step from one kept state to the next.
+    """Yield the results of all steps between each pair of consecutive saved states.
 
     Args:
-        states: at whole steps.
-        step: of (q, p, h, t), gives (q1, p1, found).
+        states: states at whole steps.
+        step: function of (q, p, h, t) that returns (q1, p1, result).
 
     Raises:
-        StateError: if the states do not stand at whole steps, or the steps lead elsewhere.
+        StateError: if the states are not at whole steps, or recomputed steps deviate.
         StepFailedError: if Newton's iteration does not converge.
     """
     for k, (start, length, end) in enumerate(
@@ -50,7 +50,7 @@ def retaken(
 
 
 def steps_between(length: float, span: float) -> int:
-    """How many steps of a length; 1 for a last one that an event or the end cut short."""
+    """Return the number of steps in a span; 1 for a last, shorter step."""
     if np.isnan(length):
         raise StateError("this is known of whole steps: integrate without t_eval, and with save_every=1")
     count = int(whole_steps(np.array([span]), np.array([length]), slack=ON_GRID)[0])
@@ -60,18 +60,18 @@ def steps_between(length: float, span: float) -> int:
 
 
 def refuse_strays(t: Array, found: Array, known: Array, before: Array) -> None:
-    """Raise :class:`StateError` for the first of n steps from t, solved anew, that does not lead where it led.
+    """Raise :class:`StateError` for the first of n recomputed steps that converged to a spurious root.
 
-    Beside the largest number of a state: of a momentum that is kept at 0 all is rounding.
+    Deviations are relative to the largest entry of a state, since entries that are 0 contain only rounding errors.
 
     Args:
-        t: (n,) times at which the steps begin.
-        found, known: (n, 2m) states at their ends.
+        t: (n,) start times of the steps.
+        found, known: (n, 2m) recomputed and saved states at their ends.
         before: (n, 2m) states at their starts.
     """
     apart = found - known
     lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, known))
-    near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # all, mostly: quicker than maxima
+    near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
     rows = np.flatnonzero(~near)
     sizes = np.maximum(np.abs(known[rows]).max(axis=1), np.abs(before[rows]).max(axis=1))
     strays = rows[~(np.abs(apart[rows]).max(axis=1) <= SAME_STATE * sizes)]

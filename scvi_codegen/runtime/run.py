@@ -1,4 +1,4 @@
-"""An integration under way, as users hold it."""
+"""Public class of a run in progress."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Run"]
 
 
 class Run(Memory):
-    """An integration under way: :class:`Memory`, and the recording of its states."""
+    """Run in progress: :class:`Memory` with recording of states."""
 
     def __repr__(self) -> str:
         interface = self.stepper.interface
@@ -38,19 +38,16 @@ class Run(Memory):
     def record(
         self, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
     ) -> Trajectory:
-        """Advance by ``steps`` and keep the present state and each whose step number is a multiple of ``save_every``.
+        """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
 
-        Where steps choose their length, by no more than lead to the goal, whose state is kept, too; all of them where
-        ``steps`` is left out.
-
-        The events of the stepper, if it has any, are recorded; a terminal one ends the run before the step it is in.
-
-        An :class:`~scvi_codegen.AccuracyWarning` says when a step is first found to be too long for the motion, but not
-        while one that began at the origin is leaving it, for 16 steps at most: it has no size yet.
+        Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted. Events of
+        the stepper are recorded; a terminal event ends the run before the step that contains it. An
+        :class:`~scvi_codegen.AccuracyWarning` is issued when a step is first too large. The warning is suppressed for
+        the first 16 steps of a run started at q = 0, p = 0, where a relative error is undefined.
 
         Raises:
-            StepFailedError: with the states kept so far as ``trajectory``; the run stands before the failing step.
-            EventError: where an event function is not finite.
+            StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+            EventError: if an event function is not finite.
         """
         before = 0.0 if self.leaving else self.step_error[0]
         if self.stepper.events:

@@ -1,9 +1,9 @@
-"""A measured motion in parts, each from a state of its own, that come to join: multiple shooting.
+"""Multiple shooting: measurements divided into segments with separate initial states and continuity constraints.
 
-First the parts nearly by themselves, the jumps between them being residuals among others, from which a guess is found
-in which every part is in phase. Then by the generalised Gauss-Newton method of H. G. Bock, *Recent advances in
-parameter identification techniques for O.D.E.*, Progress in Scientific Computing 2 (1983) 95: the jumps, linearised,
-are constraints of each linear least squares, so that what parts motions from each other never piles up.
+First the jumps between segments are weak residuals, which gives an initial guess in phase with all segments. Then
+continuity is imposed by the generalised Gauss-Newton method of H. G. Bock, *Recent advances in parameter identification
+techniques for O.D.E.*, Progress in Scientific Computing 2 (1983) 95: linearised jumps are equality constraints of a
+linear least-squares problem, so errors do not grow over the whole record.
 """
 
 from __future__ import annotations
@@ -23,40 +23,39 @@ from scvi_codegen.runtime.measurements import Measurements
 __all__ = ["LOOSE", "TIGHT", "Chain", "Limits", "chained", "joined"]
 
 LOOSE, TIGHT = 0.1, 1e-9
-"""Of the size of states: what jump weighs as much as the residual of a measurement, at first and once all joins."""
+"""Jumps, relative to the size of states, that weigh as much as a measurement residual: initially, and finally."""
 MOST = 100
-"""Iterations that join the parts."""
+"""Largest number of Gauss-Newton iterations."""
 LEAST_PART = 1e-4
-"""Of an iteration, which is halved as long as it leads uphill."""
+"""Smallest step length of the line search."""
 ENOUGH = 1e-4
-"""Of the descent that slopes promise: what an iteration must bring."""
+"""Fraction of the predicted descent that a step must attain (Armijo condition)."""
 JOINED, SETTLED, LEFT = 1e-10, 1e-9, 1e-12
-"""Jumps of no size; by how much the last iteration changes residuals, beside these, or, by rounding, beside all that is
-measured, by rounding."""
+"""Convergence: largest jump, largest relative change of the residuals, and rounding level of the measurements."""
 NEAR = 1e-5
-"""Of jumps and of such changes: rounding hides what is downhill, and iterations are taken whole."""
+"""Jumps and changes below which full steps are taken, as rounding hides the descent."""
 SMALL = 1e-6
-"""Of the size of measurements: residuals that are smaller are as good as none."""
+"""Residuals, relative to the measurements, below which the fit counts as exact."""
 BOUNDED, RELEASED = 8, 1e-9
-"""Updates of the set of bounds that hold an unknown, beside three a bound; beside the steepest slope, what lets go."""
+"""Limits of the active-set iteration: base number of updates, and gradient (relative) that releases a bound."""
 BESIDE = 3
-"""Measurements before and after a node, through which a parabola is laid."""
+"""Number of measurements on each side of a node for a parabola fit."""
 
 
 Limits: TypeAlias = tuple[Array, Array]
-"""The least and the greatest of all unknowns, infinite where there is no bound."""
+"""Lower and upper bounds of all unknowns; infinite for no bound."""
 
 
 @dataclass(eq=False)
 class Chain:
-    """Residuals and jumps as functions of the unknowns: those of places, then the state at each later node.
+    """Residuals and jumps as functions of the unknowns: parameters and initial state, then states at later nodes.
 
     Attributes:
-        parts: measurements, each from its node on.
-        known: (2m + parameters,) values of all, those of the unknowns overwritten.
-        places: (k,) where unknowns stand among (q, p, parameters).
-        sizes: (2m,) of states.
-        jump: beside these, what weighs as much as a residual of ``unit``.
+        parts: measurements of each segment.
+        known: (2m + parameters,) values; those of the unknowns are overwritten.
+        places: (k,) indices of the unknowns in (q, p, parameters).
+        sizes: (2m,) sizes of state entries.
+        jump: jump relative to ``sizes`` that weighs as much as a residual of ``unit``.
     """
 
     parts: tuple[Measurements, ...]
@@ -69,17 +68,17 @@ class Chain:
 
     @property
     def state(self) -> int:
-        """Numbers of a state."""
+        """Number of entries of a state, 2m."""
         return 2 * self.parts[0].stepper.dimension
 
     def values(self, x: Array) -> Array:
-        """(2m + parameters,) of the motion from its start."""
+        """Return (2m + parameters,) initial state and parameters."""
         values = self.known.copy()
         values[self.places] = x[: len(self.places)]
         return values
 
     def residuals(self, x: Array) -> Array:
-        """Of all measurements, in standard deviations, then jumps; infinite where a motion fails, which turns back."""
+        """Return residuals in standard deviations, then jumps; infinite if a step fails, which shortens the update."""
         try:
             return self.evaluated(x)[0]
         except StepFailedError:
@@ -88,27 +87,27 @@ class Chain:
             return np.full(len(self.found[0]), np.inf)
 
     def slopes(self, x: Array) -> Array:
-        """(measurements and jumps, unknowns) of the same."""
+        """Return the (residuals and jumps, unknowns) Jacobian."""
         return self.evaluated(x)[1]
 
     def scaled(self, x: Array) -> Array:
-        """Residuals of measurements alone."""
+        """Return the residuals of the measurements."""
         found = self.evaluated(x)[0]
         return found[: len(found) - self.jumps.size]
 
     def typical(self, x: Array) -> float:
-        """The root mean square residual of measurements, or a small one where there is none."""
+        """Return the root mean square residual of the measurements, bounded below."""
         scaled = self.scaled(x)
         sizes = [np.nanmax(np.abs(part.measured / part.deviations)) for part in self.parts if part.used.any()]
         return max(float(np.sqrt(np.mean(scaled**2))), SMALL * float(max(sizes, default=1.0)), 1e-300)
 
     @property
     def measured(self) -> float:
-        """The norm of all that is measured, in standard deviations."""
+        """Norm of all measurements in standard deviations."""
         return float(np.sqrt(sum(np.nansum((part.measured / part.deviations) ** 2) for part in self.parts)))
 
     def typical_unknowns(self, x: Array) -> Array:
-        """(unknowns,) sizes: of parameters theirs, of states at least that of the motion; 0 where there is none."""
+        """Return (unknowns,) typical sizes; 0 for parameters whose initial guess is 0."""
         guess, sizes = self.known[self.places], np.zeros(len(self.known))
         sizes[: self.state] = self.sizes
         own = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
@@ -116,7 +115,7 @@ class Chain:
         return np.concatenate([first, np.tile(self.sizes, len(self.parts) - 1)])
 
     def evaluated(self, x: Array) -> tuple[Array, Array]:
-        """Both, of one computation of the motion."""
+        """Return residuals and Jacobian from one integration; the last evaluation is cached."""
         if self.at is None or not np.array_equal(x, self.at):
             found = [self._part(j, x) for j in range(len(self.parts))]
             nodes = x[len(self.places) :].reshape(-1, self.state)
@@ -135,12 +134,12 @@ class Chain:
         return self.found
 
     def _node(self, j: int) -> slice:
-        """Where the state of a later node stands among the unknowns."""
+        """Return the indices of the state of node j among the unknowns."""
         first = len(self.places) + (j - 1) * self.state
         return slice(first, first + self.state)
 
     def _part(self, j: int, x: Array) -> tuple[Array, Array, Array, Array]:
-        """What it has at its measurements and at its end, each with its slopes by all unknowns."""
+        """Return the computed measurements and the end of segment j, each with derivatives by all unknowns."""
         part, values, size = self.parts[j], self.values(x), self.state
         changes = np.zeros((len(x), part.stepper.given))
         changes[np.arange(len(self.places)), self.places] = 1.0
@@ -157,9 +156,9 @@ class Chain:
 
 
 def _states_told(whole: Measurements, parts: Sequence[Measurements], known: Array) -> Array:
-    """(parts - 1, 2m) guesses of the states at later nodes: of parabolas through the measurements around them.
+    """Return (parts - 1, 2m) guesses of node states by parabolas through neighbouring measurements.
 
-    Where not all coordinates are measured, those of the motion from the first guess.
+    Unless all coordinates are measured the guesses are from the trajectory of the initial guess.
     """
     m = whole.stepper.dimension
     order = [np.flatnonzero(whole.columns == k) for k in range(m)]
@@ -184,7 +183,7 @@ def _states_moved(parts: Sequence[Measurements], known: Array) -> Array:
 
 
 def _parabola(whole: Measurements, column: int, t: float) -> tuple[float, float]:
-    """Value and slope at a time."""
+    """Return value and derivative at a time."""
     rows = np.flatnonzero(np.isfinite(whole.measured[:, column]))
     near = rows[np.argsort(np.abs(whole.t[rows] - t), kind="stable")[: 2 * BESIDE + 1]]
     coefficients = np.polynomial.polynomial.polyfit(
@@ -194,7 +193,7 @@ def _parabola(whole: Measurements, column: int, t: float) -> tuple[float, float]
 
 
 def chained(whole: Measurements, known: Array, places: NDArray[np.intp], count: int) -> tuple[Chain, Array]:
-    """So many parts, and a first guess of all unknowns."""
+    """Return a chain of ``count`` segments, and an initial guess of all unknowns."""
     parts = whole.cut(count) if count > 1 else (whole,)
     nodes = _states_told(whole, parts, known)
     sizes = _sizes(parts, known, nodes)
@@ -202,7 +201,7 @@ def chained(whole: Measurements, known: Array, places: NDArray[np.intp], count: 
 
 
 def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
-    """(2m,) by how much each number of a state changes from node to node; those at rest as the most of their kind."""
+    """Return (2m,) ranges of the state entries over the nodes; constant entries get the largest range of their kind."""
     size = nodes.shape[1]
     states = np.concatenate([known[np.newaxis, :size], nodes])
     if len(states) == 1:
@@ -214,12 +213,10 @@ def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
 
 
 def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bool_], int]:
-    """The unknowns with which the parts join, which of them a bound holds, and after how many iterations.
-
-    Near those that leave jumps, and within their bounds.
+    """Return the unknowns that satisfy continuity within bounds, the mask of those at bounds, and the iterations.
 
     Raises:
-        FitError: where no iteration leads downhill, or too many are made.
+        FitError: if the line search fails or the iteration does not converge.
     """
     whole, (low, high) = replace(chain, jump=1.0, unit=1.0), limits
     rounding = LEFT * whole.measured
@@ -238,13 +235,13 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
 
 
 def _within(slopes: Array, found: Array, rows: int, limits: Limits) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """The update that makes the first rows least and the others zero, of all that bounds allow, and their multipliers.
+    """Return the update that minimises the first rows subject to zeros in the others and to bounds.
 
-    By an active set: from no update towards the one wanted, as far as the first bound in the way, which then holds its
-    unknown; one is let go where that leads downhill (Nocedal & Wright, *Numerical Optimization*, 16.5).
+    Active-set method (Nocedal & Wright, *Numerical Optimization*, 16.5): move towards the equality-constrained solution
+    up to the first bound, which becomes active; release a bound whose multiplier has the wrong sign.
 
     Returns:
-        The update, the multipliers of the other rows, and which unknowns a bound holds.
+        The update, the multipliers of the other rows, and the mask of unknowns at bounds.
     """
     low, high = limits
     update, held = np.zeros(slopes.shape[1]), np.zeros(slopes.shape[1], dtype=bool)
@@ -271,7 +268,7 @@ def _within(slopes: Array, found: Array, rows: int, limits: Limits) -> tuple[Arr
 
 
 def _part_of(chain: Chain, x: Array, update: Array, weight: float) -> float:
-    """How much of an update leads downhill; FitError where nothing does. Jumps weigh more than their multipliers."""
+    """Return a step length with sufficient descent of the merit function; raise FitError if there is none."""
     found, slopes = chain.evaluated(x)
     rows = len(found) - chain.jumps.size
     before, part = _merit(found, rows, weight), 1.0
@@ -287,12 +284,12 @@ def _part_of(chain: Chain, x: Array, update: Array, weight: float) -> float:
 
 
 def _merit(found: Array, rows: int, weight: float) -> float:
-    """Half the sum of squares, and the jumps."""
+    """Return the exact penalty function: half the sum of squares plus weighted absolute jumps."""
     return float(0.5 * found[:rows] @ found[:rows] + weight * np.abs(found[rows:]).sum())
 
 
 def _constrained(slopes: Array, found: Array, rows: int) -> tuple[Array, Array]:
-    """The update that makes the first rows least and the others zero, and the multipliers of those; sparse."""
+    """Solve the sparse equality-constrained least-squares problem; return the update and the multipliers."""
     from scipy.sparse import block_array, csc_array, identity
     from scipy.sparse.linalg import splu
 

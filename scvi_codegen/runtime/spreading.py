@@ -1,9 +1,9 @@
-"""Changes of the initial state carried along chains of steps: as many steps in C as leave them apart, then QR.
+"""Propagation of tangent vectors along chains of steps with QR factorisations.
 
-Within a piece the changes are what the derivatives of the steps make of an orthonormal frame; its length adapts itself,
-so that these stay far enough apart for each to be known. The start is symplectic and orthonormal, columns ordered so
-that R is symplectic, too, where the derivatives are (the Iwasawa decomposition): exponents are then opposite in pairs
-to round-off, at all times.
+Within a chunk the derivatives of the steps act on an orthonormal frame; the length of chunks is adapted so that the
+images remain well conditioned. The initial frame is orthogonal and symplectic with ordered columns, so that R is
+symplectic if the derivatives are (Iwasawa decomposition); Lyapunov exponents then occur in pairs of opposite sign to
+round-off, at all times.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from scvi_codegen.runtime.linearised import Starts
 __all__ = ["Changes", "ahead", "along"]
 
 FIRST, MOST = 8, 1024
-"""Steps of a piece."""
+"""Number of steps of the first and of the largest chunk."""
 SEED = 1892
-"""Of the directions to begin with: in general position, the same in every run."""
+"""Random seed of the initial directions, for reproducibility."""
 NOTHING = 1e-8
-"""Beside the largest singular value of a derivative: what constraints leave of the directions they forbid."""
+"""Singular values below this fraction of the largest are directions forbidden by constraints."""
 OFF = 1e-6
-"""Beside their length: how far directions may be off those that constraints allow."""
+"""Largest component of given directions outside those admissible for the constraints."""
 
 Stretch = tuple[Starts, NDArray[np.intp]]
-"""Steps that follow each other, and (steps + 1,) the number of the kept state at each of their ends, -1 where none."""
+"""Consecutive steps, and (steps + 1,) indices of saved states at their ends, -1 if not saved."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """The changes that a motion begins with, (2m, k) of length 1: the first of a frame in general position, or given.
+    """Initial tangent vectors, (2m, k) of length 1: the first of a random frame, or given directions.
 
-    With constraints the frame is of what these allow: of the changes that a step ends with.
+    With constraints the frame spans the admissible directions, the range of the derivative of a step.
     """
 
     stepper: Integrator
@@ -54,7 +54,7 @@ class Changes:
 
     @classmethod
     def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> Changes:
-        """Raise :class:`StateError` for more than 2m, and directions of another shape, or of no length."""
+        """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
         if directions is None:
             wanted = None if count is None else checked_count(count, "the number of changes", least=1, most=size)
@@ -71,7 +71,7 @@ class Changes:
         return cls(stepper, None, columns / lengths)
 
     def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
-        """Those of a motion from (q, p) by a first step of h."""
+        """Return the tangent vectors at (q, p) for a first step of h."""
         given = self.directions
         if not self.stepper.interface.constraints:
             return _frame(self.stepper.dimension)[:, : self.count] if given is None else given
@@ -91,7 +91,7 @@ class Changes:
 
 
 def _frame(dimension: int) -> Array:
-    """(2m, 2m) orthonormal and symplectic: a unitary matrix, its columns ordered q_1, .., q_m, p_m, .., p_1."""
+    """Return a (2m, 2m) orthogonal symplectic matrix from a unitary one, columns ordered q_1, .., q_m, p_m, .., p_1."""
     real, imaginary = np.random.default_rng(SEED).normal(size=(2, dimension, dimension))
     unitary = np.linalg.qr(real + 1j * imaginary)[0]
     first = np.vstack([unitary.real, -unitary.imag])
@@ -100,7 +100,7 @@ def _frame(dimension: int) -> Array:
 
 
 def along(states: KeptStates, changes: Changes) -> Deviations:
-    """Of a run, at its kept states; the steps between them are taken again."""
+    """Return the deviations of a run at its saved states; steps between these are recomputed."""
 
     def carried(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
         carry(states, steps, numbers, vectors, back=False)
@@ -124,13 +124,13 @@ def ahead(
     options: SolverOptions | None,
     heed: Callable[[int], None],
 ) -> tuple[Array | None, StepFailedError | None]:
-    """Of a motion from (q, p) by steps of h at (n + 1,) times t, told here only, at every so-many-th state.
+    """Integrate from (q, p) with tangent vectors over (steps + 1,) times t, saving every ``save_every``-th value.
 
     Args:
-        heed: called before each piece, may raise.
+        heed: called before each chunk; may raise to stop.
 
     Returns:
-        What :class:`Growth` found, not numbers after a step that failed, ``None`` without a first; and the failure.
+        The series of :class:`Growth`, NaN after a failed step, ``None`` if the first step fails; and the failure.
     """
     stepper, steps = changes.stepper, len(t) - 1
 
@@ -157,22 +157,22 @@ def ahead(
 
 
 class _Spreading:
-    """Changes on their way.
+    """Propagation of tangent vectors.
 
     Args:
-        changes: (2m, k) of length 1.
-        given: numbers that a step starts from.
-        t: (n,) times to keep.
+        changes: (2m, k) initial vectors of length 1.
+        given: number of variables of a step.
+        t: (n,) times of saved values.
     """
 
     def __init__(self, changes: Array, given: int, t: Array) -> None:
         self._frame, self._triangle = np.linalg.qr(changes)
         self._given, self._size = given, FIRST
-        with np.errstate(divide="ignore"):  # directions that depend on each other span nothing
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
             self.growth = Growth(t, np.log(np.abs(np.diag(self._triangle))))
 
     def follow(self, stretches: Iterator[Stretch], carried: Callable[[Starts, NDArray[np.intp], Array], None]) -> None:
-        """To the end of the last step."""
+        """Propagate to the end of the last step."""
         for starts, numbers in stretches:
             done, steps = 0, len(starts.h)
             while done < steps:
@@ -184,13 +184,13 @@ class _Spreading:
                 done += self._take(part, kept[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))
 
     def _take(self, part: Starts, numbers: NDArray[np.intp], images: Array) -> int:
-        """Sum over as many steps as left (2m, k) images of the frame together, at least one: how many these are."""
+        """Accumulate as many (2m, k) images as are well conditioned, at least one; return their number."""
         reduced = triangles(images)
         parted = apart(reduced)
         taken = max(1, int(np.argmax(parted))) if parted.any() else len(images)
         sizes = np.linalg.norm(reduced[:taken] @ self._triangle, axis=1)
         ends = np.append(part.t[:taken], part.t[taken - 1] + part.h[taken - 1])
-        with np.errstate(divide="ignore"):  # a change that constraints do not allow vanishes
+        with np.errstate(divide="ignore"):  # directions forbidden by constraints are mapped to 0
             diagonals = np.log(np.abs(np.diagonal(reduced[:taken], axis1=1, axis2=2)))
             self.growth.add(ends, numbers[:taken], np.log(sizes), diagonals)
         self._frame, last = np.linalg.qr(images[taken - 1])

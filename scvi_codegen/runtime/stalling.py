@@ -1,7 +1,7 @@
-"""Runs in the time of a monitor that comes to nothing: refused, where they would go on for ever, or turn back.
+"""Detect a time transformation dt = g dtau whose g reaches zero, where a run would not terminate.
 
-With dt = g dtau no time passes where g = 0: no number of steps of tau leads beyond, and in transformed time rounding
-decides what comes after, as the level K = g (H - E) = 0 holds there whatever the energy.
+Where g = 0 no number of steps of tau advances t. In transformed time rounding then decides the continuation, because
+the constraint K = g (H - E) = 0 holds there for any energy.
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["Watch", "lost_level"]
 
 MOST_STEPS: Final = 1e9
-"""That a run may still take, at its present pace, if that has become a millionth of what it was."""
+"""Number of remaining steps at the present rate above which slow progress counts."""
 SLOW: Final = 1e-6
+"""Time per step, relative to the largest so far, below which progress counts as slow."""
 ENOUGH: Final = 30_000
-"""Steps at such a pace: a close encounter is over by then."""
+"""Number of slow steps before an error; close encounters take fewer."""
 TINY: Final = 1e-9
-"""Of the longest duration of a step in a run: at those so short the energy is looked at."""
+"""Duration of a step, relative to the longest of a run, below which the energy is checked."""
 LOST: Final = 1e-3
-"""Of the energy: nothing conserves it where rounding is all that is left of g (H - E)."""
+"""Relative energy error that shows that g (H - E) is below rounding."""
 
 
 class Watch:
-    """Over how much time the steps of a run take on; ``end``: where a monitor leads it, or ``None`` for other runs."""
+    """Progress in t of runs with a monitor function; ``end`` is the target time, ``None`` for other runs."""
 
     def __init__(self, stepper: Integrator, end: float | None) -> None:
         self.stepper, self.end, self.best, self.slow = stepper, end, 0.0, 0
 
     def halt(self, before: float, t: float, steps: int, number: int) -> StepFailedError | None:
-        """What is wrong after so many steps from a time to another: the end is out of reach.
+        """Return an error if the target time is out of reach after ``steps`` steps from ``before`` to t.
 
-        ``number``: of the last step in the run.
+        ``number`` is the step number in the run.
         """
         if self.end is None or not steps:
             return None
@@ -50,9 +51,9 @@ class Watch:
 
 
 def lost_level(states: Trajectory, longest: float) -> StepFailedError | None:
-    """What is wrong with states in transformed time: they lost the energy as the rate of time came to nothing.
+    """Return an error if states in transformed time lost their energy because the rate of time vanished.
 
-    ``longest``: of all steps of the run.
+    ``longest`` is the longest duration of a step in the run.
     """
     short = np.flatnonzero(np.abs(np.diff(states.t)) < TINY * longest)
     if not len(short):

@@ -1,4 +1,4 @@
-"""Runs and their results in a line, as ``repr`` shows them."""
+"""Short descriptions of runs and results for ``repr``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["holds", "lengths_of", "stands"]
 
 
 class Standing(Protocol):
-    """What is asked of a run."""
+    """Interface required of a run."""
 
     goal: Goal | None
 
@@ -25,7 +25,7 @@ class Standing(Protocol):
 
 
 class StandingStates(Protocol):
-    """What is asked of the states of a run."""
+    """Interface required of the states of a run."""
 
     @property
     def stepper(self) -> Integrator: ...
@@ -36,14 +36,14 @@ class StandingStates(Protocol):
 
 
 def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited: tuple[str, ...] = ()) -> str:
-    """``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
+    """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
 
     Args:
         title: system and method.
-        solver: of the stage equations, nothing where it is not known.
-        run: where it stands.
-        tau: whether its steps are of transformed time.
-        awaited: inputs that the next step waits for.
+        solver: solver of the stage equations, "" if unknown.
+        run: the run.
+        tau: whether steps are of transformed time.
+        awaited: inputs that are not set.
     """
     goal = "" if run.goal is None else f" on the way to {run.goal.t_end:g}"
     solved = f", solver {solver}" if solver else ""
@@ -53,13 +53,13 @@ def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited
 
 
 def holds(result: StandingStates, lengths: str) -> str:
-    """``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` is what follows "steps"."""
+    """Return ``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` follows "steps"."""
     span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
     return f"<{type(result).__name__} of {result.stepper.title}; {span}, {result.steps} steps{lengths}>"
 
 
 def lengths_of(h: float, goal: Goal | None, *, tau: bool) -> str:
-    """Of the steps of a run."""
+    """Describe the step size of a run."""
     if goal is None:
         return f" of {h:g}{' in tau' * tau}"
     return f" of {goal.tau:g} in tau" if goal.tau else " of their own lengths"

@@ -1,9 +1,9 @@
-"""A compiled integrator as users hold it: :class:`Integrator` with everything that has memory.
+"""Compiled integrator for users: :class:`Integrator` with runs, trajectories and ensembles.
 
-``step`` depends on its arguments alone. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory:
-it guesses each step by extrapolating the one before and carries along what rounding cut off the state. The whole memory
-is one plain C struct; :meth:`Run.save` gives its bytes and :meth:`Stepper.restore` goes on from them, bit for bit.
-Neither SymPy nor Jinja is imported.
+``step`` is a pure function. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: a predictor
+that extrapolates the previous step, and compensation terms of the state. The whole memory is one plain C struct;
+:meth:`Run.save` returns its bytes and :meth:`Stepper.restore` continues from them bitwise equally. Neither SymPy nor
+Jinja is imported.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ __all__ = ["Stepper"]
 
 
 class Stepper(Ensembles):
-    """One method for one system, compiled: integrations, runs and ensembles beside what :class:`Integrator` has."""
+    """Compiled integrator of one system: :class:`Integrator` with integrations, runs and ensembles."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # what takes long to derive, second derivatives and changes, goes if it was asked for
+        # second derivatives and tangent-vector variants are slow to derive: included only if already made
         texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, self._second)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
 
@@ -66,43 +66,44 @@ class Stepper(Ensembles):
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> Trajectory:
-        """Run ``steps`` steps of h, or to t_end, and keep every ``save_every``-th state, the initial one first.
+        """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
         Args:
             q, p: (m,) initial positions and momenta.
-            velocity: (m,) initial velocities, in place of p.
-            h: step size, negative to go back; in transformed time (:func:`~scvi_codegen.reparametrise`) of tau.
+            velocity: (m,) initial velocities, instead of p.
+            h: fixed step size, negative to integrate backward; step of tau in transformed time
+                (:func:`~scvi_codegen.reparametrise`).
             steps: number of steps.
-            t_end: instead of ``steps``: where to go. Without h by adaptive steps; the last ends there exactly. With h,
-                also in transformed time and where a monitor chooses the steps (:func:`~scvi_codegen.compile_stepper`),
-                by steps of h, the last of them shorter unless t_end - t is a whole number of them (within 1e-9).
-            tolerance: relative error of the end of such a step; by default round-off. Many of them add up.
-            save_every: steps between kept states; the one at t_end is kept, too.
+            t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly. With
+                h (also in transformed time and with a monitor, :func:`~scvi_codegen.compile_stepper`) the last step is
+                shorter unless t_end - t is a multiple of h (within 1e-9).
+            tolerance: relative local error of an adaptive step; by default round-off.
+            save_every: steps between saved states; the state at t_end is also saved.
             t: initial time.
-            parameters, options: as in :meth:`step`; an energy that transformed time needs is that of (q, p).
-            progress: called now and then with the number of steps done.
-            t_eval: (n,) times, sorted as the run goes: keep the states at these instead, as :meth:`Trajectory.at` gives
-                them.
-            events: zero crossings to record as ``events`` of the trajectory; a terminal one ends it. An
-                :class:`~scvi_codegen.runtime.events.Event`, a function of (q, v, p, t) as text or SymPy expression, or
-                several. They are compiled with the integrator, once. By default those of :func:`compile_stepper`.
-            error: in place of a tolerance, bound of the relative global error of all kept states up to t_end. Local
-                tolerances are chosen until a second run, with other steps and a state changed in its last place,
-                confirms it: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. Where
-                binary64 does not allow it, as for chaotic motions, an :class:`~scvi_codegen.AccuracyWarning` gives the
+            parameters, options: as in :meth:`step`; in transformed time the energy defaults to that of (q, p).
+            progress: called with the number of completed steps.
+            t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
+                :meth:`Trajectory.at`.
+            events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run. One or
+                several :class:`~scvi_codegen.runtime.events.Event` or functions of (q, v, p, t) as text or SymPy
+                expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
+            error: instead of a tolerance, bound of the relative global error of all saved states up to t_end. Local
+                tolerances are reduced until a second run, with other steps and a perturbed initial state, confirms
+                the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
+                precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
                 time until which the bound is confirmed.
-            check_growth: after a run of adaptive steps, repeat up to 2048 of them from a state changed in its last
-                place, unless a coarse run shows that errors grow slowly, and warn if that ends elsewhere by more than
-                1e-7 of its size. ``True``: all steps, without a coarse run; ``False``: none.
+            check_growth: after an adaptive run, repeat up to 2048 of its steps from an initial state perturbed in its
+                last place, unless a coarse run shows that errors grow slowly, and warn if the states differ by more
+                than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
 
         Returns:
-            A :class:`Trajectory`: steps // every + 1 states, fewer if an event ended it. An
-            :class:`~scvi_codegen.AccuracyWarning` names the worst step where it is too long for the motion.
+            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it. An
+            :class:`~scvi_codegen.AccuracyWarning` reports the worst step if it is too large for the motion.
 
         Raises:
-            StateError: on wrong shapes, names or numbers.
-            EventError: for an event with an unknown symbol, or where its function is not finite.
-            StepFailedError: if a step fails; its ``trajectory`` holds the states before.
+            StateError: if a shape, name or number is invalid.
+            EventError: if an event function has an unknown symbol or is not finite.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         stepper = self if events is None else self.with_events(events)
         if t_eval is not None and save_every != 1:
@@ -149,7 +150,7 @@ class Stepper(Ensembles):
 
     @property
     def _has_tau(self) -> bool:
-        """Whether its steps are of tau, by a time transformation or a monitor."""
+        """Return whether steps are steps of tau, by a time transformation or a monitor."""
         return bool(self.interface.energy_parameter or self.interface.monitor)
 
     @takes(StateError)
@@ -166,10 +167,7 @@ class Stepper(Ensembles):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """A run from (q, p), or q and a velocity, at t, to be advanced at will.
-
-        By steps of h, or of their own lengths to t_end.
-        """
+        """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
         p = self.momenta_given(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
@@ -210,20 +208,20 @@ class Stepper(Ensembles):
         error: float | None = None,
         check_growth: bool | None = None,
     ) -> DrivenTrajectory:
-        """Run a system whose inputs are data: steps end at their breakpoints, so that the order is kept.
+        """Integrate a system with inputs; steps end at the breakpoints of inputs, which preserves the order.
 
         Args:
-            inputs: by name ``(t, values)``, linear between them; ``(t, values, kind)`` with ``"constant"`` (each value
-                from its time on), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or ``PPoly`` of
+            inputs: by name ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with ``"constant"``
+                (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or ``PPoly`` of
                 degree 3 at most.
-            h: of steps; one that ends at a breakpoint is shorter. Without it steps choose their length.
-            steps, t_end: with h one of both; without it ``t_end``.
+            h: fixed step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
+            steps, t_end: with h one of both; without h ``t_end``.
             q, p, velocity, tolerance, save_every, t, parameters, options, progress, events: as of :meth:`integrate`.
             error, check_growth: as of :meth:`integrate`.
 
         Raises:
-            StateError: for inputs that are not given for all of the run, or make no function of time.
-            StepFailedError: if a step fails; its ``trajectory`` holds the states of that piece before.
+            StateError: if inputs do not cover the run or define no function of time.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states of that piece before the failure.
         """
         stepper = self if events is None else self.with_events(events)
         data = checked_inputs(self.interface, inputs)
@@ -265,9 +263,9 @@ class Stepper(Ensembles):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """The run whose :meth:`Run.save` gave these bytes, to go on exactly as it would have; give its goal again.
+        """Restore a run saved by :meth:`Run.save`; it continues bitwise equally if ``t_end`` is passed again.
 
-        With h only where a monitor chooses the steps.
+        ``h`` is required with a monitor and not allowed otherwise.
         """
         if self.interface.monitor:
             goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
@@ -281,7 +279,7 @@ class Stepper(Ensembles):
 
 
 def _check_number(run: Run, steps: int | None) -> None:
-    """Refuse steps of h without their number, and one of steps that choose their length."""
+    """Raise ``StateError`` for fixed steps without their number, and for adaptive steps with one."""
     if run.goal is None and steps is None:
         raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
     if run.goal is not None and steps is not None:
@@ -289,7 +287,7 @@ def _check_number(run: Run, steps: int | None) -> None:
 
 
 def _said(trajectory: Trajectory) -> Trajectory:
-    """The same, after what is to be said of its worst step, and of its energy."""
+    """Return the trajectory after warnings about its step size and its energy."""
     warn_of_long_steps(trajectory)
     warn_of_lost_energy(trajectory)
     return trajectory

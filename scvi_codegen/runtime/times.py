@@ -1,4 +1,4 @@
-"""Times in two pieces, as runs carry them: t + n h, rounded, and what rounding cut off; steps that make up a span."""
+"""Double-double times t + n h of runs; numbers of steps that make up a span."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["WHOLE", "steps_to", "steps_within", "times_after"]
 
 SPLITTER = 2.0**27 + 1.0
-"""Times a number of 53 bits, it splits off the upper 26 (Dekker 1971)."""
+"""Factor that splits a double into two halves of 26 bits (Dekker 1971)."""
 WHOLE = 1e-9
-"""Of a step: what rounding may leave of a span."""
+"""Fraction of a step that rounding may leave of a span."""
 MOST_STEPS = 10**9
-"""More are a slip of the pen."""
+"""Largest number of steps accepted; more indicate a mistyped step size."""
 
 
 def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
-    """T + n h after each number n < 2^53 of steps: rounded correctly but for near ties, and the rest."""
+    """Return t + n h after n < 2^53 steps as double-double numbers, correctly rounded but for near ties."""
     mantissa, exponent = math.frexp(h)
     numbers = np.asarray(steps, dtype=np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -35,7 +35,7 @@ def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
 
 
 def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
-    """How many equal steps, none longer than |h|, make up each span > 0; StateError where they are too many to take."""
+    """Return the number of equal steps not longer than |h| in each span > 0; raise ``StateError`` if too large."""
     with np.errstate(over="ignore"):
         counts = np.maximum(1.0, np.ceil(np.asarray(spans) / abs(h) - WHOLE))
     if not counts.sum() <= MOST_STEPS:
@@ -44,10 +44,10 @@ def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
 
 
 def steps_to(t: float, t_end: float, h: float) -> int | None:
-    """Return how many steps of h lead from t to t_end, or ``None`` if the last of them has to be shorter.
+    """Return the number of steps h from t to t_end, or ``None`` if the last has to be shorter.
 
     Raises:
-        StateError: where they lead away from t_end.
+        StateError: if h has the wrong sign or is too small.
     """
     span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
     if span < 0.0:
@@ -58,7 +58,7 @@ def steps_to(t: float, t_end: float, h: float) -> int | None:
 
 
 def _product(x: Array, y: float) -> tuple[Array, Array]:
-    """X y in two pieces, without error (Dekker's product)."""
+    """Return x y without rounding error as a double-double number (Dekker's product)."""
     product = x * y
     x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)
     x_low, y_low = x - x_high, y - y_high

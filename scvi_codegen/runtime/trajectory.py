@@ -1,4 +1,4 @@
-"""The result of an integration: arrays, diagnostics, files and tables."""
+"""Result of an integration: arrays, diagnostics, files and tables."""
 
 from __future__ import annotations
 
@@ -39,33 +39,33 @@ if TYPE_CHECKING:
 __all__ = ["Trajectory", "relative_changes"]
 
 MOST_DRAWN, MOST_CURVES = 400, 6
-"""States, and coordinates, that a notebook draws."""
+"""Largest numbers of states and of coordinates in the plot of a notebook."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory(NearbyMotions, Confirmed):
-    """States along a run, the initial one first.
+    """States along a run, the initial state first.
 
     Attributes:
         t: (n,) times.
         q: (n, m) positions.
         p: (n, m) momenta.
-        iterations: (n,) Newton iterations since the state before, 0 for the first.
-        h: step size (negative: backward).
-        lengths: (n,) of the step that follows each state, h for steps that are all the same; not a number for a state
-            between two steps, of ``t_eval`` or where an event ended the run.
-        tau: (n,) of a system in transformed time (:func:`~scvi_codegen.reparametrise`): h and lengths are steps of it;
-            else ``None``.
+        iterations: (n,) solver iterations since the previous state, 0 for the first.
+        h: step size (negative: backward), the first one for adaptive steps.
+        lengths: (n,) size of the step that follows each state; NaN for a state within a step, of ``t_eval`` or where an
+            event ended the run.
+        tau: (n,) values of tau in transformed time (:func:`~scvi_codegen.reparametrise`), where h and lengths are steps
+            of tau; else ``None``.
         parameters: (k,) values in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
-        options: convergence of the stage equations, ``None`` for the defaults.
-        events: the zero crossings found, parallel to ``stepper.events``.
-        goal: where steps that choose their length led, and their tolerance; ``h`` is then the first of them.
-        steps, rejected: taken since the start of the run; tried, and repeated shorter.
-        step_error, step_error_t: an estimate of the relative error of the worst step of the run, beside its state, or
-            beside the largest of the run where that is near rest at the origin; and when it began. Not numbers for
-            methods without a curve to tell them from, or with curves that are no polynomials.
-        confirmation: the comparison with a second run where ``error=`` asked for one, else ``None``.
+        options: convergence criterion of the solver, ``None`` for the defaults.
+        events: zero crossings found, parallel to ``stepper.events``.
+        goal: step plan of adaptive steps, else ``None``.
+        steps, rejected: numbers of completed and of rejected steps since the start of the run.
+        step_error, step_error_t: estimated relative error of the worst step of the run, and its start time. The error
+            is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
+            without an error estimate.
+        confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
     """
 
     iterations: NDArray[np.int32]
@@ -84,19 +84,19 @@ class Trajectory(NearbyMotions, Confirmed):
     @overload
     def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
     def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
-        """Return some of the states as a trajectory, for a slice; (t, q, p) of one state, for a number.
+        """Return a trajectory for a slice, or (t, q, p) of one state for an index.
 
-        Events outside the times of a slice are left out; ``steps`` and ``step_error`` stay those of the whole run.
+        Events outside the times of a slice are omitted; ``steps`` and ``step_error`` remain those of the whole run.
 
         Raises:
-            IndexError: for a state that is not there, and for a slice that is empty or goes backward.
+            IndexError: if an index is out of range, or a slice is empty or descending.
         """
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
         first, last, stride = checked_rows(rows, len(self))
         lengths = self.lengths[rows]
-        if stride > 1 and self.goal is not None:  # the next state kept is not the end of the step
+        if stride > 1 and self.goal is not None:  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return replace(
@@ -109,60 +109,60 @@ class Trajectory(NearbyMotions, Confirmed):
 
     @classmethod
     def before(cls, failure: StepFailedError) -> Self:
-        """What an integration kept before the step that failed; StateError if that was a single step."""
+        """Return the trajectory before a failed step; raise StateError if that was a single step."""
         if not isinstance(failure.trajectory, cls):
             raise StateError("a single step that failed has no trajectory")
         return failure.trajectory
 
     def energy(self) -> Array:
-        """(n,) energies p.v - L, constant along exact trajectories when L does not depend on time."""
+        """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
         energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
         return energies
 
     def momentum_maps(self) -> Array:
-        """(n, k) values of what symmetries conserve, in the order of ``stepper.momentum_map_names``."""
+        """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
         return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
 
     def momentum_errors(self) -> Array:
-        """(n, k) changes of the momentum maps since the first state, relative to the largest size of their terms."""
+        """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
         values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
         return relative_changes(values, sizes)
 
     def work(self) -> Array:
-        """(n,) work of the forces since the first state: sum h b_i f . v along the steps' own curves.
+        """Return (n,) work of the forces since the first state: sum h b_i f . v along the curves of the steps.
 
-        E_n - E_0 - W_n is of the order of the method where L does not depend on time; of SCVI, whose curve is of order
-        s + 1, of that.
+        For time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
+        curve.
 
         Raises:
-            MethodError: where no forces act, and for methods that do not integrate along a curve.
-            StateError: if the states do not stand at whole steps.
+            MethodError: if no forces act, or the method has no curve of positions.
+            StateError: if the states are not at whole steps.
         """
         return exchanged_until(self)[:, 0]
 
     def impulses(self) -> Array:
-        """(n, k) what forces gave since the first state to what L alone would conserve, ``stepper.impulse_names``.
+        """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
 
-        J_n - J_0 is that, to round-off for SVI and their kin, to order s + 1 for SCVI. Raises as
+        They equal J_n - J_0 to round-off for SVI and related methods, to order s + 1 for SCVI. Raises as
         :meth:`work`.
         """
         return exchanged_until(self)[:, 1:]
 
     def multipliers(self) -> Array:
-        """(n, c) multipliers of the constraints: g_q^T lambda are the forces that keep the states on them.
+        """Return (n, c) Lagrange multipliers of the constraints; the constraint forces are g_q^T lambda.
 
         Raises:
-            MethodError: for a system without constraints.
+            MethodError: if the system has no constraints.
         """
         return multipliers(self.stepper, self.q, self.p, self.t, self.parameters)
 
     def constraint_values(self) -> tuple[Array, Array]:
-        """(n, c) values of the constraints, and of their rates, at the states: zeros but for rounding."""
+        """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
         g, rate = constraint_values(self.stepper, self.q, self.p, self.t, self.parameters)
         return g, rate
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
-        """The states as :mod:`scvi_codegen.files.export` writes them."""
+        """Return the states for :mod:`scvi_codegen.files.export`."""
         interface = self.stepper.interface
         piece = (self.t, self.q, self.p, self.iterations)
         return States(
@@ -179,7 +179,7 @@ class Trajectory(NearbyMotions, Confirmed):
 
     @property
     def ended_by(self) -> Event | None:
-        """The terminal event that ended the run, at whose crossing the last state is, or ``None``."""
+        """Terminal event that ended the run, whose crossing is the last state; or ``None``."""
         for found in self.events:
             if found.event.terminal and len(found) >= int(found.event.terminal):
                 return found.event
@@ -191,10 +191,10 @@ class Trajectory(NearbyMotions, Confirmed):
         return self.stepper.velocity(self.q, self.p, self.t, self.parameters)
 
     def at(self, t: ArrayLike) -> tuple[Array, Array]:
-        """States between those kept: steps of a part of h, as accurate as the method and continuous in t.
+        """Return dense output at times t, by partial steps: as accurate as the method and continuous in t.
 
-        A whole step is the state kept there, so nothing jumps; where only every so-many-th was kept, the steps between
-        are taken again, to round-off. Backward runs as well.
+        At the ends of steps it equals the saved states; steps between saved states are recomputed, equal to round-off.
+        Backward runs are supported.
 
         Args:
             t: a time, or (n,) times in any order, within the trajectory.
@@ -203,14 +203,14 @@ class Trajectory(NearbyMotions, Confirmed):
             (q, p), each (m,) for a number and (n, m) for times.
 
         Raises:
-            StateError: for times outside, and of a trajectory made with ``t_eval``.
+            StateError: if a time is outside the trajectory, or this was made with ``t_eval``.
         """
         times = checked_times(t, "t")
         q, p = states_at(self, times.ravel())
         return q.reshape(*times.shape, self.stepper.dimension), p.reshape(*times.shape, self.stepper.dimension)
 
     def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
-        """Zero crossings of functions along the trajectory, looked for now; it needs all states (``save_every=1``).
+        """Return the zero crossings of functions along a trajectory with all states (``save_every=1``).
 
         Args:
             events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
@@ -247,7 +247,7 @@ class Trajectory(NearbyMotions, Confirmed):
         return f"{said}; too long" if self.step_error > TOLERABLE_ERROR else said
 
     def _energies(self, save_every: int) -> Array | None:
-        """Of each so many states, ``None`` where a state has no energy."""
+        """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""
         try:
             energies: Array = self.stepper.energy(
                 self.q[::save_every], self.p[::save_every], self.t[::save_every], self.parameters
@@ -258,7 +258,7 @@ class Trajectory(NearbyMotions, Confirmed):
 
     @property
     def plot(self) -> Plots:
-        """Pictures: ``run.plot()`` shows all at a glance, ``run.plot.energy("energy.png")`` one thing in a file.
+        """Plots: ``run.plot()`` gives an overview, ``run.plot.energy("energy.png")`` a single plot in a file.
 
         There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``; each returns Matplotlib axes.
         """
@@ -273,7 +273,7 @@ class Trajectory(NearbyMotions, Confirmed):
         seconds: float = 8.0,
         positions: Callable[[Array], Array] | None = None,
     ) -> Film:
-        """An animation, which a notebook shows, or a file .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
+        """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
         from scvi_codegen.pictures.animation import animate
 
         return animate(self, path, seconds=seconds, positions=positions)
@@ -282,29 +282,28 @@ class Trajectory(NearbyMotions, Confirmed):
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 
-        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and texts title,
-        system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities x_dot,
-        energy, which are nan where they cannot be computed. HDF5 and Zarr hold what :meth:`to_xarray` gives.
+        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings
+        title, system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities
+        x_dot and energy, NaN where undefined. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
 
         Raises:
-            StateError: for another suffix, or units in a format that has none.
-            MissingLibraryError: without h5netcdf or zarr (extra ``data``).
+            StateError: if the suffix is unknown, or the format has no units.
+            MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
         """
         write_states(self.states(units), path)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """Variables q, p, velocity (t, coordinate), energy, iterations (t), momentum_map (t, symmetry).
+        """Return a dataset of q, p, velocity (t, coordinate), energy, iterations (t), momentum_map (t, symmetry).
 
-        Attributes are h, parameters and titles, and a ``long_name`` of each variable. What cannot be computed for a
-        state is NaN there.
+        Attributes are h, parameters and titles, and a ``long_name`` of each variable. Undefined values are NaN.
 
         Args:
-            units: of t, q, p, velocity, energy or momentum_map, as in ``{"t": "day", "q": "au"}``; those of velocities
+            units: units of t, q, p, velocity, energy or momentum_map, ``{"t": "day", "q": "au"}``; those of velocities
                 follow.
 
         Raises:
-            StateError: for units of something else.
-            MissingLibraryError: without xarray (extra ``data``).
+            StateError: if units name an unknown variable.
+            MissingLibraryError: if xarray is not installed (extra ``data``).
         """
         return to_dataset(self.states(units).labelled())
 
@@ -312,13 +311,13 @@ class Trajectory(NearbyMotions, Confirmed):
         """Return one row per state, indexed by time, with the columns of a CSV file (:meth:`save`).
 
         Raises:
-            MissingLibraryError: without pandas (extra ``data``).
+            MissingLibraryError: if pandas is not installed (extra ``data``).
         """
         return to_dataframe(self.states())
 
 
 def relative_changes(values: Array, sizes: Array) -> Array:
-    """Changes since the first along axis 0, relative to the largest size; NaN where sizes are beyond all numbers."""
+    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow."""
     with np.errstate(invalid="ignore", over="ignore"):
         scales = np.fmax.reduce(sizes, axis=0)
         changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
@@ -326,6 +325,6 @@ def relative_changes(values: Array, sizes: Array) -> Array:
 
 
 def _range(values: Array) -> Html:
-    """From the least to the greatest value, and by how much they differ."""
+    """Format the smallest and the largest value and their difference."""
     low, high = float(np.min(values)), float(np.max(values))
     return plain(f"{low:.10g} to {high:.10g}, a difference of {high - low:.2g}")

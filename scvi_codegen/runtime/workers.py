@@ -1,4 +1,4 @@
-"""Work on each of many trajectories, shared between threads: C runs without Python's lock."""
+"""Thread pool for work on each of many trajectories; C runs without the GIL."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["MOST_PIECES", "PROGRESS_SECONDS", "Heed", "run_each", "workers_of"]
 
 PROGRESS_SECONDS = 0.1
 MOST_PIECES = 4096
-"""That threads take one after the other: waiting for a million would take longer than many of them."""
+"""Largest number of jobs of a pool; waiting for a million futures would be slow."""
 
 Heed = Callable[[int], None]
-"""What long work calls now and then, with any number: it raises where another piece of work failed."""
+"""Callback for long work, with any number: it raises if another job failed."""
 
 
-class _Stopped(Exception):  # noqa: N818  (a wish, not an error)
-    """Another trajectory was interrupted, and so is this one."""
+class _Stopped(Exception):  # noqa: N818  (a signal, not an error)
+    """Signal that stops a job after another one failed or was interrupted."""
 
 
 def workers_of(threads: int | None) -> int:
-    """The number of workers, one a core where none is given."""
+    """Return the number of threads, by default one per core."""
     given = 0 if threads is None else checked_count(threads, "threads", least=1)
     return given or os.cpu_count() or 1
 
@@ -36,11 +36,11 @@ def run_each(
     progress: Callable[[int], None] | None,
     threads: int | None,
 ) -> None:
-    """Call ``work(j, heed)`` for j < count; what ``progress`` or ``work`` raises stops all within moments.
+    """Call ``work(j, heed)`` for j < count; an exception of ``progress`` or ``work`` stops all jobs promptly.
 
     Args:
-        progress: called now and then with how many are done.
-        threads: workers, by default one a core.
+        progress: called with the number of completed jobs.
+        threads: number of threads, by default one per core.
     """
     workers, stop = workers_of(threads), threading.Event()
     pieces, done = min(count, MOST_PIECES), 0

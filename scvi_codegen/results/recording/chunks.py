@@ -1,4 +1,4 @@
-"""The files of states of a recorded run."""
+"""Files of states of a recorded run."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ __all__ = ["Chunk", "chunk_path", "chunk_paths", "no_states", "read_chunk", "unf
 
 NAME = re.compile(r"states-(\d{6,})\.npz")
 UNFINISHED = re.compile(r"\.(states-\d{6,}\.npz|manifest\.json)\..+")
-"""Files on the way to their place when their process was killed."""
+"""Names of temporary files that a killed process leaves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """States in a row, and where the run goes on from: after the last of them, or some steps later.
+    """Consecutive states, and a checkpoint after the last of them or some steps later.
 
     Attributes:
         piece: the states.
-        step: number of steps done by then.
-        memory: of the run then, as :meth:`Run.save` gives it.
+        step: number of steps at the checkpoint.
+        memory: memory of the run, as returned by :meth:`Run.save`.
     """
 
     piece: Piece
@@ -42,21 +42,21 @@ class Chunk:
 
 
 def no_states(dimension: int) -> Piece:
-    """An empty piece of states of m coordinates."""
+    """Return an empty piece of states of m coordinates."""
     vectors = np.empty((0, dimension))
     return np.empty(0), vectors, vectors, np.empty(0, dtype=np.int32)
 
 
 def chunk_path(folder: Path, number: int) -> Path:
-    """Where the files of states are, counted from 0."""
+    """Return the path of a file of states, numbered from 0."""
     return folder / f"states-{number:06d}.npz"
 
 
 def chunk_paths(folder: Path) -> list[Path]:
-    """The files of states that are there, in order.
+    """Return the existing files of states, in order.
 
     Raises:
-        RecordingError: if one is missing between them.
+        RecordingError: if a file between them is missing.
     """
     numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := NAME.fullmatch(path.name)))
     for expected, number in enumerate(numbers):
@@ -66,13 +66,13 @@ def chunk_paths(folder: Path) -> list[Path]:
 
 
 def unfinished(folder: Path) -> list[Path]:
-    """What processes that were killed left of files that never came to their place."""
+    """Return the temporary files that killed processes left."""
     return [path for path in folder.iterdir() if UNFINISHED.fullmatch(path.name)]
 
 
 def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
-    """Put a file of states in its place, whole and on the disk; OSError if that fails."""
-    buffer = io.BytesIO()  # a full disk is met in one plain write
+    """Write a file of states atomically and durably; raise OSError on failure."""
+    buffer = io.BytesIO()  # a full disk then fails in one plain write
     t, q, p, iterations = chunk.piece
     memory = np.frombuffer(chunk.memory, dtype=np.uint8)
     np.savez(buffer, t=t, q=q, p=p, iterations=iterations, step=np.int64(chunk.step), memory=memory)
@@ -81,10 +81,10 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
 
 
 def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None) -> Chunk:
-    """What a file of states holds, its checksums compared; of states of m coordinates, so many at most.
+    """Return the contents of a file of states after checking checksums and, optionally, dimension and number of rows.
 
     Raises:
-        RecordingError: if it cannot be read, or was changed.
+        RecordingError: if the file cannot be read or is damaged.
     """
     try:
         with path.open("rb") as file, loaded(file) as arrays:
@@ -97,7 +97,7 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
 
 
 def _check_shapes(chunk: Chunk, dimension: int, rows: int | None) -> None:
-    """Raise :class:`ValueError` for columns of other kinds, or of lengths that differ."""
+    """Raise :class:`ValueError` if columns have other types or inconsistent lengths."""
     columns: tuple[NDArray[Any], ...] = chunk.piece
     likes: tuple[NDArray[Any], ...] = no_states(dimension)
     for name, column, like in zip(COLUMNS, columns, likes, strict=True):

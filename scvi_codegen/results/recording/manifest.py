@@ -1,4 +1,4 @@
-"""What a recorded run is: everything but its states, as one JSON file."""
+"""Manifest of a recorded run: everything except its states, in one JSON file."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ __all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
 
 MANIFEST = "manifest.json"
 FORMAT, FORMAT_TO_A_TIME = 1, 2
-"""Of runs of so many steps, and of runs whose steps choose their length, which came later."""
+"""Format numbers of fixed-step runs, and of adaptive runs, which were added later."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Build:
-    """The compiled code that made the states from some step on.
+    """Compiled code that computed the states from some step on.
 
     Attributes:
-        step: number of steps done before.
-        version: of this package.
-        compiler: what it says of itself.
-        fingerprint: of text, compiler, flags, Python and processor; equal ones make equal bits.
+        step: number of steps completed before.
+        version: version of this package.
+        compiler: identification of the compiler.
+        fingerprint: hash of source, compiler, flags, Python and processor; equal hashes imply bitwise equal results.
     """
 
     step: int
@@ -50,7 +50,7 @@ class Build:
 
     @classmethod
     def of(cls, stepper: Integrator, step: int) -> Build:
-        """What compiles here."""
+        """Construct for the compiler of this machine."""
         return cls(
             step=step,
             version=__version__,
@@ -61,22 +61,22 @@ class Build:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Manifest:
-    """A run but for its states.
+    """Description of a run without its states.
 
     Attributes:
-        source, interface, flags: of its stepper.
-        fallback: text that lends Newton's iteration to the source, ``None`` where that has its own.
-        options: when the stage equations count as solved; ``None`` for the defaults.
+        source, interface, flags: those of its stepper.
+        fallback: source of the fallback library with Newton's iteration, ``None`` if the source contains it.
+        options: convergence criterion of the solver; ``None`` for the defaults.
         parameters: values in the order of ``interface.parameters``.
-        h: step size, 0 where steps choose their length.
+        h: step size, 0 for adaptive steps.
         t: initial time.
-        save_every: distance between kept states in steps.
-        steps: number of steps wanted, ``None`` where steps choose their length.
-        goal: where these lead, else ``None``.
+        save_every: steps between saved states.
+        steps: requested number of steps, ``None`` for adaptive steps.
+        goal: step plan of adaptive steps, else ``None``.
         rows: states in a full file.
-        model: the model file it comes from, if it has one.
-        certificate: what was found out about the integrator, as JSON, if that was given.
-        builds: first the one it began with, then each that took over.
+        model: text of the model file, if there is one.
+        certificate: verification report as JSON, if there is one.
+        builds: the build at the start, then each that continued the run.
     """
 
     source: Source
@@ -96,7 +96,7 @@ class Manifest:
     fallback: Source | None = None
 
     def stepper(self) -> Stepper:
-        """The integrator, compiled or from the cache."""
+        """Return the integrator, compiled or loaded from the cache."""
         controlled = self.source if self.goal else None
         return Stepper(
             self.source,
@@ -107,16 +107,16 @@ class Manifest:
         )
 
     def reached(self, run: Run) -> bool:
-        """Whether a run is as far as is wanted."""
+        """Return whether a run has reached its end."""
         return run.arrived if self.steps is None else run.steps >= self.steps
 
     def continued_by(self, build: Build) -> Manifest:
-        """The manifest once ``build`` takes over."""
+        """Return the manifest with ``build`` continuing the run."""
         same = build.fingerprint == self.builds[-1].fingerprint
         return self if same else replace(self, builds=(*self.builds, build))
 
     def about(self) -> dict[str, str]:
-        """What belongs beside the states wherever they go."""
+        """Return descriptive texts to store with exported states."""
         texts = self.interface.about() | {"version": self.builds[0].version}
         if self.model is not None:
             texts["model"] = self.model
@@ -125,7 +125,7 @@ class Manifest:
         return texts
 
     def check(self) -> None:
-        """Raise :class:`ValueError` for numbers that no run has, and flags that none may name."""
+        """Raise :class:`ValueError` for numbers that are impossible in a run, and for unsafe compiler flags."""
         check_flags(self.flags)
         check_interface(self.source, self.interface)
         if self.fallback and self.fallback.prefix != self.source.prefix:
@@ -152,7 +152,7 @@ class Manifest:
             raise ValueError(f"{self.goal} is not one")
 
     def to_json(self) -> str:
-        """Text read back by :meth:`from_json`, with the C code line by line."""
+        """Return a JSON text for :meth:`from_json`, with the C code line by line."""
         document = {
             "format": FORMAT_TO_A_TIME if self.goal else FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
@@ -167,7 +167,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, text: str) -> Manifest:
-        """The manifest of a text; ValueError, KeyError or TypeError if it is none."""
+        """Construct from a JSON text; raise ValueError, KeyError or TypeError if it is invalid."""
         document = json.loads(text)
         if not isinstance(document, dict) or document.get("format") not in (FORMAT, FORMAT_TO_A_TIME):
             raise ValueError(f"its format is neither {FORMAT} nor {FORMAT_TO_A_TIME}")
@@ -193,7 +193,7 @@ PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model"
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest in a folder.
+    """Return the manifest in a folder.
 
     Raises:
         RecordingError: if there is none, or it is damaged.
@@ -210,5 +210,5 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put the manifest into a folder, whole; OSError if that fails."""
+    """Write the manifest into a folder atomically; raise OSError on failure."""
     write_atomically(folder / MANIFEST, lambda file: file.write(manifest.to_json().encode()))

@@ -1,4 +1,4 @@
-"""Recorded runs read back: arrays that are as long as the run, of which only what is looked at is in memory."""
+"""Reading of recorded runs: lazy arrays that load only the files in use."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PIECES_IN_MEMORY = 2
 
 @takes(folder=PATH)
 def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
-    """The run recorded in a folder, as far as it goes now; another process may still be recording it.
+    """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
 
     Raises:
         RecordingError: if there is none, or a file of it is missing or damaged.
@@ -45,15 +45,15 @@ def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
 
 
 class RecordedRun:
-    """A run in a folder, states read when they are looked at.
+    """Run recorded in a folder; states are read on access.
 
-    Indexing gives a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` goes through it in parts
-    that fit into memory, whatever its length.
+    Indexing returns a :class:`Trajectory`: ``run[-1000:]``, ``run[::100]``; ``run.pieces()`` iterates over parts that
+    fit into memory.
 
     Attributes:
-        folder: where it lies.
-        manifest: what runs.
-        t, q, p, iterations: of shape (n,), (n, m), (n, m), (n,), to be indexed; ``numpy.asarray`` reads them whole.
+        folder: the folder.
+        manifest: description of the run.
+        t, q, p, iterations: lazy arrays of shapes (n,), (n, m), (n, m), (n,); ``numpy.asarray`` reads them in full.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -69,7 +69,7 @@ class RecordedRun:
         self.t, self.q, self.p, self.iterations = (LazyArray(self, i) for i in range(len(COLUMNS)))
 
     def __len__(self) -> int:
-        """The number n of states kept."""
+        """Return the number n of saved states."""
         return (len(self._paths) - 1) * self.manifest.rows + len(self._last)
 
     def __repr__(self) -> str:
@@ -82,7 +82,7 @@ class RecordedRun:
     @overload
     def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
     def __getitem__(self, rows: slice | int) -> Trajectory | tuple[float, Array, Array]:
-        """Return some of the states as a trajectory in memory, for a slice; (t, q, p) of one state, for a number.
+        """Return a trajectory in memory for a slice, or (t, q, p) of one state for an index.
 
         ``iterations`` counts as in the whole run.
         """
@@ -94,31 +94,31 @@ class RecordedRun:
 
     @cached_property
     def stepper(self) -> Stepper:
-        """The integrator, compiled from the text in the manifest."""
+        """The integrator, compiled from the source in the manifest."""
         return self.manifest.stepper()
 
     @property
     def steps(self) -> int:
-        """Steps done; the last of them is not among the states if it is not a multiple of ``manifest.save_every``."""
+        """Number of completed steps; the last state is saved only at multiples of ``manifest.save_every``."""
         return self._last.step
 
     @property
     def finished(self) -> bool:
-        """Whether all steps wanted are done."""
+        """Return whether the run has reached its end."""
         goal, steps = self.manifest.goal, self.manifest.steps
         return bool(goal and self.t[-1] == goal.t_end) if steps is None else self.steps >= steps
 
     @cached_property
     def h(self) -> float:
-        """Step size; where steps choose their length, what :class:`Trajectory` says of it."""
+        """Step size; for adaptive steps as of :class:`Trajectory`."""
         goal = self.manifest.goal
         return first_length(goal, self.t[:2]) if goal else self.manifest.h
 
     def resumed(self) -> Run:
-        """The run where it stands, to go on with in memory; :func:`resume_run` goes on in the folder.
+        """Return the run at its last checkpoint, to continue in memory; :func:`resume_run` continues in the folder.
 
         Raises:
-            BuildError: without a C compiler.
+            BuildError: if there is no C compiler.
         """
         manifest, goal = self.manifest, self.manifest.goal
         return self.stepper.restore(
@@ -132,11 +132,11 @@ class RecordedRun:
 
     @cached_property
     def _standing(self) -> Run:
-        """Where the run stands, to be looked at and not advanced."""
+        """The run at its last checkpoint, for inspection only."""
         return self.resumed()
 
     def pieces(self) -> Iterator[Trajectory]:
-        """The run in parts, one after the other."""
+        """Yield the run in consecutive parts."""
         first = 0
         for piece in self._pieces():
             yield self._trajectory(piece, np.arange(first, first + len(piece[0])))
@@ -152,23 +152,23 @@ class RecordedRun:
         return read_chunk(path, self.manifest.interface.dimension, self.manifest.rows)
 
     def _read_full(self, path: Path) -> Piece:
-        """One that others follow."""
+        """Read a file that is followed by others."""
         chunk = self._read(path)
         if len(chunk) != self.manifest.rows:
             raise RecordingError(f"'{path}' has {len(chunk)} states, and the manifest says {self.manifest.rows}")
         return chunk.piece
 
     def piece(self, number: int) -> Piece:
-        """The states of file ``number``, of the files read last from memory."""
+        """Return the states of file ``number``; the files read last are cached."""
         if number == len(self._paths) - 1:
             return self._last.piece
-        recent = dict(self._recent)  # replaced as a whole, so that threads may read the run
+        recent = dict(self._recent)  # replaced atomically, so that threads may read the run
         piece = recent.pop(number, None) or self._read_full(self._paths[number])
         self._recent = ((number, piece), *recent.items())[:PIECES_IN_MEMORY]
         return piece
 
     def rows(self, rows: Any) -> NDArray[np.int64]:
-        """Numbers of rows, or one number; IndexError for one that is not there."""
+        """Return row numbers, or one number, from an index; raise IndexError if out of range."""
         if isinstance(rows, slice):
             return np.arange(*rows.indices(len(self)), dtype=np.int64)
         numbers = np.asarray(rows)
@@ -184,7 +184,7 @@ class RecordedRun:
         return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
 
     def gather(self, rows: NDArray[np.int64], columns: Sequence[int]) -> list[NDArray[Any]]:
-        """The rows of these numbers, of some columns; each file is read once."""
+        """Return selected rows of some columns; each file is read once."""
         kinds = [no_states(self.manifest.interface.dimension)[column] for column in columns]
         results = [np.empty((len(rows), *kind.shape[1:]), dtype=kind.dtype) for kind in kinds]
         order = np.argsort(rows, kind="stable")
@@ -196,11 +196,11 @@ class RecordedRun:
         return results
 
     def energy(self) -> Array:
-        """(n,) energies p.v - L."""
+        """Return (n,) energies p.v - L."""
         return np.concatenate([piece.energy() for piece in self.pieces()])
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
-        """The states as :mod:`scvi_codegen.files.export` writes them, read file by file."""
+        """Return the states for :mod:`scvi_codegen.files.export`, read file by file."""
         manifest = self.manifest
         return States(
             count=len(self),
@@ -216,9 +216,9 @@ class RecordedRun:
 
     @takes(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
-        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr``, a part at a time; otherwise as :meth:`Trajectory.save`.
+        """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr`` in parts; otherwise as :meth:`Trajectory.save`.
 
-        A CSV file has no velocities and no energy: to compute them, the C text of the recording is compiled and run.
+        A CSV file has no velocities and no energy, which would require compiling the C source of the recording.
         ``run[:].save(path)`` and HDF5 files have them.
         """
         states, plain = self.states(units), Path(path).suffix.lower() == ".csv"
@@ -249,7 +249,7 @@ class RecordedRun:
         )
 
     def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
-        """(n,) of the steps after these states, not numbers where the end of one that chose its length is not there."""
+        """Return (n,) sizes of the steps after the states; NaN for an adaptive step whose end is not saved."""
         if self.manifest.goal is None:
             return np.broadcast_to(self.manifest.h, t.shape)
         found = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
@@ -257,9 +257,9 @@ class RecordedRun:
 
 
 class LazyArray:
-    """One column of a recorded run, read when it is indexed: by a number, a slice, numbers or truth values of rows.
+    """Column of a recorded run, read when indexed by a number, a slice, numbers or a boolean mask of rows.
 
-    Whatever follows the rows is applied to what they give, as in ``run.q[::10, 0]``. ``numpy.asarray`` reads it whole,
+    Further indices apply to the result, as in ``run.q[::10, 0]``. ``numpy.asarray`` reads the whole column,
     ``dask.array.from_array(run.q)`` a file at a time.
     """
 
@@ -274,7 +274,7 @@ class LazyArray:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the entries."""
+        """Type of the entries."""
         return self._like.dtype
 
     @property
@@ -284,7 +284,7 @@ class LazyArray:
 
     @property
     def chunks(self) -> tuple[int, ...]:
-        """Rows of a file, and all columns: what is best read at once."""
+        """Rows of a file, and all columns: the optimal chunk for reading."""
         return (min(self._run.manifest.rows, max(1, len(self))), *self._like.shape[1:])
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Recording a run into a folder, and going on with it."""
+"""Recording of a run into a folder, and restart from it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = ["record_run", "resume_run"]
 LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0
 SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
-"""Seconds between looks at the clock: a run is never further from its last consistent state."""
+"""Bounds of the duration of a chunk in seconds, which limits the loss when a process is killed."""
 
 
 @takes(
@@ -59,29 +59,29 @@ def record_run(
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> RecordedRun:
-    """Advance a run by ``steps``, or to its goal, and record every ``save_every``-th state, the first too, in a folder.
+    """Advance a run by ``steps``, or to its target time, and record every ``save_every``-th state in a folder.
 
     Args:
-        run: at its start, from ``stepper.start(q, p, h=h)``, or ``start(q, p, t_end=..., tolerance=...)``.
-        folder: made if it is missing; it must be empty, or hold a run that was ended before its first state.
-        steps: number of steps; left out where they choose their length and lead to a goal.
-        save_every: distance between kept states; the one at a goal is kept, too.
-        checkpoint_seconds: what is computed is written at least so often; no more is lost if the process is killed.
-        checkpoint_steps: write it also every so many steps.
-        rows: states in a file, by default about 16 MiB.
-        model: text of a model file (:func:`dump_model`), to be kept beside the states.
-        certificate: what was found out about the integrator: JSON data, an object with a method ``to_json``, or the
+        run: a run at its start, from ``stepper.start(q, p, h=h)`` or ``start(q, p, t_end=..., tolerance=...)``.
+        folder: created if missing; it must be empty, or contain a run that ended before its first state.
+        steps: number of steps; omitted for adaptive steps, which end at the target time.
+        save_every: steps between saved states; the state at the target time is also saved.
+        checkpoint_seconds: largest time between checkpoints; no more is lost if the process is killed.
+        checkpoint_steps: write a checkpoint also after every multiple of this number of steps.
+        rows: states per file, by default about 16 MiB.
+        model: text of a model file (:func:`dump_model`) to store with the states.
+        certificate: verification report of the integrator: JSON data, an object with a method ``to_json``, or the
             path of a JSON file.
-        progress: called now and then with the number of steps done.
-        stop: asked now and then whether to end here; what was computed is written.
+        progress: called with the number of completed steps.
+        stop: called regularly; the run ends if it returns true, after a checkpoint.
 
     Returns:
-        The run as it lies in the folder; ``finished`` unless ``stop`` ended it.
+        The recorded run; ``finished`` unless ``stop`` ended it.
 
     Raises:
-        StateError: on wrong numbers, a run under way, or an input that was not given.
-        RecordingError: if the folder holds a run, or cannot be written; it then says how far the run in it goes.
-        StepFailedError: if a step fails; the states before are in the folder.
+        StateError: if a number is invalid, the run has already started, or an input is not set.
+        RecordingError: if the folder contains a run or cannot be written; the message reports the last checkpoint.
+        StepFailedError: if a step fails; the states before it are in the folder.
     """
     target = Path(folder)
     if run.steps:
@@ -130,26 +130,26 @@ def resume_run(
     progress: Callable[[int], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> RecordedRun:
-    """Go on with a recorded run where it stands, bit for bit as if it had never ended.
+    """Restart a recorded run from its last checkpoint, bitwise equal to an uninterrupted run.
 
     Args:
-        folder: of :func:`record_run`.
-        steps: number of steps of the whole run, if it is to be longer or shorter than it was meant to be.
-        t_end: the same for steps that choose their length, not before where the run stands. A run that had arrived
-            goes on from there: its step to the former end stays as short as it was.
+        folder: folder of :func:`record_run`.
+        steps: new number of steps of the whole run.
+        t_end: new target time of an adaptive run, not before its current time. A run that had arrived continues from
+            there; its shortened last step remains.
         checkpoint_seconds, checkpoint_steps, progress, stop: as of :func:`record_run`.
 
     Returns:
-        The run as it lies in the folder.
+        The recorded run.
 
     Raises:
-        RecordingError: if the folder holds no run, is being written by another process, or cannot be written.
-        StateError: for steps, or a t_end, of a run of the other kind.
+        RecordingError: if the folder contains no run, is in use by another process, or cannot be written.
+        StateError: if ``steps`` is passed for an adaptive run, or ``t_end`` for fixed steps.
         StepFailedError: if a step fails.
 
     Warns:
-        RecordingWarning: if other code runs from here on (another compiler or processor, other flags), whose states may
-            differ in the last bits. The manifest says from which step.
+        RecordingWarning: if another build continues the run (another compiler, processor or flags); states may differ
+            in the last bits. The manifest records the step.
     """
     target = Path(folder)
     read_manifest(target)  # a folder without one is not locked
@@ -164,13 +164,13 @@ def resume_run(
         recorder.go_on_from(target)
         with recorder.telling_where_it_stands():
             _remove(unfinished(target))
-            write_manifest(target, continued)  # also finds out at once whether the folder can be written
+            write_manifest(target, continued)  # fails early if the folder cannot be written
         recorder.advance(progress, stop)
     return load_run(target)
 
 
 class _Recorder:
-    """A run, the states of the file that is being filled, and what of it is on the disk."""
+    """Recorder of a run: the states of the current file, and how much of them is on disk."""
 
     def __init__(self, folder: Path, manifest: Manifest, run: Run, seconds: float, steps: int | None) -> None:
         self.folder, self.manifest, self.run = folder, manifest, run
@@ -179,7 +179,7 @@ class _Recorder:
         self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.save())
 
     def go_on_from(self, folder: Path) -> None:
-        """Take over the last file, to fill it up."""
+        """Load the last file in order to complete it."""
         paths = chunk_paths(folder)
         chunk = read_chunk(paths[-1])
         full = len(chunk) == self.manifest.rows
@@ -188,7 +188,7 @@ class _Recorder:
         self.written = chunk.step
 
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
-        """Go as far as is wanted; whatever ends it, what was computed is written."""
+        """Advance to the end; write a checkpoint also on any exception."""
         try:
             for done in self._portions():
                 if progress is not None:
@@ -203,7 +203,7 @@ class _Recorder:
         self.checkpoint()
 
     def _portions(self) -> Iterator[int]:
-        """Advance in portions, write files that are full or due, and yield the number of steps done."""
+        """Advance in chunks, write checkpoints when due, and yield the number of completed steps."""
         manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
         wanted = min(LONGEST_PORTION, max(SHORTEST_PORTION, self.seconds))
         while not manifest.reached(run):
@@ -225,7 +225,7 @@ class _Recorder:
             raise
 
     def _most_steps(self) -> int:
-        """Up to the end, the last state of this file, or the next checkpoint."""
+        """Return the number of steps to the end, the end of the current file, or the next checkpoint."""
         done, save_every, manifest = self.run.steps, self.manifest.save_every, self.manifest
         last = (done // save_every + manifest.rows - self._rows()) * save_every
         ends = [last] if manifest.steps is None else [last, manifest.steps]
@@ -240,20 +240,20 @@ class _Recorder:
         return sum(len(piece[0]) for piece in self.kept[0])
 
     def keep(self, piece: Piece) -> None:
-        """States and memory together, so that an interruption at any point leaves the one that fits the other."""
+        """Store states and memory in one assignment, so that they stay consistent after an interruption."""
         self.kept = ([*self.kept[0], piece], self.run.steps, self.run.t, self.run.save())
 
     def checkpoint(self) -> None:
-        """Write what was computed since the last time.
+        """Write the states computed since the last checkpoint.
 
         Raises:
-            RecordingError: if that fails, with the step up to which the folder holds the run.
+            RecordingError: if that fails; the message reports the last step in the folder.
         """
         with self.telling_where_it_stands():
             self.write()
 
     def write(self) -> None:
-        """Put the file that is being filled in its place, and begin the next one if it is full."""
+        """Replace the current file, and begin the next one if it is full."""
         pieces, step, reached, memory = self.kept
         if step == self.written:
             return
@@ -266,7 +266,7 @@ class _Recorder:
 
     @contextmanager
     def telling_where_it_stands(self) -> Iterator[None]:
-        """Turn the errors of the system into one that says what is safe and what to do."""
+        """Convert system errors to :class:`RecordingError` with the state of the folder and a remedy."""
         try:
             yield
         except RecordingError:
@@ -286,7 +286,7 @@ class _Recorder:
 
 
 def _check_inputs(run: Run) -> None:
-    """Inputs of a run in a folder are held: it does not keep how pieces of data change h and parameters on the way."""
+    """Raise ``StateError`` unless all inputs are constant: a folder does not store pieces of input data."""
     try:
         run.check_inputs()
     except StateError as error:
@@ -297,7 +297,7 @@ def _check_inputs(run: Run) -> None:
 
 
 def _checked_steps(run: Run, steps: int | None) -> int | None:
-    """Of a run of h; none of one with a goal."""
+    """Return the number of fixed steps; ``None`` for adaptive steps."""
     if run.goal is None:
         return checked_count(steps, "steps", least=0)
     if steps is not None:
@@ -306,7 +306,7 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
 
 
 def _further(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, Goal | None]:
-    """The manifest and the goal of a run that goes on as far as is wanted now."""
+    """Return the manifest and the step plan of a run with a new end."""
     if run.goal is None:
         if t_end is not None:
             raise StateError(f"this run makes steps of h = {run.h:g}: give their number, steps, and no t_end")
@@ -320,7 +320,7 @@ def _further(manifest: Manifest, run: Run, steps: int | None, t_end: float | Non
 
 
 def _piece(trajectory: Trajectory, first: int) -> Piece:
-    """The states of a trajectory from one on."""
+    """Return the states of a trajectory from row ``first`` on."""
     return trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
 
 
@@ -331,7 +331,7 @@ def _pace(seconds: float, steps: int | None) -> tuple[float, int | None]:
 
 
 def _certificate(given: Any) -> Any:
-    """As JSON data."""
+    """Return a certificate as JSON data."""
     if isinstance(given, str | os.PathLike):
         try:
             return json.loads(Path(given).read_text(encoding="utf-8"))
@@ -344,7 +344,7 @@ def _certificate(given: Any) -> Any:
 
 
 def _prepare(folder: Path) -> None:
-    """Make the folder, or find that it may be used."""
+    """Create the folder, or check that it may be used."""
     folder.mkdir(exist_ok=True)
     if (folder / MANIFEST).exists():
         raise RecordingError(
@@ -358,7 +358,7 @@ def _prepare(folder: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Remove what a process left that was killed before there was a manifest."""
+    """Remove the files of a process that was killed before it wrote a manifest."""
     if (folder / MANIFEST).exists():
         raise RecordingError(f"'{folder}' was given a run by another process just now: choose another folder")
     _remove([*chunk_paths(folder), *unfinished(folder)])
@@ -371,7 +371,7 @@ def _remove(paths: Iterable[Path]) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder, so that no two processes record into it; the system lets go of it however the process ends."""
+    """Lock the folder against other processes; the operating system releases the lock however the process ends."""
     from filelock import FileLock, Timeout  # loads asyncio
 
     lock = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False)
@@ -379,13 +379,13 @@ def _locked(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise RecordingError(f"another process is recording into '{folder}': wait for it, or end it") from error
-    except OSError:  # some network disks have no locks; where nothing can be written, the first state will tell
+    except OSError:  # some network disks have no locks; an unwritable folder fails when the first state is written
         yield
         return
     try:
         yield
     finally:
-        with suppress(OSError):  # Windows removes it when it is let go
+        with suppress(OSError):  # Windows removes it on release
             (folder / LOCK).unlink()
         lock.release()
 
