@@ -1,1 +1,1 @@
-"""What the numbers should be, in up to 60 digits, by ways that share nothing with the compiled code."""
+"""Reference solutions in up to 60 digits, computed independently of the compiled code."""

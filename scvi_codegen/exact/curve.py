@@ -1,11 +1,11 @@
 """Collocation of the Euler-Lagrange equations (2) at many Gauss points in 60 digits.
 
-A step is divided into equal pieces with n Gauss points each. The unknowns are the velocity v0 at the start and
+A step is divided into equal pieces with n Gauss points each. The unknowns are the initial velocity v0 and
 z = h (acceleration) at every point; velocities and positions follow by integration of the interpolating polynomials,
 
     V = v0 + A z,    Q = q0 + h A V,    E(Q, V, z / h, t) = 0 at every point.
 
-At the ends and for the action the error falls like rho^(-2n), rho > 1 the larger the smoother the solution.
+The errors at the ends and of the action decrease like rho^(-2n), where rho > 1 grows with the smoothness.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from scvi_codegen.tables.quadrature import gauss_legendre
 __all__ = ["Curve", "Grid"]
 
 BITS = 240
-"""Of numbers in fixed point: 72 digits."""
+"""Precision of fixed-point numbers in bits (72 digits)."""
 CONJUGATE = 1e-11
-"""Singular values of dq1/dv0, divided by h, below which the ends count as conjugate."""
+"""Singular values of dq1/dv0, divided by h, below which the ends count as conjugate points."""
 
 
 def fixed(values: Array, exponent: int) -> Array:
-    """Numbers times 2^(BITS - exponent) as integers: products of matrices of integers are ten times faster."""
+    """Return numbers times 2^(BITS - exponent) as integers, whose matrix products are ten times faster."""
     shifted = [int(mp.ldexp(value, BITS - exponent)) for value in values.ravel()]
     return np.array(shifted, dtype=object).reshape(values.shape)
 
 
 def fixed_product(matrix: Array, values: Array) -> Array:
-    """``matrix``, in integers, times numbers; accurate relative to the largest of them."""
+    """Return an integer ``matrix`` times numbers; accurate relative to the largest of them."""
     exponent = int(mp.mag(largest(values) or mp.one))
     products = matrix @ fixed(values, exponent)
     numbers = [mp.ldexp(mp.mpf(product), exponent - 2 * BITS) for product in products.ravel()]
@@ -46,12 +46,12 @@ def fixed_product(matrix: Array, values: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """n Gauss points in each of some equal pieces of [0, 1].
+    """Grid of n Gauss points in each of several equal pieces of [0, 1].
 
     Attributes:
-        pieces: how many.
+        pieces: number of pieces.
         abscissae: (pieces * n,) all points.
-        weights: (n,) of a piece of length 1.
+        weights: (n,) weights of a piece of length 1.
         integrals: (n + 1, n) integrals from 0 to each point of a piece of length 1 and to its end, as integers.
         matrix: the Runge-Kutta matrix of all points together, in double precision.
         row: its weights, likewise.
@@ -67,7 +67,7 @@ class Grid:
     @classmethod
     @lru_cache(maxsize=64)
     def of(cls, points: int, pieces: int) -> Grid:
-        """The grid of so many points a piece."""
+        """Return the grid with this number of points per piece."""
         c, b, A = _gauss_tables(points)
         below, ones = np.tril(np.ones((pieces, pieces)), -1), np.ones(points)
         floats = b.astype(float)
@@ -82,11 +82,11 @@ class Grid:
 
     @property
     def piece(self) -> Grid:
-        """One of the pieces, as a grid."""
+        """Grid of a single piece."""
         return Grid.of(len(self.weights), 1)
 
     def integrate(self, rates: Array, start: Array) -> tuple[Array, Array]:
-        """From ``start``, the values at the points and at the end of what has these rates at the points."""
+        """Return the integral of ``rates`` with the initial value ``start``, at the points and at the end."""
         values = []
         for piece in np.split(rates, self.pieces):
             moved = start + fixed_product(self.integrals, piece) / self.pieces
@@ -105,7 +105,7 @@ def _gauss_tables(points: int) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A curve from q0 at t over a step h, given by its velocity at the start and z = h (acceleration) at the points."""
+    """Curve over a step h from q0 at t, defined by its initial velocity and z = h (acceleration) at the points."""
 
     motion: ExactMotion
     grid: Grid
@@ -117,7 +117,7 @@ class Curve:
 
     @classmethod
     def straight(cls, motion: ExactMotion, grid: Grid, t: Number, h: Number, start: Array, end: Array) -> Curve:
-        """The uniform motion from ``start`` to ``end``."""
+        """Return the uniform motion from ``start`` to ``end``."""
         rest = np.full((len(grid.abscissae), len(start)), mp.zero, dtype=object)
         return cls(motion, grid, t, h, start, (end - start) / h, rest)
 
@@ -125,7 +125,7 @@ class Curve:
     def launched(
         cls, motion: ExactMotion, grid: Grid, t: Number, h: Number, start: Array, velocity: Array, digits: int
     ) -> Curve:
-        """The solution of (2) with this start and velocity, piece after piece."""
+        """Return the solution of (2) with this initial position and velocity, computed piece after piece."""
         position, speed, found, length = start, velocity, [], h / grid.pieces
         for index in range(grid.pieces):
             first = cls(motion, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
@@ -141,7 +141,7 @@ class Curve:
         return replace(self, z=np.array([acceleration * self.h] * len(self.grid.abscissae), dtype=object))
 
     def _solved(self, digits: int) -> Curve:
-        """The solution from the same position and velocity."""
+        """Return the solution with the same initial position and velocity."""
 
         def linearised(z: Array) -> Solve:
             return solver(replace(self, z=z)._slopes()[0])
@@ -149,7 +149,7 @@ class Curve:
         return replace(self, z=newton(lambda z: replace(self, z=z)._residual(), linearised, self.z, digits))
 
     def joined_to(self, end: Array, digits: int) -> Curve:
-        """The solution that ends at ``end``: v0 is an unknown too, and q(h) = ``end`` is its equation."""
+        """Return the solution that ends at ``end``: v0 is an additional unknown, and q(h) = ``end`` its equation."""
 
         def moved(unknown: Array) -> Curve:
             return replace(self, velocity=unknown[0], z=unknown[1:])
@@ -175,7 +175,7 @@ class Curve:
         return np.array([self.motion.residual(*point) for point in self._points()], dtype=object)
 
     def _slopes(self) -> tuple[Floats, Floats]:
-        """Derivatives of all residuals by z, square, and by v0."""
+        """Return the derivatives of all residuals with respect to z (square) and to v0."""
         by_q, by_v, by_a = np.array([self.motion.residual_slopes(*point) for point in self._points()]).swapaxes(0, 1)
         h, A, c = float(self.h), self.grid.matrix, self.grid.abscissae.astype(float)
         blocks = np.einsum("ij,iab->iajb", A, by_v) + h * np.einsum("ij,iab->iajb", A @ A, by_q)
@@ -185,7 +185,7 @@ class Curve:
         return blocks.reshape(count, count), (by_v + h * c[:, None, None] * by_q).reshape(count, -1)
 
     def _bordered(self) -> Solve:
-        """Solves for (v0, z) by elimination of z; what is left is dq1/dv0, the Jacobi field."""
+        """Return a solver for (v0, z) that eliminates z; its Schur complement is dq1/dv0, the Jacobi field."""
         by_z, by_v0 = self._slopes()
         m = len(self.position)
         inverted = inverse(by_z)
@@ -205,25 +205,25 @@ class Curve:
         return lambda right: scaled(solve, right)
 
     def ends(self) -> tuple[Array, Array]:
-        """Positions at both ends."""
+        """Return the positions at both ends."""
         velocities, _ = self.grid.integrate(self.z, self.velocity)
         return self.position, self.grid.integrate(velocities * self.h, self.position)[1]
 
     def end_velocities(self) -> tuple[Array, Array]:
-        """Velocities at both ends."""
+        """Return the velocities at both ends."""
         return self.velocity, self.grid.integrate(self.z, self.velocity)[1]
 
     def end_momenta(self) -> tuple[Array, Array]:
-        """Momenta at both ends."""
+        """Return the momenta at both ends."""
         (q0, q1), (v0, v1) = self.ends(), self.end_velocities()
         return self.motion.momentum(q0, v0, self.t), self.motion.momentum(q1, v1, self.t + self.h)
 
     def action(self) -> Number:
-        """The integral of L over the step."""
+        """Return the integral of L over the step."""
         return self._integral([self.motion.lagrangian(q, v, t) for q, v, t, _ in self._points()]) * self.h
 
     def sizes(self) -> tuple[Number, Number, Number]:
-        """The integral of ``|L|``, the largest position and the largest momentum."""
+        """Return the integral of ``|L|``, the largest position and the largest momentum."""
         points, motion = self._points(), self.motion
         action = self._integral([abs(motion.lagrangian(q, v, t)) for q, v, t, _ in points]) * abs(self.h)
         momenta = np.array([motion.momentum(q, v, t) for q, v, t, _ in points])

@@ -1,10 +1,10 @@
-"""The exact discrete Lagrangian (6) and the exact flow to many digits: what every variational integrator approximates.
+"""Exact discrete Lagrangian (6) and exact flow to many digits, which every variational integrator approximates.
 
     L_d^E(q0, q1) = integral of L(q(t), q'(t), t) from t to t + h, q the solution of (2) with q(t) = q0, q(t + h) = q1.
 
-Its derivatives are the momenta of that solution at its ends, p0 = -D_1 L_d^E and p1 = D_2 L_d^E, so the exact discrete
-Legendre transforms and the exact flow come with it. The solution is found by :mod:`scvi_codegen.exact.curve` on finer
-and finer grids, until two in a row agree to the digits asked for.
+Its derivatives are the momenta of that solution at its ends, p0 = -D_1 L_d^E and p1 = D_2 L_d^E, which yield the exact
+discrete Legendre transforms and the exact flow. The solution is computed by :mod:`scvi_codegen.exact.curve` on
+successively finer grids, until two in a row agree to the requested digits.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ __all__ = ["ExactStep", "exact_discrete_lagrangian", "exact_map"]
 
 MOST_DIGITS = 50
 POINTS = (10, 15, 22, 32)
-"""Gauss points a piece; all are tried on the fewest pieces for which a solution is found, then the last alone."""
+"""Gauss points per piece; all are tried on the fewest pieces for which a solution is found, then only the last."""
 PIECES = (1, 2, 4, 8, 16)
 MOST_STRAIGHT = 2
-"""Pieces with which a straight line is tried as first guess; more have not helped."""
+"""Maximum number of pieces for which the straight line is the initial guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
 LAGRANGIAN = of("a LagrangianSystem", LagrangianSystem)
@@ -40,7 +40,7 @@ VALUES = Kind("values by name or a list of all", lambda value: MAPPING.holds(val
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExactStep:
-    """A piece of an exact trajectory; numbers are ``mpmath`` numbers of 60 digits, correct to about ``error``.
+    """Step of an exact trajectory; numbers are ``mpmath`` numbers of 60 digits, correct to about ``error``.
 
     Attributes:
         q0, q1: m positions at t and t + h.
@@ -75,22 +75,23 @@ def exact_discrete_lagrangian(
 ) -> ExactStep:
     """Solve the Euler-Lagrange boundary-value problem from q0 at t to q1 at t + h; paper (6).
 
-    Several solutions may join two points (a pendulum can wind round); Newton's iteration starts from the straight line,
-    or from the trajectory that leaves q0 with the velocity ``guess``.
+    The solution need not be unique (a pendulum can rotate); Newton's iteration starts from the straight line, or from
+    the
+    trajectory with the initial velocity ``guess``.
 
     Args:
         system: any regular Lagrangian without forces and constraints.
-        q0, q1: m positions each. Floats stand for their exact binary values; strings such as ``"0.1"``, integers,
-            fractions, mpmath and SymPy numbers are taken to 60 digits.
-        h: step, negative to go back.
-        t: time at the start.
-        parameters: by name (others keep their defaults) or all in order; of an input its coefficients.
-        digits: asked for, 1 to 50.
-        guess: m velocities at the start, near those of the solution wanted.
+        q0, q1: m positions each. Floats are used with their exact binary values; strings such as ``"0.1"``, integers,
+            fractions, mpmath and SymPy numbers are converted to 60 digits.
+        h: step size, negative for a step backward in time.
+        t: initial time.
+        parameters: by name (others keep their defaults) or all in order; coefficients for inputs.
+        digits: requested digits, 1 to 50.
+        guess: m initial velocities near those of the desired solution.
 
     Raises:
-        StateError: on numbers that are none, wrong shapes or names, for inputs that are not given, and for systems with
-            forces or constraints; if no solution is found; if q1 is conjugate to q0, where it is not unique.
+        StateError: for invalid numbers, wrong shapes or names, inputs without values, and systems with forces or
+            constraints; if no solution is found; if q1 is conjugate to q0, where the solution is not unique.
     """
     if system.forces:
         raise StateError(f"forces act on '{system.name}': there is no action whose slopes the momenta are")
@@ -126,17 +127,17 @@ def exact_map(
     parameters: Values = None,
     digits: int = 30,
 ) -> ExactStep:
-    """Follow the exact trajectory from (q0, p0) at t to t + h: the map that L_d^E generates by (5).
+    """Compute the exact trajectory from (q0, p0) at t to t + h: the map that L_d^E generates by (5).
 
     Args:
-        system: any regular Lagrangian without constraints; forces may act.
+        system: any regular Lagrangian without constraints; forces are supported.
         q0, p0: m positions and m momenta.
         h, t, parameters, digits: as in :func:`exact_discrete_lagrangian`.
 
     Raises:
-        StateError: on numbers that are none, wrong shapes or names, for inputs that are not given, and for systems with
-            constraints; if the trajectory does not exist up to t + h, or is too far from smooth to be followed in 16
-            pieces.
+        StateError: for invalid numbers, wrong shapes or names, inputs without values, and systems with constraints; if
+        the
+            trajectory does not exist up to t + h, or is not smooth enough for 16 pieces.
     """
     problem = _Problem(system, h, t, parameters, digits)
     start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")
@@ -153,7 +154,7 @@ def exact_map(
 
 
 class _Problem:
-    """Checked arguments, and the search for a grid that is fine enough."""
+    """Validated arguments, and the search for a sufficiently fine grid."""
 
     def __init__(self, system: LagrangianSystem, h: Any, t: Any, parameters: Values, digits: int) -> None:
         checked_count(digits, "digits", least=1, most=MOST_DIGITS)
@@ -166,7 +167,7 @@ class _Problem:
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
     def vector(self, values: Sequence[Any], name: str) -> Array:
-        """(m,) numbers."""
+        """Return (m,) numbers."""
         entries = [values] if isinstance(values, str) or not hasattr(values, "__len__") else list(values)
         if len(entries) != len(self.names):
             raise StateError(f"{name} must be {len(self.names)} numbers ({', '.join(self.names[:6])}), not {values!r}")
@@ -174,7 +175,7 @@ class _Problem:
         return np.array(numbers, dtype=object)
 
     def answer(self, solve: Callable[[Grid], Curve], complaint: str) -> ExactStep:
-        """The solution on the first grid that agrees with the one before."""
+        """Return the solution on the first grid that agrees with the previous one."""
         coarse, reason = None, ""
         for pieces in PIECES:
             for points in POINTS if coarse is None else POINTS[-1:]:
@@ -197,7 +198,7 @@ def _step(curve: Curve, error: Number) -> ExactStep:
 
 
 def _difference(coarse: Curve, fine: Curve) -> Number:
-    """The largest difference of action, ends and momenta, each relative to the size of its kind along the curve."""
+    """Return the largest difference of action, ends and momenta, relative to their sizes along the curve."""
     differences = (
         abs(fine.action() - coarse.action()),
         largest(np.array(fine.ends()) - np.array(coarse.ends())),

@@ -1,10 +1,9 @@
-"""The exact motion of a system over a short time, in 60 digits, from its formula alone.
+"""Exact motion of a system over a short time, in 60 digits, from its formula alone.
 
-It shares nothing with the compiler but the formula: SymPy's ``diff`` takes the derivatives (another way is left for
-those that only steer Newton's iteration), Hamilton's equations or
-those of Euler and Lagrange give the rates, and the midpoint rule, extrapolated to step size 0 (Gragg, Bulirsch, Stoer;
-Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, II.9), follows them. What is compiled is measured
-against this.
+It shares only the formula with the compiler: SymPy's ``diff`` takes the derivatives (other derivatives are used in the
+Jacobian of Newton's iteration only), Hamilton's or the Euler-Lagrange equations give the rates, which are integrated by
+the midpoint rule with extrapolation to step size 0 (Gragg, Bulirsch, Stoer; Hairer, Norsett & Wanner, Solving Ordinary
+Differential Equations I, II.9). Compiled code is compared with this reference.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ from scvi_codegen.tables.precision import Number, mp
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 
 MOST_PROJECTIONS = 6
-"""Each doubles the digits to which a state of doubles meets constraints."""
+"""Number of Newton projections onto constraints; each doubles the correct digits of a state given in doubles."""
 MOST_COLUMNS, MOST_HALVINGS = 24, 12
 DIGITS = 45
 ACCURACY = mp.mpf(10) ** -DIGITS
 
 
 def numbers(values: Any) -> Numbers:
-    """60-digit numbers, the doubles given exactly."""
+    """Return 60-digit numbers, with doubles converted exactly."""
     array = np.array(values, dtype=object)
     return np.array([mp.mpf(x) for x in array.ravel()], dtype=object).reshape(array.shape)
 
 
 class ExactMotion:
-    """L or H of a system and what follows from it as functions of numbers, and the motion.
+    """Functions derived from L or H of a system, evaluated in 60 digits, and its flow.
 
     Args:
-        system: what moves.
-        parameters: their values in order; left out, the defaults.
+        system: the mechanical system.
+        parameters: their values in order; by default those of the system.
     """
 
     def __init__(self, system: MechanicalSystem, parameters: Sequence[Number] | None = None) -> None:
@@ -55,7 +54,7 @@ class ExactMotion:
         self.symbols = (*system.coordinates, *self.second, system.time, *system.parameters)
 
     def with_parameters(self, parameters: Sequence[Number]) -> ExactMotion:
-        """The same functions with other values of the parameters, in order."""
+        """Return the same functions with other values of the parameters, in order."""
         found = copy(self)
         found.parameters = [mp.mpf(value) for value in parameters]
         return found
@@ -66,7 +65,7 @@ class ExactMotion:
 
     @cached_property
     def _slopes(self) -> list[sympy.Expr]:
-        """DL/dv, or dH/dp."""
+        """Derivatives dL/dv, or dH/dp."""
         return [self.system.formula.diff(x) for x in self.second]
 
     @cached_property
@@ -75,19 +74,19 @@ class ExactMotion:
 
     @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:
-        """Derivatives of dL/dv by v, q and t, a row each."""
+        """Derivatives of dL/dv with respect to v, q and t, one row each."""
         variables = (*self.second, *self.system.coordinates, self.system.time)
         return [[slope.diff(x) for x in variables] for slope in self._slopes]
 
     @cached_property
     def _mass(self) -> Tape:
-        """D2L/dv2, row by row."""
+        """Mass matrix d2L/dv2, row by row."""
         m = len(self.second)
         return Tape([entry for row in self._curvature for entry in row[:m]], self.symbols)
 
     @cached_property
     def _by_position(self) -> list[sympy.Expr]:
-        """DL/dq + f - gamma p, or dH/dq - f + gamma p."""
+        """Derivatives dL/dq + f - gamma p, or dH/dq - f + gamma p."""
         slopes = [self.system.formula.diff(q) for q in self.system.coordinates]
         sign = -1 if self.hamiltonian else 1
         if self.system.damping != 0:
@@ -97,15 +96,16 @@ class ExactMotion:
 
     @cached_property
     def _right_hand_side(self) -> Tape:
-        """DL/dq + f and the derivatives of dL/dv; dH/dq - f and dH/dp."""
+        """Right-hand side: dL/dq + f and the derivatives of dL/dv; or dH/dq - f and dH/dp."""
         others = self._slopes if self.hamiltonian else [entry for row in self._curvature for entry in row]
         return Tape([*self._by_position, *others], self.symbols)
 
     @cached_property
     def _holding(self) -> Tape:
-        """G of the constraints, row by row; what their rates grow by while velocities stay; they; their rates.
+        """Constraint Jacobian G, row by row; d/dt of the rates at constant v; the constraints; their rates.
 
-        Of a constraint of velocities its own slopes by them, nothing, and itself.
+        A nonholonomic constraint contributes its derivatives with respect to v, 0 for the constraint, and itself as
+        rate.
         """
         q, v, t = self.system.coordinates, self.second, self.system.time
 
@@ -123,11 +123,11 @@ class ExactMotion:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
 
     def momentum(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
-        """(m,) momenta dL/dv of a Lagrangian."""
+        """Return the (m,) momenta dL/dv of a Lagrangian."""
         return self._values(self._by_second, q, v, t)
 
     def velocity(self, q: Numbers, p: Numbers, t: Number, digits: int = DIGITS) -> Numbers:
-        """(m,) velocities: dH/dp, or the v with dL/dv = p, by Newton's iteration from rest.
+        """Return the (m,) velocities: dH/dp, or the v with dL/dv = p, by Newton's iteration from v = 0.
 
         Raises:
             StateError: if there is none.
@@ -145,18 +145,18 @@ class ExactMotion:
             raise StateError(f"no velocity that Newton's iteration finds has these momenta: {failure}") from failure
 
     def lagrangian(self, q: Numbers, v: Numbers, t: Number) -> Number:
-        """L of a Lagrangian."""
+        """Return L of a Lagrangian."""
         return self._values(self._formula, q, v, t)[0]
 
     def energy(self, q: Numbers, p: Numbers, t: Number) -> Number:
-        """H, or p . v - L."""
+        """Return H, or p . v - L."""
         if self.hamiltonian:
             return self._values(self._formula, q, p, t)[0]
         v = self.velocity(q, p, t)
         return p @ v - self.lagrangian(q, v, t)
 
     def _rates(self, state: Numbers, t: Number) -> Numbers:
-        """Of (q, p) where H is given, of (q, v) where L is."""
+        """Return the rates of (q, p) for a Hamiltonian, of (q, v) for a Lagrangian."""
         q, second = np.split(state, 2)
         m = len(q)
         if self.hamiltonian:
@@ -168,23 +168,23 @@ class ExactMotion:
         return np.concatenate([second, _solved(mass, applied)])
 
     def _mass_and_applied(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
-        """L_vv, and what it times the accelerations is without constraints, at (q, v) of a Lagrangian."""
+        """Return L_vv and the applied force (L_vv times unconstrained accelerations) at (q, v) of a Lagrangian."""
         m, found = len(q), self._values(self._right_hand_side, q, v, t)
         slopes = found[m:].reshape(m, 2 * m + 1)
         return slopes[:, :m], found[:m] - slopes[:, m : 2 * m] @ v - slopes[:, 2 * m]
 
     def _held(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
-        """(m + c,) accelerations, and the multipliers that keep the second derivatives of the constraints at 0."""
+        """Return (m + c,) accelerations, and multipliers with which constraints have zero second derivatives."""
         slopes, (growth, _, _) = self._bound(q, v, t)
         return _solved(_saddle(mass, slopes), np.concatenate([applied, -growth]))
 
     def _bound(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
-        """(c, m) slopes of the constraints; (3, c) what their rates grow by while v stays, they, their rates."""
+        """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
         m, count, found = len(q), len(self.system.constraints), self._values(self._holding, q, v, t)
         return found[: count * m].reshape(count, m), found[count * m :].reshape(3, count)
 
     def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
-        """The state on the constraints next to (q, p), to all digits; (q, p) itself without any."""
+        """Project (q, p) onto the constraints to all digits; without constraints it is returned unchanged."""
         q, p, t = numbers(q), numbers(p), mp.mpf(t)
         if not self.system.constraints:
             return q, p
@@ -198,30 +198,30 @@ class ExactMotion:
         return q, self.momentum(q, v, t)
 
     def multipliers(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
-        """(c,) of the constraints at a state."""
+        """Return the (c,) constraint multipliers at a state."""
         mass, applied = self._mass_and_applied(q, v, t)
         return self._held(mass, applied, q, v, t)[len(q) :]
 
     def rates(self, q: Numbers, p: Numbers, t: Number) -> tuple[Numbers, Numbers]:
-        """(m,) velocities and forces: the rates of q and p by Hamilton's equations."""
+        """Return (m,) velocities and forces: the rates of q and p by Hamilton's equations."""
         v = self.velocity(q, p, t)
         if self.hamiltonian:
             return v, self._rates(np.concatenate([q, p]), t)[len(q) :]
         return v, self._values(self._right_hand_side, q, v, t)[: len(q)]
 
     def acceleration(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
-        """(m,) accelerations at (q, v) of a Lagrangian."""
+        """Return the (m,) accelerations at (q, v) of a Lagrangian."""
         return self._rates(np.concatenate([q, v]), t)[len(q) :]
 
     def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
-        """(m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
+        """Return the (m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
         m, found = len(q), self._values(self._right_hand_side, q, v, t)
         slopes = found[m:].reshape(m, 2 * m + 1)
         residual: Numbers = slopes[:, :m] @ a + slopes[:, m : 2 * m] @ v + slopes[:, 2 * m] - found[:m]
         return residual
 
     def residual_slopes(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
-        """(3, m, m) its derivatives by position, velocity and acceleration, in doubles."""
+        """Return the (3, m, m) derivatives of the residual by position, velocity and acceleration, in doubles."""
         places, tape = self._slopes_of_residual
         matrices = np.zeros((len(q), 3 * len(q)))
         matrices[places] = [float(value) for value in tape([*q, *v, *a, t, *self.parameters])]
@@ -229,7 +229,7 @@ class ExactMotion:
 
     @cached_property
     def _slopes_of_residual(self) -> tuple[tuple[list[int], list[int]], Tape]:
-        """Where derivatives of the residual are not 0, rows and columns, and their values."""
+        """Rows and columns of the non-zero derivatives of the residual, and their values."""
         q, v, t = self.system.coordinates, self.second, self.system.time
         a = tuple(sympy.Dummy(real=True) for _ in q)
         residual = [
@@ -241,10 +241,11 @@ class ExactMotion:
         return (rows, columns), Tape(list(entries.values()), (*q, *v, *a, t, *self.system.parameters))
 
     def flow(self, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
-        """(q, p) at t + h of the motion through (q, p) at t, to about 45 digits.
+        """Return (q, p) at t + h of the trajectory through (q, p) at t, to about 45 digits.
 
         Raises:
-            StateError: if extrapolation does not converge on any part of the interval: a singularity may lie there.
+            StateError: if extrapolation does not converge on some part of the interval, which may contain a
+            singularity.
         """
         q, p, h, t = numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)
         start = np.concatenate([q, p if self.hamiltonian else self.velocity(q, p, t)])
@@ -262,7 +263,7 @@ class ExactMotion:
         return self._followed(middle, h / 2, t + h / 2, halvings - 1)
 
     def _extrapolated(self, start: Numbers, h: Number, t: Number) -> Numbers | None:
-        """Aitken-Neville in (h / n)^2 for n = 2, 4, 6, ..; ``None`` if the last columns still differ."""
+        """Return the Aitken-Neville extrapolation in (h / n)^2 for n = 2, 4, 6, ..; ``None`` without convergence."""
         row: list[Numbers] = []
         for k in range(1, MOST_COLUMNS + 1):
             new = [self._midpoints(start, h, t, 2 * k)]
@@ -283,7 +284,7 @@ class ExactMotion:
 
 
 def _saddle(mass: Numbers, slopes: Numbers) -> Numbers:
-    """[mass, -slopes^T; slopes, 0]."""
+    """Return the saddle-point matrix [mass, -slopes^T; slopes, 0]."""
     count, m = slopes.shape
     matrix = numbers(np.zeros((m + count, m + count)))
     matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -slopes.T, slopes
@@ -298,5 +299,5 @@ def _solved(matrix: Numbers, right: Numbers) -> Numbers:
 
 @lru_cache(maxsize=64)
 def exact_motion(system: MechanicalSystem) -> ExactMotion:
-    """The motion of a system, its formula differentiated once a process."""
+    """Return the exact motion of a system; cached, since its formula is differentiated."""
     return ExactMotion(system)

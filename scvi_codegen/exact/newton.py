@@ -17,37 +17,37 @@ from scvi_codegen.tables.precision import Number, mp
 __all__ = ["Array", "Floats", "NotConvergedError", "Solve", "inverse", "largest", "newton", "scaled", "solver"]
 
 Array: TypeAlias = NDArray[Any]
-"""Of mpmath numbers."""
+"""Array of mpmath numbers."""
 Floats: TypeAlias = NDArray[np.float64]
 Solve: TypeAlias = Callable[[Array], Array]
 
 MOST_ITERATIONS = 60
 STALE = 1e-3
-"""A Jacobian is computed anew where an iteration with the old one gains less than this factor."""
+"""Convergence factor of the updates above which the Jacobian is recomputed."""
 LEAST_FRACTION = 1e-4
 
 
 class NotConvergedError(ArithmeticError):
-    """Newton's iteration found no solution."""
+    """Failure of Newton's iteration to converge."""
 
 
 def largest(values: Array) -> Number:
-    """The largest absolute value."""
+    """Return the largest absolute value."""
     return max(map(abs, values.ravel()), default=mp.zero)
 
 
 def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digits: int, stale: float = STALE) -> Array:
-    """The zero of ``residual`` near x, to so many digits of its largest entry: damped, its Jacobian in doubles.
+    """Return the zero of ``residual`` near x, by damped Newton iteration with a Jacobian in double precision.
 
     Args:
-        residual: raises ``ArithmeticError`` where it is not defined.
-        linearised: solves with the Jacobian at a point; kept while updates shrink by ``stale``.
-        x: the first guess.
-        digits: of the largest entry of x.
-        stale: the dearer a Jacobian is beside a residual, the larger.
+        residual: raises ``ArithmeticError`` where it is undefined.
+        linearised: returns a solver with the Jacobian at a point; reused while updates shrink by ``stale``.
+        x: initial guess.
+        digits: requested digits, relative to the largest entry of x.
+        stale: convergence factor above which the Jacobian is recomputed; larger for expensive Jacobians.
 
     Raises:
-        NotConvergedError: if there is no zero near.
+        NotConvergedError: if the iteration does not converge.
     """
     scale, value, solve = largest(x), residual(x), linearised(x)
     update = solve(value)
@@ -64,7 +64,7 @@ def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digi
 
 
 def damped(residual: Solve, solve: Solve, x: Array, update: Array) -> tuple[Array, Array, Array]:
-    """The longest of the steps 1, 1/2, 1/4 ... of the update that shortens the next update of the same Jacobian."""
+    """Return the first of the damped steps 1, 1/2, 1/4 ... that shortens the next update with the same Jacobian."""
     fraction, size = 1.0, largest(update)
     while fraction > LEAST_FRACTION:
         moved = x - update * mp.mpf(fraction)
@@ -81,7 +81,7 @@ def damped(residual: Solve, solve: Solve, x: Array, update: Array) -> tuple[Arra
 
 
 def inverse(matrix: Floats) -> Floats:
-    """The inverse of a matrix that is regular wherever the mass matrix is."""
+    """Return the inverse of a matrix that is regular wherever the mass matrix is."""
     try:
         found = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     except np.linalg.LinAlgError as failure:
@@ -92,7 +92,7 @@ def inverse(matrix: Floats) -> Floats:
 
 
 def scaled(solve: Callable[[Floats], Floats], right: Array) -> Array:
-    """A linear function of floats, applied to numbers of any size: they are scaled to size 1 first."""
+    """Apply a linear function of doubles to numbers of any size, scaled to size 1."""
     size = largest(right)
     if size == 0:
         return right
@@ -101,6 +101,6 @@ def scaled(solve: Callable[[Floats], Floats], right: Array) -> Array:
 
 
 def solver(matrix: Floats) -> Solve:
-    """Solves with this matrix."""
+    """Return a linear solver with this matrix."""
     inverted = inverse(matrix)
     return lambda right: scaled(lambda floats: inverted @ floats, right)

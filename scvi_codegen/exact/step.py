@@ -1,8 +1,8 @@
-"""One step of a method's equations in 60 digits: what the compiled step should be, free of round-off.
+"""Steps of a method's equations in 60 digits: the reference for a compiled step, free of round-off.
 
-It shares with the compiled code what the method is and nothing of how it is solved: the equations are the paper's
-(:meth:`~scvi_codegen.methods.method.Method.paper_form`, those that :func:`~scvi_codegen.derivation.equations.derive`
-writes out), kernels are evaluated expression by expression, and the matrix of Newton's iteration comes from finite
+It shares the definition of the method with the compiled code, but not the solution: the equations are the paper's
+(:meth:`~scvi_codegen.methods.method.Method.paper_form`, which :func:`~scvi_codegen.derivation.equations.derive` writes
+out), kernels are evaluated expression by expression, and the matrix of Newton's iteration is computed by finite
 differences.
 """
 
@@ -32,17 +32,17 @@ from scvi_codegen.tables.precision import Number, mp
 __all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
 
 DIGITS = 45
-"""To which the equations are solved."""
+"""Digits to which the equations are solved."""
 WIDTH = mp.mpf(10) ** -30
-"""Relative, of the differences: slopes to 30 digits."""
+"""Relative width of the finite differences, which are correct to 30 digits."""
 REFINEMENTS = 4
 STEADY = 0.1
-"""The matrix, from differences in 60 digits, is dear: it is kept while updates shrink so fast."""
+"""Convergence factor above which the Jacobian is recomputed; it is expensive (differences in 60 digits)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedStep:
-    """The unknowns of a step, in the order of the derivation, and the state at its end."""
+    """Unknowns of a step, in the order of the derivation, and the final state."""
 
     unknowns: tuple[Number, ...]
     q: tuple[Number, ...]
@@ -58,7 +58,7 @@ class _Known:
 
 
 class DerivedStep:
-    """The stage equations of a system as functions of numbers; parameters have default values, or others."""
+    """Stage equations of a system as functions of numbers, with default or other values of the parameters."""
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
@@ -80,24 +80,24 @@ class DerivedStep:
         self.scatters = [[numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families]
 
     def with_parameters(self, parameters: Sequence[Number]) -> DerivedStep:
-        """The same equations with other values of the parameters, in order."""
+        """Return the same equations with other values of the parameters, in order."""
         found = copy(self)
         found.motion = self.motion.with_parameters(parameters)
         return found
 
     @property
     def unknowns(self) -> int:
-        """How many numbers a step is solved for."""
+        """Number of unknowns of a step."""
         return int(self.blocks[-1].stop)
 
     def seconds(self, q: Any, p: Any, h: Any, t: Any = 0) -> float:
-        """About how long a step takes to be solved: as long as its equations at as many places as it has unknowns."""
+        """Estimate the time of solving a step: that of evaluating its equations as many times as it has unknowns."""
         known, began = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)), time.perf_counter()
         self._rows(self._straight(known), known)
         return self.unknowns * (time.perf_counter() - began)
 
     def __call__(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
-        """The step from (q, p) at t to t + h; numbers are taken as they are given, so 0.1 is the double.
+        """Compute the step from (q, p) at t to t + h; numbers are converted exactly, so 0.1 is the double.
 
         Raises:
             StateError: if Newton's iteration does not converge.
@@ -121,7 +121,7 @@ class DerivedStep:
             raise StateError(f"{leaves} with h = {mp.nstr(known.h, 6)}") from failure
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
-        """What one update of Newton's iteration makes of the straight line, the matrix from finite differences."""
+        """Return the result of one Newton update from the straight line, with the matrix from finite differences."""
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.mpf(t))
         z = self._straight(known)
         matrix, rows = self._exact_matrix(z, known), self._rows(z, known)[: self.unknowns]
@@ -133,10 +133,10 @@ class DerivedStep:
         return self._end(z, self._rows(z, known), known)
 
     def duration(self, solved: SolvedStep, q: Any, p: Any, h: Any) -> Number:
-        """What of time a step lasts: the rate of the clock, summed along its curve by the method's own quadrature.
+        """Return the physical time of a step: the integral of dt/dtau along its curve by the method's quadrature.
 
         Raises:
-            StateError: where time is not transformed.
+            StateError: without a time transformation.
         """
         shape = self.stages.shape
         if self.rate is None or not isinstance(shape, Velocities):
@@ -147,9 +147,9 @@ class DerivedStep:
         return known.h * mp.fdot(shape.weights, rates)
 
     def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
-        """(m,) and (unknowns,) derivatives of the generating function by q0 and the unknowns, by central differences.
+        """Return the (m,) and (unknowns,) central differences of the generating function by q0 and the unknowns.
 
-        ``None`` where a family of points has no scalar.
+        ``None`` if a group of points has no scalar.
         """
         if None in self.scalars:
             return None
@@ -178,14 +178,14 @@ class DerivedStep:
             scale /= mp.mpf(family.gathers[0].scale.numerator) / family.gathers[0].scale.denominator
             for n, weight in enumerate(family.weights):
                 scalar = self.scalars[f]
-                assert scalar is not None  # or there would be no slopes
+                assert scalar is not None  # checked above
                 (value,) = scalar(self._point(family, n, arguments[n], known))
                 grown = self._growth(family.abscissae[n], known)
                 total += scale * weight * grown * known.h ** (1 + family.scalar_power) * value
         return total
 
     def _straight(self, known: _Known) -> Numbers:
-        """(unknowns,): the straight line with the velocity of the initial state, 0 for blocks of other sizes."""
+        """Return the (unknowns,) initial guess: straight line with the initial velocity, 0 for other block sizes."""
         v = self.motion.velocity(known.q, known.p, known.t)
         return np.concatenate(
             [
@@ -199,7 +199,7 @@ class DerivedStep:
         )
 
     def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
-        """(points, arguments) of the kernel of a family."""
+        """Return the (points, arguments) of the kernel of a family."""
         parts = []
         for gather, table in zip(self.stages.families[f].gathers, self.gathers[f], strict=True):
             factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
@@ -207,7 +207,7 @@ class DerivedStep:
         return np.concatenate(parts, axis=1)
 
     def _gathered(self, line: Numbers, size: int, z: Numbers, known: _Known) -> Numbers:
-        """(size,) sum of q0 and the blocks with the coefficients of a line of a table."""
+        """Return the (size,) sum of q0 and the blocks with the coefficients of a table row."""
         total = known.q * line[0] if line[0] else numbers([0] * size)
         for b in np.flatnonzero(line[1:]):
             total = total + z[self.blocks[b]] * (line[b + 1] * known.h ** self.stages.blocks[b].power)
@@ -226,12 +226,12 @@ class DerivedStep:
         return scale * family.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
 
     def _growth(self, c: Number, known: _Known) -> Number:
-        """What damping makes of a weight at a point c of the step: e^(gamma c h) of it."""
+        """Return the factor e^(gamma c h) of a weight at the point c of the step, where gamma is the damping rate."""
         (rate,) = self.damping(self.motion.parameters)
         return mp.exp(rate * c * known.h)
 
     def _rows(self, z: Numbers, known: _Known) -> Numbers:
-        """The equations, and p1."""
+        """Return the residuals of the equations, followed by p1."""
         m = self.system.dimension
         starts = [
             known.p * x if own.stop - own.start == m else numbers([0] * (own.stop - own.start))
@@ -248,7 +248,7 @@ class DerivedStep:
         return rows
 
     def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
-        """Derivatives of the rows by the unknowns, those of the kernels by differences."""
+        """Return the derivatives of the rows with respect to the unknowns; those of the kernels by differences."""
         matrix = numbers(np.zeros((self.unknowns, self.unknowns)))
         powers = [known.h**block.power for block in self.stages.blocks]
         for f, family in enumerate(self.stages.families):
@@ -276,7 +276,7 @@ class DerivedStep:
         return slopes
 
     def _inverse(self, exact: Numbers, known: _Known) -> Numbers:
-        """The inverse in double precision, with rows and columns scaled to size 1: later updates correct it."""
+        """Return the inverse in double precision, with rows and columns scaled to size 1; later updates correct it."""
         rows = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact], dtype=object)
         exact = rows[:, None] * exact
         columns = np.array([1 / (max(map(abs, line)) or mp.one) for line in exact.T], dtype=object)
@@ -293,17 +293,17 @@ class DerivedStep:
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
-    """Where parts of these sizes stand, one after the other."""
+    """Return the slices of consecutive parts with these sizes."""
     return tuple(slice(end - size, end) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
 
 @lru_cache(maxsize=64)
 def derived_step(system: MechanicalSystem, method: Method) -> DerivedStep:
-    """The paper's equations of a method for a system, derived once a process."""
+    """Return the paper's equations of a method for a system, cached."""
     return DerivedStep(system, paper_equations(system, method))
 
 
 @lru_cache(maxsize=64)
 def compiled_equations(system: MechanicalSystem, method: Method) -> DerivedStep:
-    """The same map in the unknowns of the compiled code."""
+    """Return the equations in the unknowns of the compiled code, cached."""
     return DerivedStep(system, discretise(system, method))

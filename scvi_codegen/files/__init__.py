@@ -1,1 +1,1 @@
-"""What lies on disk, whatever is in it: whole files, the cache folder, the templates, formats of states, TOML."""
+"""Files on disk: atomic writes, the cache folder, the templates, export formats, TOML."""

@@ -1,4 +1,4 @@
-"""Files written whole or not at all: beside their place first, then renamed into it."""
+"""Atomic writes: files are written to a temporary name in the same folder, then renamed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["remove", "replaced", "sync_folder", "write_atomically"]
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], object]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then rename it: the old one stays until the new is whole."""
+    """Write a temporary file in the folder of ``path``, then rename it, so that ``path`` is always complete."""
     target = Path(path)
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
     try:
@@ -33,10 +33,11 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[IO[bytes]], 
 
 @contextmanager
 def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A path on the same disk, for a library to make a file or a folder at, which then takes the place of ``path``.
+    """Yield a path on the same disk for a new file or folder, which then replaces ``path``.
 
-    If that fails, nothing has changed. A file replaces a file at once. A folder cannot: the one it replaces is moved
-    aside just before, and removed after.
+    If that fails, nothing has changed. A file is replaced atomically; an existing folder is moved aside just before,
+    and
+    removed afterwards.
     """
     target = Path(path)
     with tempfile.TemporaryDirectory(
@@ -57,15 +58,15 @@ def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder outlive a loss of power, where the system can."""
+    """Synchronise the names in a folder to disk, where the operating system supports it."""
     with suppress(OSError):
         _sync(folder)
 
 
 def _sync(path: Path) -> None:
     if path.is_dir() and os.name != "posix":
-        return  # folders are not opened there
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # to read alone is too little on Windows
+        return  # folders cannot be opened there
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)  # Windows requires write access
     try:
         os.fsync(handle)
     finally:
@@ -73,7 +74,7 @@ def _sync(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder with all that is in it, as far as that can be done."""
+    """Remove a file or a folder with its contents, ignoring errors."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

@@ -1,11 +1,11 @@
 """The user's cache folder: compiled integrators, generated texts, reference solutions.
 
-Anything in it can be made again, and is made again when it is missing or not what its checksum says. A checksum finds
-accidents; what protects from others is that nobody else may write here: a folder or an entry that belongs to another
-user than this one or root, or that its group or every user of the machine may write, is not used. When the entries
-are larger than ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no limit), those used least recently are removed. To
-count thousands of entries takes as long as to compile one: a process counts them at its first, and again when it has
-written a share of what was free. Processes may do all this at once: entries come and go by renaming.
+Every entry can be regenerated, and is if it is missing or its checksum does not match. Checksums detect accidents;
+against other users, the folder and its entries are used only if no one but this user and root may write to them. If
+the entries exceed ``$SCVI_CODEGEN_CACHE_SIZE`` (1G by default; 0: no limit), the least recently used are removed.
+Counting thousands of entries takes as long as compiling one: a process counts them at its first write, and again when
+it has written a certain share of what was free. Concurrent processes are safe: entries are created and removed by
+renaming.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 INTEGRATORS, TEXTS, REFERENCES = "_scvi_*", "texts/*.json", "references/*.npz"
 UNFINISHED = (".building-*", ".removed-*", "texts/.*", "references/.*")
 STALE_SECONDS = 3600
-"""After which something unfinished is taken to be of a process that was killed; no compilation takes so long."""
+"""Age after which an unfinished entry is attributed to a killed process; no compilation takes so long."""
 UNCOUNTED_SHARE = 1 / 16
-"""Of what is free: so much a process writes before it counts again."""
+"""Share of the free size that a process writes before it counts again."""
 _uncounted: dict[tuple[Path, int], float] = {}
-"""Bytes that this process may yet write before it counts, by folder and limit."""
+"""Bytes that this process may write before it counts again, by folder and limit."""
 
 
 def cache_folder() -> Path:
-    """Where compiled steppers are kept: ``$SCVI_CODEGEN_CACHE``, else the user's cache folder."""
+    """Return the cache folder: ``$SCVI_CODEGEN_CACHE``, else the user's cache folder."""
     chosen = os.environ.get(CACHE_VARIABLE)
     return Path(chosen) if chosen else platformdirs.user_cache_path("scvi-codegen")
 
 
 def trusted_folder() -> Path | None:
-    """The cache folder, or ``None``, with a warning, if others may write into it: what lies there is run."""
+    """Return the cache folder, or ``None`` with a warning if others may write to it: its contents are executed."""
     folder = cache_folder()
     if not exposed(folder):
         return folder
@@ -73,19 +73,19 @@ def trusted_folder() -> Path | None:
 
 
 def remedy_of(folder: Path) -> str:
-    """Why a folder is not used, and what to do."""
+    """Return why a folder is not used, and what to do."""
     reason = exposed(folder)
     remedy = f"chmod go-w '{folder}', or name" if "write" in reason else "name"
     return f"{reason}, and what lies there is run: {remedy} another folder in {CACHE_VARIABLE}"
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder that nobody else may write, whatever the umask; OSError if that fails."""
+    """Create a folder that only this user may write to, whatever the umask; OSError if that fails."""
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
 
 
 def exposed(path: Path) -> str:
-    """Why others than this user and root may change what is there; nothing where they may not, or nothing is there."""
+    """Return why users other than this one and root may write to a path; empty if they may not."""
     if os.name != "posix":
         return ""
     try:
@@ -100,10 +100,10 @@ def exposed(path: Path) -> str:
 
 
 def size_limit() -> int:
-    """Bytes that the entries may have together, 0 for any number.
+    """Return the maximum total size of the entries in bytes, 0 for no limit.
 
     Raises:
-        BuildError: if ``$SCVI_CODEGEN_CACHE_SIZE`` is no size.
+        BuildError: if ``$SCVI_CODEGEN_CACHE_SIZE`` is not a size.
     """
     given = os.environ.get(SIZE_VARIABLE) or DEFAULT_SIZE
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", given.strip(), re.IGNORECASE)
@@ -117,13 +117,13 @@ def size_limit() -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CacheInfo:
-    """What is in the cache.
+    """Contents of the cache.
 
     Attributes:
-        folder: where it is.
-        integrators, texts, references: numbers of compiled integrators, of generated texts, of reference solutions.
-        size: bytes of all of them.
-        limit: bytes they may have, 0 for any number.
+        folder: path of the cache folder.
+        integrators, texts, references: numbers of compiled integrators, generated texts and reference solutions.
+        size: their total size in bytes.
+        limit: maximum total size in bytes, 0 for no limit.
     """
 
     folder: Path
@@ -143,7 +143,7 @@ class CacheInfo:
 
 
 def cache_info() -> CacheInfo:
-    """What is in the cache now. Raises as :func:`size_limit`."""
+    """Return the current contents of the cache. Raises as :func:`size_limit`."""
     folder = cache_folder()
     integrators, texts, references = (list(folder.glob(kind)) for kind in (INTEGRATORS, TEXTS, REFERENCES))
     return CacheInfo(
@@ -157,7 +157,7 @@ def cache_info() -> CacheInfo:
 
 
 def clear_cache() -> int:
-    """Remove all entries, and what processes left that were killed long ago; nothing else. Returns the bytes freed."""
+    """Remove all entries, and unfinished entries of processes killed long ago. Returns the number of bytes freed."""
     folder = cache_folder()
     entries = list(_entries(folder))
     freed = sum(map(_size, entries))
@@ -168,15 +168,15 @@ def clear_cache() -> int:
 
 
 def touch(entry: Path) -> None:
-    """Note that an entry was used."""
+    """Record the use of an entry."""
     with suppress(OSError):
         os.utime(entry)
 
 
 def make_room(folder: Path, newest: Path) -> None:
-    """Remove the entries used least recently until all fit the limit, but never the ``newest``, which was written now.
+    """Remove the least recently used entries until all fit the limit, except the ``newest``.
 
-    They are counted where this one may be too much: where it does not fit what was left uncounted.
+    Entries are counted only if this one may exceed what was left uncounted.
     """
     limit = size_limit()
     left = _uncounted.get((folder, limit), 0.0) - _size(newest)
@@ -187,7 +187,7 @@ def make_room(folder: Path, newest: Path) -> None:
 
 
 def _fit(folder: Path, newest: Path, limit: int) -> int:
-    """Remove entries until all fit; the bytes of those that are left."""
+    """Remove entries until all fit; return the bytes of the remaining ones."""
     found = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
     total = _size(newest) + sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
@@ -199,7 +199,7 @@ def _fit(folder: Path, newest: Path, limit: int) -> int:
 
 
 def discard(entry: Path) -> None:
-    """Remove an entry: first out of sight, so that no other process finds half of it or puts another in its place."""
+    """Remove an entry, after renaming it, so that other processes find it either complete or missing."""
     try:
         aside = Path(tempfile.mkdtemp(prefix=".removed-", dir=entry.parent))
     except OSError:
@@ -222,7 +222,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def _last_use(path: Path) -> float:
-    """0 for what is gone meanwhile."""
+    """Return the time of the last use, 0 for a path that no longer exists."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -230,7 +230,7 @@ def _last_use(path: Path) -> float:
 
 
 def _size(path: Path | os.DirEntry[str]) -> int:
-    """Bytes of a file, or of all in a folder that others may be removing."""
+    """Return the bytes of a file, or of all files in a folder, which others may be removing."""
     try:
         if not path.is_dir():
             return path.stat().st_size

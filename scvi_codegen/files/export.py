@@ -1,7 +1,7 @@
-"""States of a trajectory, however long, as files and as tables: npz, CSV, HDF5, Zarr; xarray, pandas.
+"""Export of trajectories of any length to files and tables: npz, CSV, HDF5, Zarr; xarray, pandas.
 
-Files are written piece by piece, so that their length does not matter, and take their place when they are whole.
-h5netcdf, zarr, xarray and pandas are the extra ``data``, imported where they are used.
+Files are written in chunks, which bounds memory, and atomically. h5netcdf, zarr, xarray and pandas are the extra
+``data``, imported where they are used.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ __all__ = ["LABELLED", "Piece", "States", "check_format", "chunk_rows", "to_data
 
 Array = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, Array, Array, NDArray[np.int32]]
-"""Some of the states, one after the other: t (n,), q (n, m), p (n, m), iterations (n,)."""
+"""Chunk of consecutive states: t (n,), q (n, m), p (n, m), iterations (n,)."""
 
 COLUMNS = ("t", "q", "p", "iterations")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class States:
-    """A trajectory to write.
+    """Trajectory to export.
 
     Attributes:
-        count: the number n of states.
-        pieces: gives them in order, as often as it is called.
+        count: number n of states.
+        pieces: returns an iterator over chunks in order; may be called repeatedly.
         coordinates: the m names.
         parameters: value by name.
         h: step size.
-        about: texts to write beside the numbers, by name: title, system, method, version, ...
+        about: metadata texts by name: title, system, method, version, ...
         maps: names of the momentum maps.
-        quantities: what follows from t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c).
-        units: of t, q, p and these, where they are known.
+        quantities: derived quantities of t (n,), q and p (n, m): velocity (n, m), energy (n,), momentum_map (n, c).
+        units: of t, q, p and these, as far as known.
     """
 
     count: int
@@ -63,17 +63,17 @@ class States:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """All but the states as numbers and texts."""
+        """Metadata: all fields except the states, as numbers and texts."""
         return {**self.about, "h": self.h, "parameters": json.dumps(dict(self.parameters))}
 
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
-        """Shape and type of each array."""
+        """Return shape and type of each array."""
         n, m = self.count, len(self.coordinates)
         real = np.dtype(float)
         return {"t": ((n,), real), "q": ((n, m), real), "p": ((n, m), real), "iterations": ((n,), np.dtype(np.int32))}
 
     def labelled(self) -> Labelled:
-        """With names for dimensions, and with what follows from the states."""
+        """Return the arrays with named dimensions, including derived quantities."""
         dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",)}
         dimensions |= {"q": ("t", "coordinate"), "p": ("t", "coordinate"), "iterations": ("t",)}
         whole = {"coordinate": np.array(self.coordinates)}
@@ -98,16 +98,16 @@ class States:
 
 
 def chunk_rows(dimension: int) -> int:
-    """States of m coordinates in a chunk of about 16 MiB."""
+    """Return the number of states of m coordinates in a chunk of about 16 MiB."""
     return max(1, CHUNK_BYTES // (8 * (1 + 2 * dimension) + 4))
 
 
 def check_format(path: str | os.PathLike[str]) -> None:
-    """Find out, before a long run, whether states can be written to such a file.
+    """Check, before a long run, that states can be written to a file of this suffix.
 
     Raises:
-        StateError: for another suffix.
-        MissingLibraryError: if the library for it is not installed.
+        StateError: for an unknown suffix.
+        MissingLibraryError: if its library is not installed.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
@@ -119,11 +119,12 @@ def check_format(path: str | os.PathLike[str]) -> None:
 
 
 def write_states(states: States, path: str | os.PathLike[str]) -> None:
-    """Write states in the format of the suffix, whole or not at all.
+    """Write states atomically in the format of the suffix.
 
     Raises:
-        StateError, MissingLibraryError: as :func:`check_format`; StateError also if another folder is in the way, and
-            for units in a format that has none.
+        StateError, MissingLibraryError: as :func:`check_format`; StateError also if ``path`` is an unrelated folder,
+        and
+            for units in a format that does not support them.
         OSError: if it cannot be written.
     """
     check_format(path)
@@ -134,7 +135,7 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> None:
-    """Have ``write`` make a file or a folder, which then takes the place of ``path``, or nothing changes."""
+    """Create a file or a folder by ``write``, which then replaces ``path``; nothing changes on failure."""
     if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
         raise StateError(f"{str(path)!r} is a folder with something else in it: choose another name")
     try:
@@ -148,7 +149,7 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> 
 
 
 def to_dataframe(states: States) -> pandas.DataFrame:
-    """One row per state, indexed by time, with the columns of a CSV file (:func:`_names`)."""
+    """Return one row per state, indexed by time, with the columns of a CSV file (:func:`_names`)."""
     library = imported("pandas")
     t, *columns = (np.concatenate(parts) for parts in zip(*map(tuple, _columns(states)), strict=True))
     frame: pandas.DataFrame = library.DataFrame(
@@ -159,7 +160,7 @@ def to_dataframe(states: States) -> pandas.DataFrame:
 
 
 def _names(states: States) -> list[str]:
-    """Column names: t, coordinates x, momenta p_x, iterations; then velocities x_dot and the energy, where known."""
+    """Return column names: t, coordinates x, momenta p_x, iterations; velocities x_dot and energy, if known."""
     names = ["t", *states.coordinates, *(f"p_{name}" for name in states.coordinates), "iterations"]
     if states.quantities is not None:
         names += [*(f"{name}_dot" for name in states.coordinates), "energy"]
@@ -167,7 +168,7 @@ def _names(states: States) -> list[str]:
 
 
 def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
-    """The columns of :func:`_names`, (n,) each, piece by piece."""
+    """Yield the columns of :func:`_names`, (n,) each, chunk by chunk."""
     for t, q, p, iterations in states.pieces():
         found = {} if states.quantities is None else states.quantities(t, q, p)
         more = (*found["velocity"].T, found["energy"]) if found else ()
@@ -175,7 +176,7 @@ def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
 
 
 def _write_npz(states: States, path: Path) -> None:
-    """What ``np.savez`` would write of the whole arrays, made of pieces."""
+    """Write the same file as ``np.savez`` for the whole arrays, in chunks."""
     small = {
         "h": np.array(states.h),
         "parameters": np.array(list(states.parameters.values()), dtype=float),
@@ -209,7 +210,7 @@ def _write_labelled(states: States, path: Path, *, write: Callable[[Labelled, Pa
 
 
 LABELLED = {".h5": write_hdf5, ".hdf5": write_hdf5, ".nc": write_hdf5, ".zarr": write_zarr}
-"""Formats that have names for dimensions, and units."""
+"""Formats with named dimensions and units."""
 WRITERS: Mapping[str, Callable[[States, Path], None]] = {
     ".npz": _write_npz,
     ".csv": _write_csv,

@@ -1,7 +1,7 @@
-"""Arrays whose dimensions have names, for HDF5, Zarr and xarray: states, and what follows from them.
+"""Arrays with named dimensions, for HDF5, Zarr and xarray: states and derived quantities.
 
-HDF5 files are netCDF4, written through h5netcdf; ``xarray.open_dataset`` reads them, and ``xarray.open_zarr`` the
-folders of Zarr. Every variable has a ``long_name``, and ``units`` where they were given.
+HDF5 files are netCDF4, written by h5netcdf; ``xarray.open_dataset`` reads them, and ``xarray.open_zarr`` Zarr folders.
+Every variable has a ``long_name``, and ``units`` if given.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["CHUNK_BYTES", "Labelled", "checked_units", "imported", "missing", "to_dataset", "write_hdf5", "write_zarr"]
 
 CHUNK_BYTES = 2**24
-"""Of what is in memory at a time, and of a chunk of a file."""
+"""Size of chunks in memory and in files."""
 Arrays: TypeAlias = Mapping[str, NDArray[Any]]
 
 LONG_NAMES = {
@@ -46,20 +46,20 @@ LONG_NAMES = {
     "steps": "steps completed",
 }
 MEASURED = ("t", "q", "p", "velocity", "energy", "momentum_map")
-"""What may have units."""
+"""Arrays that may have units."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Labelled:
-    """Arrays of any length along t, and whole ones.
+    """Arrays of any length along t, and arrays without t.
 
     Attributes:
-        dimensions: of each array by its name; those along t have it first.
-        pieces: gives the arrays along t in parts, as often as it is called.
-        whole: the arrays without t; one called as its only dimension names what stands along it.
+        dimensions: of each array by its name; t is the first.
+        pieces: returns an iterator over chunks of the arrays along t; may be called repeatedly.
+        whole: the arrays without t; one named like its only dimension is the coordinate of that dimension.
         count: the length of t.
         units: of arrays, by name.
-        attributes: of all together, numbers and texts.
+        attributes: global attributes, numbers and texts.
     """
 
     dimensions: Mapping[str, tuple[str, ...]]
@@ -70,37 +70,37 @@ class Labelled:
     attributes: Mapping[str, Any]
 
     def sizes(self) -> dict[str, int]:
-        """Length of each dimension."""
+        """Return the length of each dimension."""
         found = {"t": self.count}
         for name, array in self.whole.items():
             found |= dict(zip(self.dimensions[name], array.shape, strict=True))
         return found
 
     def about(self, name: str) -> dict[str, str]:
-        """Attributes of an array."""
+        """Return the attributes of an array."""
         units = {"units": self.units[name]} if name in self.units else {}
         return {"long_name": LONG_NAMES[name], **units}
 
     def size(self) -> int:
-        """Bytes of all arrays, texts left out."""
+        """Return the bytes of the arrays along t."""
         shapes = [(self.shape(name), _kind(name)) for name in self.along()]
         return sum(int(np.prod(shape)) * kind.itemsize for shape, kind in shapes)
 
     def along(self) -> list[str]:
-        """Names of the arrays along t."""
+        """Return the names of the arrays along t."""
         return [name for name in self.dimensions if name not in self.whole]
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Of an array."""
+        """Return the shape of an array."""
         sizes = self.sizes()
         return tuple(sizes[dimension] for dimension in self.dimensions[name])
 
 
 def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Units by name, with those of velocities where those of positions and times are given.
+    """Return units by name; those of velocities follow from those of positions and time.
 
     Raises:
-        StateError: for another name, or no text.
+        StateError: for an unknown name, or a value that is not text.
     """
     found = dict(units or {})
     for name, unit in found.items():
@@ -112,7 +112,7 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def to_dataset(labelled: Labelled) -> xarray.Dataset:
-    """An xarray Dataset, whole in memory."""
+    """Return an xarray Dataset in memory."""
     library = imported("xarray")
     parts = list(labelled.pieces())
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in labelled.along()} | dict(labelled.whole)
@@ -127,7 +127,7 @@ def to_dataset(labelled: Labelled) -> xarray.Dataset:
 
 
 def write_hdf5(labelled: Labelled, path: Path) -> None:
-    """A file of netCDF4; OSError where there is no room for it, which HDF5 itself does not survive."""
+    """Write a netCDF4 file; OSError if the disk is too full, since HDF5 itself crashes then."""
     if shutil.disk_usage(path.parent).free < labelled.size():
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     texts = imported("h5py").string_dtype()
@@ -145,7 +145,7 @@ def write_hdf5(labelled: Labelled, path: Path) -> None:
 
 
 def write_zarr(labelled: Labelled, path: Path) -> None:
-    """A folder of version 2 of the format, which every reader knows."""
+    """Write a Zarr folder of format version 2, which all readers support."""
     zarr = imported("zarr")
     group = zarr.open_group(str(path), mode="w", zarr_format=2)
     group.attrs.update(labelled.attributes)
@@ -177,7 +177,7 @@ def _fill(labelled: Labelled, arrays: Any) -> None:
 
 
 def imported(library: str) -> Any:
-    """The library; MissingLibraryError without it."""
+    """Import a library; MissingLibraryError if it is not installed."""
     try:
         return importlib.import_module(library)
     except ImportError as error:
@@ -185,5 +185,5 @@ def imported(library: str) -> Any:
 
 
 def missing(library: str) -> MissingLibraryError:
-    """What to say without a library."""
+    """Return the error for a missing library."""
     return MissingLibraryError(f"this needs {library}, which is not installed: pip install 'scvi-codegen[data]'")

@@ -1,4 +1,4 @@
-"""Arrays read from files of NumPy's (.npy, .npz), none of them pickled."""
+"""Reading of NumPy's files (.npy, .npz) without pickle."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["loaded"]
 
 @contextmanager
 def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
-    """What ``numpy.load`` gives, open as long as the context.
+    """Return the result of ``numpy.load``, open within the context.
 
     Raises:
         OSError: if the file cannot be read.
-        ValueError: for whatever a damaged file raises: errors of zipfile, zlib, the parser of headers, the memory.
+        ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
     """
     try:
         found = np.load(file, allow_pickle=False)

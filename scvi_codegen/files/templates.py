@@ -1,4 +1,4 @@
-"""Where the templates are, and where the package itself is: what a text depends on beside its system."""
+"""Locations of the templates and of the package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1]
 
 
 def template_folder() -> Path:
-    """The templates: inside the installed package, or beside it in a checkout."""
+    """Return the templates: inside the installed package, or next to it in a checkout."""
     for folder in (PACKAGE / "templates", PACKAGE.parent / "templates"):
         if (folder / "stepper.c.jinja").is_file():
             return folder

@@ -1,4 +1,4 @@
-"""TOML text of any origin to plain data: what would fill the memory, run for hours or end the parser is refused."""
+"""Safe parsing of TOML of any origin: text that would exhaust memory, time or the parser is rejected."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["read_toml"]
 
 MAX_CHARACTERS = 1_000_000
 MAX_BITS = 4096
-"""Of a whole number: Python does not print longer ones. TOML's have 64."""
+"""Maximum number of bits of an integer: Python does not print longer ones. TOML's have 64."""
 LONG_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
-"""The parser takes a time that grows with the square of the number of words between dots."""
+"""Keys with many dots; the time of the parser grows with the square of their number."""
 
 
 def read_toml(text: str) -> dict[str, Any]:
-    """The document in a text.
+    """Return the document in a text.
 
     Raises:
-        ModelFileError: for what is not TOML, or longer or deeper than any file of this program.
+        ModelFileError: for text that is not TOML, or longer or deeper than any file of this program.
     """
     if len(text) > MAX_CHARACTERS:
         raise ModelFileError(f"the file has {len(text)} characters: the limit is {MAX_CHARACTERS}")
@@ -33,7 +33,7 @@ def read_toml(text: str) -> dict[str, Any]:
         raise ModelFileError(f"this is not TOML: {error}") from error
     except RecursionError:
         raise ModelFileError("this is not a file of this program: lists or tables are nested too deeply") from None
-    except ValueError as error:  # Python's limit for the digits of a whole number
+    except ValueError as error:  # Python's limit for the digits of an integer
         raise ModelFileError(f"this is not TOML: a number is too long ({error})") from error
     _check_whole_numbers(document)
     return document

@@ -1,1 +1,1 @@
-"""Text and SymPy to one exact canonical expression; its derivatives, its value, and back to text."""
+"""Formulas: parsing of text and SymPy to canonical expressions, exact; derivatives, evaluation and printing."""

@@ -1,4 +1,4 @@
-"""What the grammar accepts, and the one form in which SymPy's constructors leave it."""
+"""Canonical form of expressions, and the check that an expression is in the grammar."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ MAX_EXPONENT = 64
 MAX_EXPONENT_DENOMINATOR = 10_000
 MAX_BITS = 2048
 MAX_DIGITS = 616
-"""Of a whole number of so many bits."""
+"""Maximum number of decimal digits of an integer of ``MAX_BITS`` bits."""
 MAX_PASSES = 8
 
 
 def bits(number: Expr) -> int:
-    """Size of a rational, in bits of its larger half; 0 for anything else."""
+    """Return the size of a rational, the bits of its numerator or denominator; 0 for other expressions."""
     return max(int(number.p).bit_length(), int(number.q).bit_length()) if number.is_Rational else 0
 
 
 def beyond_double(number: Expr) -> bool:
-    """Whether a rational is an infinity as a C double, or 0 without being 0."""
+    """Return whether a rational overflows as a C double, or underflows to 0."""
     p, q = abs(int(number.p)), int(number.q)
     return p > int(LARGEST) * q or (p > 0 and p << 1075 <= q)
 
@@ -55,9 +55,9 @@ _SMOOTHER = {
 
 
 def unsupported_part(expression: Expr) -> str | None:
-    """Say what keeps an expression out of the grammar, or ``None``: the rule of the parser, the printer and the system.
+    """Return why an expression is outside the grammar, or ``None``; shared by parser, printer and systems.
 
-    Refused are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
+    Rejected are other functions, floating-point numbers, non-finite or non-real constants, numbers of more than
     ``MAX_BITS`` bits and constant exponents beyond ``MAX_EXPONENT``.
     """
     pending, seen = [expression], set()
@@ -92,7 +92,7 @@ def _node_problem(node: Any) -> str | None:
 
 
 def exponent_problem(exponent: Expr) -> str | None:
-    """Bound the rational part of an exponent: SymPy takes 2**1000000000 out of 2**(x + 1000000000), digit by digit."""
+    """Return why the rational part of an exponent is too large: SymPy extracts 2**10**9 from 2**(x + 10**9)."""
     constant = exponent.as_coeff_Add(rational=True)[0]
     if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
         return None
@@ -103,7 +103,7 @@ def exponent_problem(exponent: Expr) -> str | None:
 
 
 def _constant_problem(expression: Expr) -> str | None:
-    """Look at the largest parts without symbols: each must be a finite real number."""
+    """Return why a maximal subexpression without symbols is not a finite real number, or ``None``."""
     pending = [expression]
     while pending:
         node = pending.pop()
@@ -118,10 +118,10 @@ def _constant_problem(expression: Expr) -> str | None:
 
 
 def evaluated(expression: Expr, replacements: Mapping[Expr, Expr] | None = None) -> Expr:
-    """Replace parts, make floating-point numbers rational and call every constructor anew until nothing changes.
+    """Replace parts, make floating-point numbers rational and re-evaluate all constructors until nothing changes.
 
-    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``);
-    after this, an expression is the one its text means. A float becomes the rational its shortest decimal form says.
+    SymPy leaves some nodes as no constructor would build them (``evaluate=False``, but also ``-((1/2)**x - 1)``); the
+    result equals the parsed text of the expression. A float becomes the rational of its shortest decimal form.
     """
     rules = dict(replacements or {})
     for _ in range(MAX_PASSES):

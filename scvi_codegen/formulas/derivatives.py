@@ -1,8 +1,8 @@
 """Sparse symbolic derivatives by forward accumulation: each node carries only its own non-zero partial derivatives.
 
-The Lagrangian of a lattice has a thousand terms and hundreds of variables, but each term knows two or three of them.
-Nothing is simplified; what vanishes as SymPy's constructors see it is left out. Every node is differentiated once, in
-all variables together, however often it occurs, which is many times quicker than ``Expr.diff``, term by term.
+The Lagrangian of a lattice has a thousand terms and hundreds of variables, but each term depends on two or three.
+Nothing is simplified; entries that SymPy's constructors evaluate to 0 are omitted. Every distinct node is
+differentiated once, with respect to all variables, which is much faster than ``Expr.diff``, term by term.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _Gradient = dict[int, Expr]
 
 
 def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
-    """Non-zero first derivatives of ``expression``, by index into ``variables``, ascending.
+    """Return the non-zero first derivatives of ``expression``, by index into ``variables``, ascending.
 
     >>> from sympy.abc import x, y, z
     >>> gradient(x**2 * z + z, [x, y, z])
@@ -30,7 +30,7 @@ def gradient(expression: Expr, variables: Sequence[Symbol]) -> dict[int, Expr]:
 def jacobian(
     expressions: Sequence[Expr] | Mapping[int, Expr], variables: Sequence[Symbol]
 ) -> dict[tuple[int, int], Expr]:
-    """Non-zero first derivatives of several expressions, by (row, column), ascending.
+    """Return the non-zero first derivatives of several expressions, by (row, column), ascending.
 
     Args:
         expressions: the rows, as a sequence or by index (what ``gradient`` returns).
@@ -47,7 +47,7 @@ def jacobian(
 
 
 def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, int], Expr]:
-    """Non-zero second derivatives by (row, column), ascending; both triangles, which share their entries.
+    """Return the non-zero second derivatives by (row, column), ascending; both triangles, which share their entries.
 
     >>> from sympy.abc import x, y
     >>> hessian(x**2 * y, [x, y])
@@ -61,12 +61,12 @@ def hessian(expression: Expr, variables: Sequence[Symbol]) -> dict[tuple[int, in
 
 @lru_cache(maxsize=4)
 def _accumulation(variables: tuple[Symbol, ...]) -> _Accumulation:
-    """What is known already: momenta, forces and masses of a system are asked for again and again."""
+    """Return the shared cache for these variables, since the derivatives of a system are requested repeatedly."""
     return _Accumulation(variables)
 
 
 class _Accumulation:
-    """Partial derivatives of every node met so far, by index of the variable, zeros left out."""
+    """Cache of the non-zero partial derivatives of every visited node, by index of the variable."""
 
     def __init__(self, variables: Sequence[Symbol]) -> None:
         self.known: dict[Expr, _Gradient] = {variable: {index: S.One} for index, variable in enumerate(variables)}
@@ -91,7 +91,7 @@ class _Accumulation:
 
 
 def _combined(pairs: Sequence[tuple[Expr, _Gradient]]) -> _Gradient:
-    """Sum of factor times gradient: the chain rule."""
+    """Return the sum of factor times gradient: the chain rule."""
     parts: dict[int, list[Expr]] = {}
     for factor, slopes in pairs:
         for index, slope in slopes.items():
@@ -101,7 +101,7 @@ def _combined(pairs: Sequence[tuple[Expr, _Gradient]]) -> _Gradient:
 
 
 def _partial(node: Expr, position: int) -> Expr:
-    """Derivative of a node by its argument in ``position``, the other arguments held fixed."""
+    """Return the derivative of a node with respect to its argument in ``position``."""
     if isinstance(node, Add):
         return S.One
     if isinstance(node, Mul):

@@ -1,4 +1,4 @@
-"""Formulas read from text: a small whitelist grammar, never ``eval``, never ``sympify``.
+"""Parser for formulas: a small whitelist grammar, without ``eval`` or ``sympify``.
 
     sum      = product (("+" | "-") product)*
     product  = signed (("*" | "/") signed)*
@@ -6,10 +6,10 @@
     power    = atom ["**" ("+" | "-")* atom]
     atom     = number | name | function "(" sum ("," sum)* ")" | "(" sum ")"
 
-Precedences are Python's. A parser of its own, rather than Python's ``ast``, because ``ast`` gives up at a sum of some
-three thousand terms (a long lattice has more), counts columns in bytes, and forgets the digits of a decimal and the
-brackets of a tower of powers. Every number is exact (``0.1`` is 1/10), every node is built by a SymPy constructor, and
-sizes are checked *before* a constructor could fold a constant that fills the memory.
+Precedences are Python's. Python's ``ast`` is not used because it fails for sums of some three thousand terms (long
+lattices have more), counts columns in bytes, and loses the digits of decimals and the brackets in towers of powers.
+Every number is exact (``0.1`` is 1/10), every node is built by a SymPy constructor, and sizes are checked *before* a
+constructor could fold a constant that fills the memory.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 __all__ = ["Parser", "Token", "parse_expression", "parsed"]
 
 MAX_CHARACTERS = 1_000_000
-"""Reading takes time in proportion to the length times the depth of brackets: fifty atoms in a gas are 212 000 long."""
+"""Length limit; parsing time grows with length times bracket depth (fifty atoms in a gas: 212 000 characters)."""
 MAX_DEPTH = 100
 
 _TOKEN = re.compile(
@@ -62,7 +62,7 @@ _HINTS = {
 
 
 class Token(NamedTuple):
-    """A number, a name, an operator or the end."""
+    """Token of a formula: a number, a name, an operator or the end."""
 
     kind: str
     text: str
@@ -70,17 +70,17 @@ class Token(NamedTuple):
 
 
 def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
-    """Read one formula.
+    """Parse one formula.
 
     Args:
         text: the formula; line breaks count as spaces.
-        symbols: the names it may use. ``pi`` and the names of ``FUNCTIONS`` are known besides.
+        symbols: the names it may use, in addition to ``pi`` and the names of ``FUNCTIONS``.
 
     Returns:
         The SymPy expression, free of floating-point numbers.
 
     Raises:
-        ExpressionError: for anything outside the grammar, with the column of the offence.
+        ExpressionError: for anything outside the grammar, with its column.
 
     >>> x = Symbol("x", real=True)
     >>> parse_expression("0.5*x**2 - cos(2*x)/3", {"x": x})
@@ -90,7 +90,7 @@ def parse_expression(text: str, symbols: Mapping[str, Symbol]) -> Expr:
 
 
 def parsed(parser: Parser) -> Expr:
-    """What a parser reads, with an :class:`ExpressionError` for whatever it cannot."""
+    """Run a parser; any failure of SymPy becomes an :class:`ExpressionError`."""
     text = parser.text
     try:
         return parser.parse()
@@ -100,13 +100,13 @@ def parsed(parser: Parser) -> Expr:
         message = "the formula is nested too deeply: name a part of it, or write it as a sum"
         raise ExpressionError(message, text, parser.column) from None
     except (ArithmeticError, AttributeError, TypeError, ValueError) as error:
-        # SymPy's own failures, for instance in sqrt(1e-300 - 9) and asin(sin(1e300)).
+        # SymPy's own failures, for instance in sqrt(1e-300 - 9) and asin(sin(1e300))
         message = "SymPy cannot evaluate the constants of this formula: make them parameters"
         raise ExpressionError(message, text, parser.column) from error
 
 
 def _vanishes(part: Expr) -> bool:
-    """Whether a constant is 0; formulas are not asked, which SymPy would answer at length."""
+    """Return whether a constant is 0; formulas with symbols are not tested, which SymPy would do slowly."""
     return bool(part.is_number and part.is_zero)
 
 
@@ -128,9 +128,9 @@ def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
 
 
 class Parser:
-    """Recursive descent over the tokens; sums and products of any length are loops, only brackets recurse.
+    """Recursive-descent parser; sums and products of any length are loops, only brackets recurse.
 
-    A grammar with more kinds of atoms is a subclass, with a pattern of its tokens and an own :meth:`name`.
+    A grammar with further kinds of atoms is a subclass with its own ``pattern`` of tokens and :meth:`name`.
     """
 
     pattern: ClassVar[re.Pattern[str]] = _TOKEN
@@ -144,11 +144,11 @@ class Parser:
 
     @property
     def column(self) -> int:
-        """Where the next token stands."""
+        """Column of the next token."""
         return self.tokens[self.position].column
 
     def parse(self) -> Expr:
-        """The whole text."""
+        """Parse the whole text."""
         result = self.sum()
         if self.tokens[self.position].kind != "end":
             self.refuse_leftover()
@@ -159,11 +159,11 @@ class Parser:
         return result
 
     def refuse(self, message: str, column: int) -> NoReturn:
-        """Raise an error at a column."""
+        """Raise an :class:`ExpressionError` at a column."""
         raise ExpressionError(message, self.text, column)
 
     def refuse_leftover(self) -> NoReturn:
-        """Raise one at a token that fits nowhere."""
+        """Raise an :class:`ExpressionError` at a token that fits nowhere."""
         kind, text, column = self.tokens[self.position]
         if kind == "operator" and text == "**":
             self.refuse("a tower of powers is ambiguous: write (x**y)**z or x**(y**z)", column)
@@ -175,7 +175,7 @@ class Parser:
         self.refuse(f"an operator is missing before '{text}': {what}", column)
 
     def accept(self, *operators: str) -> Token | None:
-        """The next token if it is one of these operators."""
+        """Return and consume the next token if it is one of these operators, else ``None``."""
         token = self.tokens[self.position]
         if token.kind != "operator" or token.text not in operators:
             return None
@@ -183,19 +183,19 @@ class Parser:
         return token
 
     def close(self) -> None:
-        """The bracket that closes."""
+        """Consume a closing bracket."""
         if self.accept(")") is None:
             self.refuse_leftover()
         self.depth -= 1
 
     def open(self, column: int) -> None:
-        """One level of brackets more."""
+        """Increase the bracket depth."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             self.refuse(f"brackets are nested deeper than {MAX_DEPTH}", column)
 
     def sum(self) -> Expr:
-        """``product (("+" | "-") product)*``."""
+        """Parse ``product (("+" | "-") product)*``."""
         column, terms = self.column, [self.product(negative=False)]
         while token := self.accept("+", "-"):
             terms.append(self.product(negative=token.text == "-"))
@@ -211,13 +211,13 @@ class Parser:
         return Add(*(Mul(coefficient, rest) for rest, coefficient in coefficients.items()))
 
     def bounded(self, number: Expr, column: int) -> Expr:
-        """The number, unless it is too long."""
+        """Return the number; raise an error if it is too long."""
         if bits(number) > MAX_BITS:
             self.refuse(f"a constant grows beyond {MAX_BITS} bits here, more than any C double can hold", column)
         return number
 
     def product(self, *, negative: bool) -> Expr:
-        """``signed (("*" | "/") signed)*``."""
+        """Parse ``signed (("*" | "/") signed)*``."""
         column, coefficient, factors = self.column, S.NegativeOne if negative else S.One, []
         inverse = False
         while True:
@@ -239,18 +239,18 @@ class Parser:
         return result
 
     def sign(self) -> Expr:
-        """The product of all signs here."""
+        """Parse signs and return their product."""
         sign = S.One
         while token := self.accept("+", "-"):
             sign = -sign if token.text == "-" else sign
         return sign
 
     def signed(self) -> tuple[Expr, Expr]:
-        """Sign and power."""
+        """Parse a signed power and return sign and power."""
         return self.sign(), self.power()
 
     def power(self) -> Expr:
-        """``atom ["**" exponent]``."""
+        """Parse ``atom ["**" exponent]``."""
         column, base = self.column, self.atom()
         operator = self.accept("**")
         if operator is None:
@@ -267,7 +267,7 @@ class Parser:
         return self.supported(Pow(base, exponent), operator.column)
 
     def supported(self, result: Expr, column: int) -> Expr:
-        """Refuse what a constructor made of legal arguments: sqrt(-1), log(0), exp(10**9), sqrt(x**2) = Abs(x)."""
+        """Raise an error for invalid results of legal arguments: sqrt(-1), log(0), exp(10**9), sqrt(x**2) = Abs(x)."""
         if result.is_number or (result.args and result.func not in NODES) or result.is_Pow:
             problem = unsupported_part(result)
             if problem:
@@ -275,7 +275,7 @@ class Parser:
         return result
 
     def atom(self) -> Expr:
-        """A number, a name, a call or a bracket."""
+        """Parse a number, a name, a call or a bracket."""
         kind, text, column = self.tokens[self.position]
         if kind == "end":
             self.refuse(
@@ -294,12 +294,12 @@ class Parser:
         return result
 
     def number(self, text: str, column: int) -> Expr:
-        """The exact value of a number."""
+        """Return the exact value of a number."""
         following = self.tokens[self.position]
         if following.kind == "name" and following.text in ("j", "J") and following.column == column + len(text):
             self.refuse("complex numbers are not part of the grammar", column)
         mantissa, _, exponent = text.lower().partition("e")
-        whole = text.isdigit()  # perhaps half of a fraction, which may be longer
+        whole = text.isdigit()  # an integer, perhaps the numerator of a fraction, may be longer
         if len(mantissa) > (MAX_DIGITS if whole else 320) or len(exponent) > 8 or abs(int(exponent or 0)) > 640:
             self.refuse("this number has too many digits: a C double ends at 1.8e308", column)
         value = Rational(text)
@@ -308,7 +308,7 @@ class Parser:
         return self.bounded(value, column)
 
     def name(self, name: str, column: int) -> Expr:
-        """The symbol, or the value, of a name."""
+        """Return the symbol, constant or function call of a name."""
         if name in FUNCTIONS:
             return self.call(name, column)
         if self.tokens[self.position][:2] == ("operator", "("):
@@ -322,7 +322,7 @@ class Parser:
         return value
 
     def call(self, name: str, column: int) -> Expr:
-        """A function of its arguments."""
+        """Parse a function call."""
         opening = self.accept("(")
         if opening is None:
             self.refuse(f"'{name}' is a function: write {name}(...)", column)

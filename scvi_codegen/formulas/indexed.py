@@ -1,10 +1,10 @@
-"""Sums over indices read from text: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
+"""Parser for indexed formulas: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
 
     L     = a sum of  [factor "*"] "sum" "(" loop ("," loop)* "," formula ")"  and of formulas without a sum
-    atom  = .. | array "[" place ("," place)* "]"
+    atom  = .. | array "[" index ("," index)* "]"
 
-Loops and places are those of :mod:`scvi_codegen.indices`. A sum within a sum has bounds that are whole
-numbers, and is written out: ``sum(k in 3, r_dot[i, k]**2)``.
+Loops and indices are those of :mod:`scvi_codegen.indices`. A sum within a sum must have integer bounds, and is
+unrolled: ``sum(k in 3, r_dot[i, k]**2)``.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _TOKEN = re.compile(
     re.ASCII,
 )
 MOST_WRITTEN_OUT, MOST_NESTED = 64, 4096
-"""Terms of a sum within a sum, and of all such sums within each other."""
+"""Maximum number of terms of one sum within a sum, and of all such nested sums."""
 
 Bound: TypeAlias = Loop | int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedTerm:
-    """A formula summed over loops; every access of an array in it is a symbol named as it is written.
+    """Formula summed over loops; every array access in it is a symbol named as it is written.
 
     Attributes:
-        loops: outermost first; none of a formula that stands outside of sums.
-        formula: in the symbols of ``slots`` and what else it was given.
+        loops: outermost first; empty for a formula outside of sums.
+        formula: in the symbols of ``slots``, parameters and time.
         slots: symbol and access of each array entry that occurs, in alphabetical order.
     """
 
@@ -56,7 +56,7 @@ class IndexedTerm:
 
 
 def parse_array(text: str) -> Array:
-    """A declaration, ``"q[N]"``.
+    """Parse the declaration of an array, ``"q[N]"``.
 
     Raises:
         ExpressionError: for other text.
@@ -67,19 +67,19 @@ def parse_array(text: str) -> Array:
 def parse_indexed(
     text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
 ) -> tuple[IndexedTerm, ...]:
-    """Read a sum of sums.
+    """Parse a sum of sums.
 
     Args:
         text: the formula.
-        arrays: those whose entries it may use: coordinates, their velocities, parameters.
-        symbols: what else it may use.
-        tables: arrays of places.
+        arrays: arrays whose entries may occur: coordinates, their velocities, parameters.
+        symbols: other symbols that may occur, by name.
+        tables: index tables.
 
     Returns:
-        Its terms, those over the same loops as one.
+        Its terms, with one term per distinct tuple of loops.
 
     Raises:
-        ExpressionError: for anything outside the grammar, and for an index that leaves its array.
+        ExpressionError: for anything outside the grammar, and for an index outside its array.
 
     >>> q = parse_array("q[N]")
     >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
@@ -100,13 +100,13 @@ def parse_indexed(
 
 
 def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
-    """A formula over loops, with those accesses that occur in it."""
+    """Return the term of a formula over loops, with the accesses that occur in it."""
     found = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
     return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in found))
 
 
 class _Indices(Parser):
-    """What declarations and sums have in common: brackets, sizes, whole numbers."""
+    """Parser elements shared by declarations and sums: brackets, sizes, whole numbers."""
 
     pattern = _TOKEN
 
@@ -136,14 +136,14 @@ class _Indices(Parser):
         return int(token.text)
 
     def offset(self) -> int:
-        """``(+|-) whole number``, as often as there are such."""
+        """Parse ``(+|-) whole number``, repeated, and return the sum."""
         total = 0
         while sign := self.accept("+", "-"):
             total += self.whole_number() * (-1 if sign.text == "-" else 1)
         return total
 
     def size(self) -> Size:
-        """A name, a whole number, or both."""
+        """Parse a size: a name, a whole number, or both."""
         if self.peek().kind == "name":
             name = self.take_name("a size").text
             return Size(name, self.offset())
@@ -178,7 +178,7 @@ class _Declaration(_Indices):
 
 
 class IndexedParser(_Indices):
-    """Formulas with entries of arrays, and sums."""
+    """Parser for formulas with array entries and sums."""
 
     def __init__(
         self, text: str, symbols: Mapping[str, Symbol], arrays: Sequence[Array], tables: Sequence[Array]
@@ -192,7 +192,7 @@ class IndexedParser(_Indices):
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
 
     def name(self, name: str, column: int) -> Expr:
-        """A name: of a sum, of an entry, or as in every formula."""
+        """Parse a sum, an array entry, or a name of the scalar grammar."""
         if name == "sum" and self.peek().text == "(":
             return self.summed(column)
         if name in self.arrays:
@@ -208,7 +208,7 @@ class IndexedParser(_Indices):
         return super().name(name, column)
 
     def summed(self, column: int) -> Expr:
-        """``sum(loops, formula)``, with ``sum`` read."""
+        """Parse ``sum(loops, formula)`` after ``sum``."""
         self.open(column)
         self.expect("(")
         loops = self.loop()
@@ -228,13 +228,13 @@ class IndexedParser(_Indices):
         return placeholder
 
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
-        """Its bracket, behind which its indices are free again."""
+        """Parse the closing bracket of a sum and release its indices."""
         for loop in loops:
             del self.bound[loop.index]
         self.close()
 
     def written_out(self, loops: Sequence[Loop], column: int) -> Expr:
-        """A sum whose bounds are whole numbers: the formula is read once for each."""
+        """Unroll a sum with integer bounds: its formula is parsed once per value of the indices."""
         if any(loop.first.name or loop.end.name for loop in loops):
             message = (
                 "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
@@ -267,7 +267,7 @@ class IndexedParser(_Indices):
         return Add(*formulas)
 
     def loop(self) -> list[Loop]:
-        """``i in N``; two of a pair."""
+        """Parse a loop ``i in N``, or a pair of loops ``i < j in N``."""
         first = self.take_name("an index")
         pair = self.take_name("an index") if self.accept("<") else None
         for token in (first, *([pair] if pair else [])):
@@ -291,7 +291,7 @@ class IndexedParser(_Indices):
         return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
 
     def check_index(self, token: Token) -> None:
-        """Refuse a name that means something."""
+        """Raise an error for an index name that is already in use."""
         try:
             check_name(token.text)
         except SystemDefinitionError as error:
@@ -302,7 +302,7 @@ class IndexedParser(_Indices):
             self.refuse(f"'{token.text}' has a meaning: choose another index", token.column)
 
     def entry(self, array: Array, column: int) -> Expr:
-        """``[places]``, with the name of the array read."""
+        """Parse ``[indices]`` after the name of an array."""
         if self.peek().text != "[":
             self.refuse(f"'{array.name}' is an array: write {array}", column)
         places = self.brackets(array, column)
@@ -312,7 +312,7 @@ class IndexedParser(_Indices):
         return slot
 
     def brackets(self, array: Array, column: int) -> tuple[Place, ...]:
-        """The places of an entry, each on its axis."""
+        """Parse the indices of an entry, and check each against its axis."""
         self.expect("[")
         places = [self.place()]
         while self.accept(","):
@@ -328,7 +328,7 @@ class IndexedParser(_Indices):
         return tuple(places)
 
     def place(self) -> Place:
-        """Where an axis is accessed."""
+        """Parse one index of an array entry."""
         token = self.peek()
         if token.kind != "name":
             return Place(base=self.size())
@@ -347,7 +347,7 @@ class IndexedParser(_Indices):
         return Place(index=token.text, base=Size("", self.offset()))
 
     def entry_of_table(self) -> Place:
-        """``bonds[b, 0]``."""
+        """Parse the entry of an index table, ``bonds[b, 0]``."""
         token = self.take_name("a table")
         table = self.tables[token.text]
         row, *columns = self.brackets(table, token.column)
@@ -357,7 +357,7 @@ class IndexedParser(_Indices):
         return Place(index=row.index, table=table.name, column=columns[0].base.number)
 
     def leaves(self, place: Place, axis: Size) -> str:
-        """Why a place is not on an axis; nothing where it is, or where that depends on sizes with other names."""
+        """Return why an index is outside an axis; empty if it is inside, or if that depends on other sizes."""
         base = place.base
         if place.table:
             return ""

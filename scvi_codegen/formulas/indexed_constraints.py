@@ -1,8 +1,8 @@
-"""Constraints on arrays read from text: an equation, and the loops whose every element has one.
+"""Parser for constraints of indexed systems: an equation, and loops over the elements for which it holds.
 
 constraint = sum ["=" sum] ["for" loop ("," loop)*]      (r[b+1] - r[b])**2 = l[b]**2 for b in 0..N-2
 
-Loops and places are those of :mod:`scvi_codegen.indices`.
+Loops and indices are those of :mod:`scvi_codegen.indices`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _FOR = re.compile(r"\bfor\b")
 def parse_constraint(
     text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
 ) -> IndexedTerm:
-    """Read g = 0 for all elements of loops; of ``left = right`` g is left - right.
+    """Parse a constraint g = 0 for all elements of loops; for ``left = right`` g is left - right.
 
     Args:
         text: the constraint.
         arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.indexed.parse_indexed`.
 
     Raises:
-        ExpressionError: as there, and for a sum over a whole array, which would bind all of its entries together.
+        ExpressionError: as there, and for a sum over a whole array, which would couple all of its entries.
 
     >>> from scvi_codegen.formulas.indexed import parse_array
     >>> term = parse_constraint("(q[i+1] - q[i])**2 = 1 for i in 0..N-2", [parse_array("q[N]")], {})
@@ -57,10 +57,10 @@ def parse_constraint(
 
 
 class _Loops(IndexedParser):
-    """``b in B, k in 0..N-2``, alone."""
+    """Parser for loops alone, ``b in B, k in 0..N-2``."""
 
     def read(self) -> list[Loop]:
-        """All of them."""
+        """Parse all loops."""
         found = self.loop()
         self.bound |= {loop.index: loop for loop in found}
         while self.accept(","):

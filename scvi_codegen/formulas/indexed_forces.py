@@ -1,4 +1,4 @@
-"""Forces on arrays read from text: at all places of an axis, at a single one, at those in a table.
+"""Parser for forces of indexed systems: on all entries along an axis, on a single one, or on those in a table.
 
 target   = array "[" (index | size | whole number | entry) ("," ..)* "]"        q[i], r[i, a], q[0], q[N-1]
 entry    = table "[" index ("," whole number)? "]"                            q[pins[p]], r[bonds[b, 1], a]
@@ -23,8 +23,8 @@ class IndexedForce:
     """Forces over loops.
 
     Attributes:
-        loops, slots: as of :class:`IndexedTerm`, of all formulas.
-        targets: the coordinate that each acts on, and its formula.
+        loops, slots: as of :class:`IndexedTerm`, common to all formulas.
+        targets: coordinates on which forces act, each with its formula.
     """
 
     loops: tuple[Loop, ...]
@@ -44,10 +44,10 @@ def parse_force(
     symbols: Mapping[str, Symbol],
     tables: Sequence[Array] = (),
 ) -> tuple[IndexedForce, ...]:
-    """Read the force on ``q[i]``, every place of an axis, on a single place, ``q[0]``, or on those of a table.
+    """Parse the force on ``q[i]`` for all i along an axis, on a single entry, ``q[0]``, or on those of a table.
 
     Args:
-        target: what it acts on.
+        target: the coordinate that it acts on.
         text: its formula, in the indices of the target.
         coordinates: arrays of the target.
         arrays, symbols, tables: as of :func:`parse_indexed`.
@@ -79,10 +79,10 @@ def parse_force(
 
 
 class _Target(IndexedParser):
-    """An entry of an array whose indices run over whole axes."""
+    """Parser for the target of a force: an array entry whose indices run over whole axes."""
 
     def read(self) -> dict[str, Size]:
-        """The axis of each index."""
+        """Return the axis of each index."""
         token = self.take_name("an array of coordinates")
         if token.text not in self.arrays:
             known = ", ".join(map(str, self.arrays.values()))
@@ -103,7 +103,7 @@ class _Target(IndexedParser):
         return bounds
 
     def row(self, table: Array, bounds: dict[str, Size]) -> None:
-        """``[b, 0]`` of a table, whose rows are those of a loop."""
+        """Parse ``[b, 0]`` of a table; b runs over its rows."""
         self.expect("[")
         self.index_along(table.axes[0], bounds)
         if self.accept(","):
@@ -111,7 +111,7 @@ class _Target(IndexedParser):
         self.expect("]")
 
     def index_along(self, axis: Size, bounds: dict[str, Size]) -> None:
-        """An index of its own along an axis."""
+        """Parse an index of its own along an axis."""
         place = self.peek()
         self.check_index(place)
         if place.text in bounds:

@@ -1,4 +1,4 @@
-"""Sums over indices as a mathematician writes them."""
+"""LaTeX of indexed formulas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["latex_entry", "latex_sum", "latex_sums"]
 
 
 def latex_sum(term: IndexedTerm) -> str:
-    r"""A term in LaTeX.
+    r"""Return a term in LaTeX.
 
     >>> from scvi_codegen.formulas.indexed import parse_array, parse_indexed
     >>> (term,) = parse_indexed("sum(i in 0..N-2, (q[i+1] - q[i])**2/2)", [parse_array("q[N]")], {})
@@ -25,7 +25,7 @@ def latex_sum(term: IndexedTerm) -> str:
 
 
 def latex_sums(term: IndexedTerm) -> str:
-    """Its sums alone."""
+    """Return the summation signs of a term alone."""
     pairs = {loop.behind for loop in term.loops}
     return " ".join(_sum(loop) for loop in term.loops if loop.index not in pairs)
 
@@ -39,7 +39,7 @@ def _sum(loop: Loop) -> str:
 
 
 def latex_entry(access: Access) -> str:
-    """An entry of an array, its places as indices."""
+    """Return an array entry with subscripts."""
     name = access.array.name
     letter = rf"\dot{{{_letter(name.removesuffix(DOT))}}}" if name.endswith(DOT) else _letter(name)
     return f"{letter}_{{{', '.join(map(_place, access.places))}}}"

@@ -1,7 +1,7 @@
-"""SymPy's ``Sum`` and ``Indexed`` as text of the grammar of sums over indices.
+"""Conversion of SymPy's ``Sum`` and ``Indexed`` to text of the grammar of indexed formulas.
 
-SymPy itself is asked for nothing: its derivatives of sums over indices are wrong in places (bound letters that occur
-twice, functions of indices), so a sum is read term by term, as it stands.
+SymPy's own derivatives of such sums are not used, as they are sometimes wrong (repeated bound symbols, functions of
+indices); a sum is read term by term.
 
     Sum(f, (i, 0, N - 1))                           sum(i in 0..N-1, f)
     Sum(f, (i, 0, N - 1)) with q[Mod(i + 1, N)]     sum(i in N periodic, f)
@@ -21,10 +21,10 @@ __all__ = ["indexed_text"]
 
 
 def indexed_text(expression: Expr) -> str:
-    """The text of a sum of sums.
+    """Return the text of a sum of sums.
 
     Raises:
-        SystemDefinitionError: for limits that are none of the above.
+        SystemDefinitionError: for other limits than those above.
 
     >>> from sympy import IndexedBase, symbols
     >>> q, (i, N) = IndexedBase("q"), symbols("i N", integer=True)
@@ -55,7 +55,7 @@ class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
-    """The index of a place on a ring, and the length of the ring."""
+    """Return the index in a periodic expression Mod(i + k, N), and the period."""
     place, length = expression.args
     indices = [each for each in place.free_symbols if each not in length.free_symbols]
     if len(indices) != 1 or not (place - indices[0]).is_Integer:
@@ -64,7 +64,7 @@ def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
 
 
 def _loops(limits: Sequence[Tuple], wrapped: Mapping[Symbol, Expr]) -> list[str]:
-    """The loops of a sum, outermost first; an index that begins behind another is the second of a pair."""
+    """Return the loops of a sum, outermost first; an index that begins at another plus 1 is the second of a pair."""
     if any(len(limit) != 3 for limit in limits):
         raise SystemDefinitionError(f"a sum has an index and two bounds, as (i, 0, N - 1), not {limits}")
     spans = {index: (first, last) for index, first, last in reversed(limits)}

@@ -1,11 +1,11 @@
-"""Inputs: functions of time that are data, such as the force of a motor or a measured ground motion.
+"""Inputs: functions of time passed to runs as data, such as a motor force or a measured ground motion.
 
 Between two breakpoints an input u is a cubic of the time since the first of them,
 
     u(t) = u_0 + u_1 s + u_2 s^2 + u_3 s^3,        s = t - u_t,
 
-with five parameters of the system. A run changes them at the breakpoints, where it ends a step: nothing is compiled
-anew for other data, every method and solver takes them, and steps never see a kink, so that orders are kept.
+with five parameters of the system. A run updates them at the breakpoints, which are ends of steps: other data need no
+recompilation, every method and solver supports them, and no step contains a breakpoint, so orders are preserved.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from scvi_codegen.formulas.symbols import check_name, symbol
 __all__ = ["PARTS", "input_formulas", "input_parameters", "inputs_by_name", "with_inputs"]
 
 PARTS = ("0", "1", "2", "3", "t")
-"""Of an input: coefficients by power, and the breakpoint that they count from."""
+"""Suffixes of the five parameters of an input: coefficients by power, and the breakpoint."""
 
 
 def input_parameters(inputs: Sequence[str]) -> dict[str, float]:
-    """The parameters of all inputs, each of which is 0 until it is given."""
+    """Return the parameters of all inputs, with default value 0."""
     for name in inputs:
         check_name(name)
     return {f"{name}_{part}": 0.0 for name in inputs for part in PARTS}
 
 
 def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[str, float]:
-    """Default values of parameters, and of those that inputs are made of.
+    """Return the default values of parameters, including those of inputs.
 
     Raises:
-        SystemDefinitionError: for a parameter that is called as a part of an input.
+        SystemDefinitionError: if a parameter has the name of an input's parameter.
     """
     parts = input_parameters(inputs)
     for name in parameters:
@@ -46,7 +46,7 @@ def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[
 
 
 def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]:
-    """What stands for each input in formulas, by its own symbol."""
+    """Return the cubic polynomial of each input, by its symbol."""
     found: dict[Symbol, Expr] = {}
     for name in inputs:
         c0, c1, c2, c3, start = (symbol(f"{name}_{part}") for part in PARTS)
@@ -56,6 +56,6 @@ def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]
 
 
 def inputs_by_name(formula: Expr, inputs: Sequence[str]) -> Expr:
-    """A formula with each input as its own symbol again: its first coefficient, the others being 0."""
+    """Return a formula with each input's polynomial replaced by its symbol (coefficient 0; others set to 0)."""
     own: dict[Basic, Basic] = {symbol(part): Integer(0) for part in input_parameters(inputs)}
     return formula.xreplace(own | {symbol(f"{name}_0"): symbol(name) for name in inputs})

@@ -1,4 +1,4 @@
-"""Values of a formula at many places at once, by NumPy, part by part: nothing is printed as code and run."""
+"""Vectorised evaluation of formulas by NumPy, node by node, without generated code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["on_arrays"]
 
 
 def on_arrays(formula: Expr, known: Mapping[Expr, Any]) -> Any:
-    """The value, of the common shape of the arrays that stand for symbols.
+    """Return the values of a formula, with the broadcast shape of the arrays in ``known``.
 
     Args:
         formula: of :mod:`scvi_codegen.formulas.grammar`.

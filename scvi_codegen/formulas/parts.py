@@ -1,4 +1,4 @@
-"""Expressions by their shared parts, and keys of caches made from every field of what describes a system."""
+"""Subexpressions, and cache keys that contain every field of a system's description."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["identity", "key_of", "parts"]
 
 
 def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
-    """All that occurs in expressions, themselves first."""
+    """Return all distinct subexpressions, beginning with the expressions themselves."""
     found = dict.fromkeys(expressions)
     waiting = list(expressions)
     while waiting:
@@ -23,10 +23,10 @@ def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
 
 
 def identity(expression: sympy.Basic) -> str:
-    """An expression as text that tells it from every other.
+    """Return text that identifies an expression uniquely.
 
-    A part stands behind its own parts, which it names by their lines. They stand as SymPy keeps them, the same in
-    every process; ``sympy.srepr`` sorts them anew, which takes longer than to differentiate a sum of thousands.
+    Each line is a subexpression that refers to its arguments by line numbers. Arguments are in SymPy's order, the same
+    in all processes; ``sympy.srepr`` sorts them again, which takes longer than to differentiate a sum of thousands.
 
     >>> from sympy.abc import x
     >>> print(identity((x + 1)**2))
@@ -51,13 +51,13 @@ def identity(expression: sympy.Basic) -> str:
 
 
 def key_of(value: Any) -> str:
-    """Return text that differs for values that differ: a dataclass by its type and every one of its fields.
+    """Return text that differs for different values: a dataclass by its type and all of its fields.
 
-    Keys of caches are made of it, so that a new field cannot be forgotten. Fields that do not take part in comparisons
-    are included.
+    Cache keys are made from it, so that a new field cannot be forgotten. Fields excluded from comparisons are
+    included.
 
     Raises:
-        TypeError: for a value that is none of: a dataclass, expression, number, text, ``None``, sequence or mapping.
+        TypeError: for a value that is no dataclass, expression, number, text, ``None``, sequence or mapping.
 
     >>> key_of((1, 1.0, "1", None))
     "(1, 1.0, '1', None)"

@@ -1,4 +1,4 @@
-"""Values of sums over indices at all their elements, by NumPy."""
+"""Evaluation of indexed sums at all their elements, by NumPy."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from scvi_codegen.indices import Access, Loop, Place
 __all__ = ["Elements"]
 
 MOST_ELEMENTS = 5_000_000
-"""Of the loops of a term, at once in NumPy."""
+"""Maximum number of elements of the loops of a term that are evaluated at once."""
 
 
 class Elements:
-    """All values of the indices of loops, as arrays.
+    """Index values of all elements of loops, as arrays.
 
     Args:
         loops: of a term.
         sizes: value of each size.
-        tables: places by name.
+        tables: index tables by name.
 
     Raises:
-        StateError: where they are too many.
+        StateError: if there are more than ``MOST_ELEMENTS``.
     """
 
     def __init__(self, loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, NDArray[Any]]) -> None:
@@ -51,7 +51,7 @@ class Elements:
             )
 
     def of(self, access: Access) -> tuple[Any, ...]:
-        """Where an access stands."""
+        """Return the indices of an access at all elements, one array or number per axis."""
         return tuple(self._place(place) for place in access.places)
 
     def _place(self, place: Place) -> Any:
@@ -69,13 +69,13 @@ class Elements:
         arrays: Mapping[str, NDArray[np.float64]],
         numbers: Mapping[Expr, float],
     ) -> Any:
-        """Of a formula, at every element.
+        """Return the values of a formula at every element.
 
         Args:
             formula: in the symbols of slots and numbers.
-            slots: symbol and access of each entry of an array.
-            arrays: by name.
-            numbers: by symbol.
+            slots: symbol and access of each array entry.
+            arrays: arrays by name.
+            numbers: values by symbol.
         """
         known: dict[Expr, Any] = {slot: arrays[access.array.name][self.of(access)] for slot, access in slots}
         found = on_arrays(formula, {**known, **numbers})

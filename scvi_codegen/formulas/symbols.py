@@ -1,11 +1,11 @@
-r"""Names of coordinates, velocities, momenta and parameters: which are fit, and how a user's become ours.
+r"""Names of coordinates, velocities, momenta and parameters: validation, and conversion to canonical symbols.
 
 Every symbol is ``Symbol(name, real=True)`` with a plain identifier as name: coordinate ``q`` has the velocity
-``q_dot``, time is ``t``. Names given by the user are mapped as follows.
+``q_dot``, time is ``t``. Names chosen by the user are converted as follows.
 
 * ``\theta_1``, ``\theta_{1}`` and ``θ_1`` become ``theta_1``; spaces become underscores.
-* Refused, with the name: what is no identifier even then, keywords of C, functions and constants of the grammar,
-  ``t`` for anything but time, ``q_dot`` for anything but the velocity of ``q``, two symbols that end up the same.
+* Rejected, with the name: invalid identifiers after this conversion, keywords of C, functions and constants of the
+  grammar, ``t`` for anything but time, ``q_dot`` for anything but the velocity of ``q``, two symbols of equal names.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ DOT = "_dot"
 
 
 def symbol(name: str) -> Symbol:
-    """The real symbol of that name."""
+    """Return the real symbol of that name."""
     return Symbol(name, real=True)
 
 
 def number(name: str, value: Any) -> float:
-    """Convert a default value; text and complex numbers are refused, not converted."""
+    """Convert a default value to float; text, complex and non-finite numbers are rejected."""
     try:
         converted = math.nan if isinstance(value, (str, bytes, complex)) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -54,7 +54,7 @@ def number(name: str, value: Any) -> float:
 
 
 def identifier(name: str) -> str:
-    r"""Spell a name with letters, digits and underscores where that is harmless: ``\theta_{1}`` -> ``theta_1``."""
+    r"""Convert a name to letters, digits and underscores where possible: ``\theta_{1}`` -> ``theta_1``."""
     spelled = "".join(_letter(character) for character in name.strip())
     return re.sub(r"\s+", "_", spelled.replace("{", "").replace("}", "").replace("\\", ""))
 
@@ -68,7 +68,7 @@ def _letter(character: str) -> str:
 
 
 def given_name(key: object) -> str:
-    """The name of a parameter given as a symbol, as a function of time or as text."""
+    """Return the name of a parameter that is a symbol, a function of time or text."""
     if isinstance(key, (Symbol, AppliedUndef)):
         return str(key.name)
     if isinstance(key, str):
@@ -77,7 +77,7 @@ def given_name(key: object) -> str:
 
 
 def check_name(name: object) -> None:
-    """Raise :class:`SystemDefinitionError` for what cannot be a name in C and in formulas."""
+    """Raise :class:`SystemDefinitionError` for names that are invalid in C or in formulas."""
     if not isinstance(name, str) or not IDENTIFIER.fullmatch(name):
         arrays = "; arrays are those of IndexedSystem" if isinstance(name, str) and "[" in name else ""
         raise SystemDefinitionError(
@@ -90,7 +90,7 @@ def check_name(name: object) -> None:
 
 
 def check_names(coordinates: Sequence[str], parameters: Sequence[str], momenta: Sequence[str] = ()) -> None:
-    """The same for all names of a system, and for one name in two roles."""
+    """Raise :class:`SystemDefinitionError` for invalid names of a system, and for one name in two roles."""
     if not coordinates:
         raise SystemDefinitionError("a system needs at least one coordinate: coordinates is empty")
     roles: dict[str, str] = {TIME: "time"}

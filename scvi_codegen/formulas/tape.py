@@ -1,4 +1,4 @@
-"""Values of expressions in 60 digits, as straight-line arithmetic: each part once, without a walk through trees."""
+"""Evaluation of expressions in 60 digits by straight-line programs, each subexpression once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONSTANTS = {sympy.S.Pi: mp.mpf(mp.pi), sympy.S.Exp1: mp.mpf(mp.e)}
 
 
 class Tape:
-    """Several expressions as functions of the same symbols.
+    """Straight-line program of several expressions in the same symbols.
 
     Args:
         expressions: of the grammar of :mod:`~scvi_codegen.formulas.grammar`.
@@ -33,10 +33,10 @@ class Tape:
         self._results = [self._place(expression) for expression in expressions]
 
     def __call__(self, numbers: Sequence[Number]) -> list[Number]:
-        """The values at a point.
+        """Return the values at a point.
 
         Raises:
-            ArithmeticError: where one is not real or not within the range of a C double.
+            ArithmeticError: if a value is not real or not within the range of a C double.
         """
         values = [*numbers, *self._start[len(numbers) :]]
         try:
@@ -50,7 +50,7 @@ class Tape:
         return found
 
     def _place(self, expression: sympy.Expr) -> int:
-        """Where the value of an expression stands."""
+        """Return the index of an expression's value, appending the operations that compute it."""
         if expression in self._places:
             return self._places[expression]
         if expression.args:
@@ -93,14 +93,14 @@ def _constant(expression: Any) -> Number:
 
 
 def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Number]) -> Number:
-    """Value of an expression at one point, in 60 digits.
+    """Return the value of an expression at one point, in 60 digits.
 
     Args:
         expression: of the grammar.
         values: a number for each of its symbols.
 
     Raises:
-        ArithmeticError: if the value, or that of a part, is not real or not within the range of a C double.
+        ArithmeticError: if the value, or that of a subexpression, is not real or exceeds the range of a C double.
     """
     try:
         return Tape(list(parts(expression)), list(values))(list(map(mp.mpf, values.values())))[0]

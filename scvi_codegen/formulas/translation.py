@@ -1,4 +1,4 @@
-"""From SymPy as users write it, with functions of time and derivatives, to the canonical symbols of a system."""
+"""Translation of SymPy expressions, with functions of time and derivatives, to the canonical symbols of a system."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["Translation", "given_expression"]
 
 
 def given_expression(value: Any, what: str) -> Expr:
-    """A SymPy expression, or a number as one.
+    """Return a SymPy expression; numbers are converted.
 
     Raises:
-        SystemDefinitionError: for anything else; text would be read in names of SymPy's, where E is 2.718..
+        SystemDefinitionError: for anything else; text would be read with SymPy's names, where E is 2.718..
     """
     try:
         expression = sympy.sympify(value, strict=True)
@@ -34,19 +34,19 @@ def given_expression(value: Any, what: str) -> Expr:
 
 
 class Translation:
-    """The map from a user's symbols, functions of time and derivatives to canonical symbols.
+    """Map from a user's symbols, functions of time and derivatives to canonical symbols.
 
     Args:
-        expression: what is translated; its symbols get their names from this.
+        expression: main expression to translate.
         coordinates: symbols or functions of time.
-        others: what is translated, too.
+        others: further expressions to translate.
         velocities, momenta: parallel to the coordinates.
-        time: the symbol for it.
+        time: symbol of time.
         parameters, inputs: names, also of functions of time.
 
     Attributes:
         coordinates, momenta, parameters: canonical symbols.
-        rules: from what the user writes to symbols.
+        rules: canonical symbols by the user's expressions.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Translation:
                 self._add(free, identifier(free.name))
 
     def apply(self, expression: Expr, what: str = "Lagrangian") -> Expr:
-        """The expression in canonical symbols, its numbers exact."""
+        """Return the expression in canonical symbols, with exact numbers."""
         unfolded = {derivative: derivative.doit() for derivative in expression.atoms(sympy.Derivative)}
         result = evaluated(expression.xreplace(unfolded), self.rules)
         leftover = sorted(result.atoms(sympy.Derivative) or result.atoms(AppliedUndef), key=str)
@@ -139,7 +139,7 @@ class Translation:
                     self._add(free, name)
 
     def _given_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
-        """Functions of time alone that are called as a parameter or an input is."""
+        """Add the functions of time that have the name of a parameter or an input."""
         found = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
         for function in sorted(found, key=str):
             if function.func.__name__ in names and function.args == (self.user_time,):

@@ -1,4 +1,4 @@
-"""The functions and constants of the grammar by name, and how a part of a formula is quoted in a message."""
+"""Functions and constants of the grammar by name, and quotation of subexpressions in messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sympy import Expr, S
 __all__ = ["CONSTANTS", "FUNCTIONS", "LARGEST", "NAME_OF", "shortened"]
 
 LARGEST = 1.7976931348623157e308
-"""The largest double."""
+"""Largest finite C double."""
 
 FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
     function.__name__: function
@@ -21,13 +21,13 @@ FUNCTIONS: Mapping[str, Callable[..., Expr]] = {
         *(sympy.exp, sympy.log, sympy.sqrt),
     )
 }
-"""The functions of the grammar by name; all take one argument, ``atan2`` two."""
+"""Functions of the grammar by name; all take one argument, ``atan2`` two."""
 
 NAME_OF = {function: name for name, function in FUNCTIONS.items() if isinstance(function, type)}
 CONSTANTS = {"pi": S.Pi}
 
 
 def shortened(node: Any) -> str:
-    """The text of a part, cut to 60 characters."""
+    """Return the text of an expression, cut to 60 characters."""
     text = str(node)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,4 @@
-"""Expressions written as text of the grammar of :mod:`scvi_codegen.formulas.grammar`."""
+"""Printer for expressions: text of the grammar of :mod:`scvi_codegen.formulas.grammar`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["format_expression"]
 
 
 def format_expression(expression: Expr) -> str:
-    """Write an expression as text of this grammar, so that ``parse_expression`` gives it back, node by node.
+    """Return an expression as text of the grammar, from which ``parse_expression`` rebuilds it node by node.
 
     The expression is taken as SymPy's constructors leave it; one built with ``evaluate=False`` comes back evaluated.
 
     Raises:
-        SystemDefinitionError: for a part the grammar does not have.
+        SystemDefinitionError: for an expression outside the grammar.
 
     >>> x, y = sympy.symbols("x y", real=True)
     >>> format_expression(sympy.sqrt(x) / (3 * y) - sympy.exp(-y))
@@ -49,7 +49,7 @@ def _product_text(expression: Expr) -> str:
     text = ("-" if coefficient < 0 else "") + "*".join(above)
     if len(divisors) < 2:
         return text + "".join(f"/{divisor}" for divisor in divisors)
-    # A rational alone with a sum in brackets would be multiplied out when read: divide by one after the other.
+    # A rational factor in front of a sum in brackets would be expanded by the parser: divide factor by factor.
     return (
         f"{text}/{'/'.join(divisors)}"
         if any(factor.base.is_Add for factor in below)

@@ -1,1 +1,1 @@
-"""What callers give: kinds of arguments, whole numbers and keywords, refused by name before anything is done."""
+"""Validation of arguments: types, integers and keywords, with errors that name the argument."""

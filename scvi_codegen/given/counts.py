@@ -1,4 +1,4 @@
-"""Checks of whole numbers (degrees, points, steps, threads) and of the tolerance of adaptive steps."""
+"""Validation of integers (degrees, points, steps, threads) and of the tolerance of adaptive steps."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from scvi_codegen.errors import ScviCodegenError, StateError
 __all__ = ["LARGEST_COUNT", "check_tolerance", "checked_count"]
 
 LARGEST_COUNT = 2**53 - 1
-"""Up to here a binary64 holds every whole number."""
+"""Largest integer below which binary64 represents every integer."""
 
 
 def check_tolerance(value: float, error: type[ScviCodegenError] = StateError) -> None:
-    """Refuse a tolerance of adaptive steps that is not positive and below 1."""
+    """Raise an error unless the tolerance of adaptive steps is positive and below 1."""
     if not 0.0 < value < 1.0:
         raise error(
             f"the tolerance must be positive and below 1 (relative error of each step), not {value:g}: leave it out "
@@ -25,7 +25,7 @@ def check_tolerance(value: float, error: type[ScviCodegenError] = StateError) ->
 def checked_count(
     value: Any, name: str, *, least: int, most: int = LARGEST_COUNT, error: type[ScviCodegenError] = StateError
 ) -> int:
-    """The value as an int from ``least`` to ``most``, or an error that names it; truth values are no numbers."""
+    """Return the value as an int from ``least`` to ``most``, or raise an error that names it; booleans are rejected."""
     try:
         count = operator.index(value)
     except TypeError:

@@ -1,4 +1,4 @@
-"""What a keyword that a function does not have may have been meant to say."""
+"""Suggestions for keyword arguments that a function does not have."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ ELSEWHERE: Final = {
     "solver": "it is chosen where a stepper is compiled: compile_stepper(system, method, solver=...)",
     "method": "the method is said where it is compiled: compile_stepper(system, method)",
 }
-"""By the keyword, where it is said, for functions that do not have it."""
+"""Explanations by keyword, for functions that do not have it."""
 
 
 def keyword_meant(name: str, known: Collection[str]) -> str:
-    """``"; did you mean 'h'?"``, or ``": "`` and where it is said, or what it takes.
+    """Return ``"; did you mean 'h'?"``, or ``": "`` and an explanation, or the list of keywords.
 
     Args:
         name: a keyword that the function does not have.
-        known: those that it has.
+        known: keywords that it has.
     """
     if here := same_here(name, known):
         return here

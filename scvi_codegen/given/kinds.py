@@ -1,6 +1,6 @@
-"""What kinds of things public functions take: the wrong kind is refused by name, before anything is done.
+"""Type checks of the arguments of public functions, with errors that name the argument.
 
-Numbers and arrays, which may come as whatever converts to them, are checked where they are converted
+Numbers and arrays, which may be anything convertible, are checked when they are converted
 (:mod:`scvi_codegen.native.arguments`, :mod:`scvi_codegen.given.counts`).
 """
 
@@ -47,19 +47,19 @@ LONGEST_SHOWN = 60
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What an argument has to be, in words after "must be", and whether a value is it."""
+    """Type check of an argument: its description after "must be", and a predicate."""
 
     words: str
     holds: Callable[[Any], bool]
 
 
 def of(words: str, *types: type) -> Kind:
-    """An instance of one of the types."""
+    """Return the check for an instance of one of the types."""
     return Kind(words, lambda value: isinstance(value, types))
 
 
 def several(words: str, *types: type) -> Kind:
-    """A list, a tuple or another sequence of such instances, no text."""
+    """Return the check for a list, a tuple or another sequence of such instances, except text."""
     return Kind(words, lambda value: _is_sequence(value) and all(isinstance(entry, types) for entry in value))
 
 
@@ -90,7 +90,7 @@ CANVAS = Kind("Matplotlib axes", lambda value: hasattr(value, "plot") and hasatt
 
 
 def check_kind(kind: Kind, value: Any, name: str, error: type[ScviCodegenError] = ArgumentError) -> None:
-    """Refuse a value that is not of the kind; the error has its name."""
+    """Raise an error that names the argument if the value fails the check."""
     if not kind.holds(value):
         shown = repr(value)
         shown = shown if len(shown) <= LONGEST_SHOWN else f"{shown[:LONGEST_SHOWN]} .."
@@ -98,7 +98,7 @@ def check_kind(kind: Kind, value: Any, name: str, error: type[ScviCodegenError] 
 
 
 def takes(error: type[ScviCodegenError] = ArgumentError, /, **kinds: Kind) -> Callable[[Called], Called]:
-    """Check arguments by name at each call; one whose default is ``None`` may be ``None``.
+    """Check arguments by name at each call; an argument whose default is ``None`` may be ``None``.
 
     >>> @takes(name=TEXT)
     ... def greet(name):
@@ -107,7 +107,7 @@ def takes(error: type[ScviCodegenError] = ArgumentError, /, **kinds: Kind) -> Ca
     Traceback (most recent call last):
     scvi_codegen.errors.ArgumentError: name must be text, not 3
 
-    A keyword that the function does not have is refused, too, with what it may have been meant to say.
+    A keyword that the function does not have raises an error with a suggestion.
     """
 
     def decorate(function: Called) -> Called:

@@ -1,4 +1,4 @@
-"""What arguments of functions and keys of model files are called, here and by other programs: one list for all."""
+"""Synonyms of function arguments and of keys of model files in this and other programs."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ WORDS: Final = {
     "run": "integrate integration simulation settings solve",
     "system": "model problem",
 }
-"""By what is said here, of functions and of files, what it is called elsewhere."""
+"""Synonyms in other programs, by the names used here for arguments and keys."""
 
 
 def meanings(word: str) -> Iterator[str]:
-    """What is said here in place of a word, the likeliest first."""
+    """Yield the names used here for a word, the likeliest first."""
     for here, elsewhere in WORDS.items():
         if {word, word.lower()} & {*here.split(), *elsewhere.split()}:
             yield from here.split()
 
 
 def same_here(word: str, known: Collection[str]) -> str:
-    """``"; did you mean 'h'?"``, of the words that are known in its place, or nothing."""
+    """Return ``"; did you mean 'h'?"`` if a known word has the same meaning, else an empty string."""
     return next((f"; did you mean '{meant}'?" for meant in meanings(word) if meant in known), "")

@@ -1,1 +1,1 @@
-"""What moves: systems given by L or H, what follows from them, and what they conserve."""
+"""Mechanical systems: Lagrangians, Hamiltonians, expressions derived from them, conserved quantities."""

@@ -1,8 +1,8 @@
-"""A motion beside small changes of it, as one system: what becomes of these is then a matter of steps alone.
+"""Variational equations: a system extended by tangent vectors of its trajectory.
 
-For L = sum m_i v_i^2 / 2 - V(q, t) and forces of position and time, F in all, a change x of q follows m x'' = F_q x:
-Newton's equations with the same masses, x among the coordinates, F_q x among the forces. Steps commute with
-differentiation, so that what a method makes of x, and of m x', is the derivative of what it makes of q and p.
+For L = sum m_i v_i^2 / 2 - V(q, t) with total forces F(q, t), a tangent vector x of the trajectory satisfies
+m x'' = F_q x: Newton's equations with the same masses, coordinates x and forces F_q x. Discretisation commutes with
+differentiation, so the computed x and m x' are the derivatives of the computed q and p.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ __all__ = ["vary", "with_changes"]
 
 @takes(system=SYSTEM)
 def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
-    """The system, and beside it ``count`` small changes of its motion, as coordinates of their own: ``x_change_1``.
+    """Return the system extended by ``count`` tangent vectors of its trajectory, as coordinates named ``x_change_1``.
 
-    By SVI and collocation they are the exact derivatives of the computed motion along so many directions, as
-    :meth:`Trajectory.tangent` has them, at a third of a step each: solved by the sweeps of the motion itself. A run
-    starts from q with the directions of q behind it, one after the other, and from p with those of p.
+    With SVI and collocation methods they are the exact directional derivatives of the computed trajectory, equal to
+    :meth:`Trajectory.tangent` at about a third of a step per vector: they are solved by the same fixed-point iteration
+    as
+    the trajectory. Initial q is followed by the directions of q, one vector after another; likewise p.
 
     Args:
-        system: with constant masses, one a coordinate, and forces of position and time alone.
-        count: of changes, at least 1.
+        system: with constant masses, one per coordinate, and forces of position and time only.
+        count: number of tangent vectors, at least 1.
 
     Raises:
-        SystemDefinitionError: for other systems; their changes are told by :meth:`Trajectory.tangent` alone.
+        SystemDefinitionError: for other systems; use :meth:`Trajectory.tangent` for them.
     """
     twin, number = lagrangian_twin(system), checked_count(count, "count", least=1)
     found = with_changes(twin, number) if twin else None
@@ -51,9 +52,9 @@ def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
 
 
 def with_changes(system: LagrangianSystem, count: int) -> LagrangianSystem | None:
-    """The system, and behind its m coordinates m for each of so many changes; ``None`` where masses are not constant.
+    """Return the system extended by ``count`` groups of m coordinates.
 
-    The momenta of a change are those of p.
+    ``None`` unless it is separable and unconstrained. The momenta of a tangent vector are variations of p.
     """
     forms = forms_of(system)
     if not forms.separable or system.constraints or system.clock:

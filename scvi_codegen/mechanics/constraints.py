@@ -1,12 +1,12 @@
-"""Constraints: of positions, g(q, t) = 0 (rods, joints, loops), and of velocities, A v + b = 0 (rolling, skates).
+"""Holonomic constraints g(q, t) = 0 (rods, joints, loops) and nonholonomic ones A v + b = 0 (rolling, skates).
 
-Motions meet them, with multipliers lambda as the forces that see to it and do no work in what they leave free,
+They enter the equations of motion with Lagrange multipliers lambda; constraint forces do no virtual work,
 
     d/dt L_v = L_q + f + G^T lambda,        g = 0 with G = g_q,        or A(q, t) v + b(q, t) = 0 with G = A
 
-(holonomic, and nonholonomic by the principle of Lagrange and d'Alembert). What is said of velocities, G v = .., is met
-by both: of holonomic constraints it is the rate g_q v + g_t, a hidden constraint. No index is reduced: methods take g
-itself at the points of a step (:mod:`scvi_codegen.methods.constraints`).
+(holonomic; nonholonomic by the principle of Lagrange and d'Alembert). Both imply a velocity constraint G v = ..; for
+holonomic constraints it is the hidden constraint g_q v + g_t = 0. The index is not reduced: methods impose g itself at
+the points of a step (:mod:`scvi_codegen.methods.constraints`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = [
 
 
 def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
-    """The g of a list of formulas; of an equation, ``left = right`` or SymPy's ``Eq``, left - right."""
+    """Return g of each formula; an equation, ``left = right`` or SymPy's ``Eq``, becomes left - right."""
     found = []
     for formula in given or ():
         equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
@@ -53,7 +53,7 @@ def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> 
 
 
 def check_constraints(system: MechanicalSystem) -> None:
-    """Raise :class:`SystemDefinitionError` for constraints of nothing, that depend on others, or bend velocities."""
+    """Raise :class:`SystemDefinitionError` for constraints that are dependent or nonlinear in velocities."""
     names = list(map(system.text_of, system.constraints))
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
@@ -79,7 +79,7 @@ def check_constraints(system: MechanicalSystem) -> None:
 
 
 def _dependent(system: MechanicalSystem) -> int:
-    """The first constraint whose gradient depends on those before it at every point tried; 0 if there is none."""
+    """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
     slopes, count = constraint_slopes(system), len(system.constraints)
     tape, first = None, 0
     for point in sample_points(system.coordinates, (system.time,), system.constants):
@@ -98,37 +98,37 @@ def _dependent(system: MechanicalSystem) -> int:
 
 
 def constraint_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
-    """The symbols of lambda, one a constraint."""
+    """Return the symbols of the Lagrange multipliers lambda, one per constraint."""
     return tuple(sympy.Symbol(f"lambda_{k}", real=True) for k in range(1, len(system.constraints) + 1))
 
 
 def holonomic(system: MechanicalSystem, g: Expr) -> bool:
-    """Whether a constraint is one of positions alone."""
+    """Return whether the constraint ``g`` contains no velocities."""
     return not g.free_symbols & set(system.velocities)
 
 
 def positions_held(system: MechanicalSystem) -> tuple[Expr, ...]:
-    """The g of positions; 0 in the place of a constraint of velocities."""
+    """Return g of each holonomic constraint, and 0 for each nonholonomic one."""
     return tuple(g if holonomic(system, g) else sympy.S.Zero for g in system.constraints)
 
 
 def velocities_held(system: MechanicalSystem) -> tuple[Expr, ...]:
-    """The A v + b of velocities; 0 in the place of a constraint of positions."""
+    """Return A v + b of each nonholonomic constraint, and 0 for each holonomic one."""
     return tuple(sympy.S.Zero if holonomic(system, g) else g for g in system.constraints)
 
 
 def constraint_rates(system: MechanicalSystem) -> tuple[Expr, ...]:
-    """What is said of velocities: g_q v + g_t, or A v + b."""
+    """Return the velocity form of each constraint: g_q v + g_t, or A v + b."""
     return tuple(map(sympy.Add, along_motion(system, positions_held(system)), velocities_held(system)))
 
 
 def constraint_slopes(system: MechanicalSystem) -> dict[tuple[int, int], Expr]:
-    """The entries of G that are not 0: the directions in which a constraint pushes."""
+    """Return the non-zero entries of the constraint Jacobian G by (constraint, coordinate)."""
     return jacobian(constraint_rates(system), system.velocities)
 
 
 def along_motion(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[Expr, ...]:
-    """d/dt of functions of (q, v, t) while velocities stay."""
+    """Return d/dt of functions of (q, t) along a trajectory, as expressions in (q, v, t); v is held constant."""
     rates = dict(zip(system.coordinates, system.velocities, strict=True)) | {system.time: sympy.S.One}
     variables = tuple(rates)
     found = []
@@ -139,7 +139,7 @@ def along_motion(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[E
 
 
 def with_reactions(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Expr, ...]:
-    """Forces and G^T lambda, m expressions."""
+    """Return the forces plus the constraint forces G^T lambda, m expressions."""
     terms: list[list[Expr]] = [[force] for force in forces]
     factors = constraint_multipliers(system)
     for (k, i), slope in constraint_slopes(system).items():

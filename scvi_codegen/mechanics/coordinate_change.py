@@ -1,4 +1,4 @@
-"""Other coordinates for the same motion: L is a scalar, so new coordinates are put in, and that is all."""
+"""Coordinate changes of a Lagrangian system (point transformations): L is a scalar, so q = q(u, t) is substituted."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def change_coordinates(
 def _projected(
     system: LagrangianSystem, positions: Mapping[Symbol, Expr], replaced: Mapping[Expr, Expr], new: tuple[Symbol, ...]
 ) -> tuple[Expr, ...]:
-    """The forces on the new coordinates, f_u = q_u^T f_q: work is the same."""
+    """Return the generalised forces on the new coordinates, f_u = q_u^T f_q (equal virtual work)."""
     forces = [sympy.S.Zero] * len(new) if system.forces else []
     for q, force in zip(system.coordinates, system.forces, strict=False):
         for i, slope in gradient(positions.get(q, q), new).items():
@@ -81,7 +81,7 @@ def _projected(
 
 
 def _rate(position: Expr, variables: tuple[Symbol, ...], time: Symbol) -> Expr:
-    """The time derivative along a curve of the new coordinates."""
+    """Return the time derivative of ``position`` along a curve of the new coordinates."""
     slopes = gradient(position, (*variables, time))
     rates = (*(symbol(variable.name + DOT) for variable in variables), sympy.S.One)
     return sympy.Add(*(slope * rates[i] for i, slope in slopes.items()))

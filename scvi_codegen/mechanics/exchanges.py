@@ -1,15 +1,15 @@
-"""What forces and damping give a system along its motion: work, and impulses in the directions of symmetries.
+"""Work and impulse: the energy and momentum that forces and damping transfer to a system along its trajectory.
 
-Where L alone has a symmetry xi its momentum map J changes by what the force does in that direction, and the energy of
-an L without time by the work of the force,
+If L alone has a symmetry xi, its momentum map J changes by the impulse of the force along xi, and the energy of an
+autonomous L by the work of the force,
 
     J1 - J0 = int f . xi dt,                        E1 - E0 = int f . v dt.
 
-SVI and their kin keep the first to round-off, with the integral by the method's own quadrature along its own curve
-(forced discrete Noether theorem: J. E. Marsden, M. West, Acta Numerica 10 (2001), theorem 3.2.1), and meet the second
-with their order. Damping is in both the force -gamma p; of a momentum map what it takes is known beforehand, all but
-exp(-gamma h) of it a step, and the integral has the order of the method. The curve of SCVI(s) is no stationary one: it
-meets both with the order of the curve, s + 1.
+Variational methods satisfy the first to round-off, with the integral by the method's own quadrature along its own
+curve (forced discrete Noether theorem: J. E. Marsden, M. West, Acta Numerica 10 (2001), theorem 3.2.1), and the second
+to their order. Damping acts as the force -gamma p; its effect on a momentum map is known in closed form (a factor
+exp(-gamma h) per step), and the integral is accurate to the order of the method. SCVI(s) curves are not stationary
+points of the action: both balances hold to the order of the curve, s + 1.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ __all__ = ["Exchange", "exchanges"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exchange:
-    """What flows in per unit of time: power, or the force along a symmetry of the system without forces."""
+    """Rate of work (power) or of impulse: the force along a symmetry of the unforced system."""
 
     name: str
     rate: Expr
 
 
 def exchanges(system: MechanicalSystem) -> tuple[Exchange, ...]:
-    """The power, then what each momentum map that forces or damping touch receives; none without these."""
+    """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
     if not system.forces and system.damping == 0:
         return ()
     found = [Exchange(name="energy", rate=_along(system, system.velocities))]

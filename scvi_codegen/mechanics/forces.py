@@ -1,12 +1,12 @@
-"""Forces beside the potential: friction, drives, motors; given by coordinate, or friction by Rayleigh's function.
+"""Generalised forces: friction, drives and motors, given per coordinate or by Rayleigh's dissipation function.
 
-With forces f the motion follows the principle of Lagrange and d'Alembert,
+With forces f the equations of motion follow from the principle of Lagrange and d'Alembert,
 
     delta int L dt + int f . delta q dt = 0,      that is      d/dt L_v = L_q + f.
 
-Every method discretises the second integral as it does the first, by the same quadrature along the same curve: at each
-point L_q becomes L_q + f, and nothing else changes. Orders stay; momentum maps whose directions do no work are kept as
-before. Of a Hamiltonian they are forces on momenta, p' = -H_q + f(q, p, t).
+Every method discretises the second integral like the first, by the same quadrature along the same curve: at each
+point L_q becomes L_q + f. The order is unchanged, and momentum maps along whose directions the forces do no work are
+conserved as before. For a Hamiltonian they are forces on momenta, p' = -H_q + f(q, p, t).
 
 Sources: C. Kane, J. E. Marsden, M. Ortiz, M. West, Int. J. Numer. Meth. Eng. 49 (2000); J. E. Marsden, M. West, Acta
 Numerica 10 (2001), part 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. Anal. 49 (2015).
@@ -30,15 +30,15 @@ __all__ = ["dissipative_forces", "forces_by_coordinate"]
 def forces_by_coordinate(
     coordinates: Sequence[Symbol], given: Mapping[Any, Any], read: Callable[[Any], Expr]
 ) -> tuple[Expr, ...]:
-    """The m forces, 0 where none is given; none at all if all are 0.
+    """Return the m forces, 0 for coordinates without one; an empty tuple if all are 0.
 
     Args:
         coordinates: of the system.
-        given: force by coordinate, a symbol or its name.
-        read: from what stands there to an expression in canonical symbols.
+        given: force by coordinate, which is a symbol or its name.
+        read: converts a value to an expression in canonical symbols.
 
     Raises:
-        SystemDefinitionError: for what is no coordinate.
+        SystemDefinitionError: for keys that are not coordinates.
     """
     if not isinstance(given, Mapping):
         raise SystemDefinitionError(f"forces are a mapping from coordinates to formulas, not {given!r}")
@@ -53,7 +53,7 @@ def forces_by_coordinate(
 
 
 def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple[Expr, ...]:
-    """The forces -dD/dv of Rayleigh's function D(q, v, t)."""
+    """Return the forces -dD/dv of Rayleigh's dissipation function D(q, v, t)."""
     slopes = gradient(dissipation, velocities)
     if not slopes:
         raise SystemDefinitionError(

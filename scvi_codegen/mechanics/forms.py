@@ -1,12 +1,12 @@
-"""What the kernels compute: momentum, force, mass, the Euler-Lagrange residual, the scalar behind the shooting method.
+"""Expressions that generated kernels evaluate: momentum, force, mass matrix, Euler-Lagrange residual and its product.
 
-L stands for the function of :class:`~scvi_codegen.mechanics.system.MechanicalSystem`: where a Hamiltonian is given it
-is p . v - H, p its auxiliaries, and the results below depend on p, for which ``constitutive`` = v - H_p = 0 is solved.
+L denotes the function of :class:`~scvi_codegen.mechanics.system.MechanicalSystem`. For a Hamiltonian it is p . v - H
+with p as auxiliary variables; the expressions below then depend on p, which solves ``constitutive`` = v - H_p = 0.
 Everything is differentiated term by term with :mod:`scvi_codegen.formulas.derivatives`; nothing is simplified and no
-mass matrix is inverted. Accelerations and multipliers are symbols of their own, so a kernel is a function of plain
-numbers.
+mass matrix is inverted. Accelerations and multipliers are separate symbols, so a kernel is a function of plain numbers.
 
-All of it is derived once a system, when it is asked for: :func:`forms_of` gives equal systems the same :class:`Forms`.
+Each expression is derived on first use, once per system: :func:`forms_of` returns the same :class:`Forms` for equal
+systems.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ Entries = dict[tuple[int, int], Expr]
 
 
 def accelerations(system: MechanicalSystem) -> tuple[Symbol, ...]:
-    """The m symbols that stand for second time derivatives."""
+    """Return the m symbols of the second time derivatives."""
     return tuple(sympy.Symbol(f"{q.name}_ddot", real=True) for q in system.coordinates)
 
 
 def curve_rates(system: MechanicalSystem, count: int) -> tuple[tuple[Symbol, ...], ...]:
-    """The symbols of the second and ``count - 1`` higher time derivatives of q, m each."""
+    """Return the symbols of the time derivatives of q of orders 2 to ``count + 1``, m per order."""
     higher = [[sympy.Symbol(f"{q.name}_d{k}", real=True) for q in system.coordinates] for k in range(3, count + 2)]
     return (accelerations(system), *map(tuple, higher))[:count]
 
 
 def multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
-    """The m multiplier symbols of a collocation node (shooting-based methods)."""
+    """Return the m multiplier symbols of a collocation node (shooting-based methods)."""
     return tuple(sympy.Symbol(f"{q.name}_multiplier", real=True) for q in system.coordinates)
 
 
 def auxiliary_multipliers(system: MechanicalSystem) -> tuple[Symbol, ...]:
-    """The multipliers of ``constitutive`` at a collocation node: m, or none without auxiliaries."""
+    """Return the multipliers of ``constitutive`` at a collocation node: m, or none without auxiliary variables."""
     return tuple(sympy.Symbol(f"{p.name}_multiplier", real=True) for p in system.auxiliaries)
 
 
 @dataclass(frozen=True)
 class Forms:
-    """What follows from the function of a system, each derived when it is first asked for, and kept."""
+    """Expressions derived from the function of a system, each computed on first access and cached."""
 
     system: MechanicalSystem
 
@@ -61,52 +61,52 @@ class Forms:
 
     @cached_property
     def force(self) -> tuple[Expr, ...]:
-        """L_q, m expressions, and the forces beside it."""
+        """L_q plus the generalised forces, m expressions."""
         slopes = self._slopes(self.system.lagrangian, self.system.coordinates)
         return tuple(map(sympy.Add, slopes, self.system.forces)) if self.system.forces else slopes
 
     @cached_property
     def thrust(self) -> tuple[Expr, ...]:
-        """What momenta change by in a unit of time, m expressions: :attr:`force` less their damping."""
+        """Rate of change of the momenta, m expressions: :attr:`force` minus the damping gamma p."""
         if self.system.damping == 0:
             return self.force
         return tuple(f - self.system.damping * p for f, p in zip(self.force, self.momentum, strict=True))
 
     @cached_property
     def mass(self) -> Entries:
-        """L_vv."""
+        """Mass matrix L_vv."""
         return jacobian(self.momentum, self.system.velocities)
 
     @cached_property
     def lower_mass(self) -> Entries:
-        """The lower triangle of L_vv, which is symmetric: all that a solver needs of it."""
+        """Lower triangle of the symmetric mass matrix L_vv; solvers need only this part."""
         return {(i, j): entry for (i, j), entry in self.mass.items() if i >= j}
 
     @cached_property
     def constitutive(self) -> tuple[Expr, ...]:
-        """L_p = v - H_p by the auxiliaries p, m expressions that vanish (paper (35f)); none without auxiliaries."""
+        """Constitutive residual L_p = v - H_p, m expressions (paper (35f)); empty for a Lagrangian."""
         return self._slopes(self.system.lagrangian, self.system.auxiliaries)
 
     @cached_property
     def legendre_arguments(self) -> tuple[Symbol, ...]:
-        """(q, v), or (q, p) of a Hamiltonian: what ``legendre`` and the formula of the system are functions of."""
+        """Arguments of ``legendre`` and of the system's formula: (q, v), or (q, p) for a Hamiltonian."""
         return (*self.system.coordinates, *(self.system.auxiliaries or self.system.velocities))
 
     @cached_property
     def legendre(self) -> tuple[Expr, ...]:
-        """What the system gives in closed form, m expressions: p = L_v at (q, v), or v = H_p at (q, p)."""
+        """Legendre transform in closed form, m expressions: p = L_v at (q, v), or v = H_p at (q, p)."""
         if not self.system.auxiliaries:
             return self.momentum
         return self._slopes(self.system.formula, self.system.auxiliaries)
 
     @cached_property
     def legendre_slopes(self) -> Entries:
-        """L_vv, or H_pp."""
+        """Jacobian of ``legendre``: L_vv, or H_pp."""
         return jacobian(self.legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
 
     @cached_property
     def energy(self) -> Expr:
-        """L_v . v - L, or H where it is given; conserved when time does not occur in it."""
+        """Energy L_v . v - L, or H for a Hamiltonian; conserved if it does not depend on time."""
         if self.system.auxiliaries:
             return self.system.formula
         products = [p * v for p, v in zip(self.momentum, self.system.velocities, strict=True)]
@@ -114,9 +114,9 @@ class Forms:
 
     @cached_property
     def euler_lagrange(self) -> tuple[Expr, ...]:
-        """E = L_vv a + L_vq v + L_vt - L_q + gamma L_v, m expressions in (q, v, a, t), 0 on trajectories (paper (2)).
+        """Euler-Lagrange residual d/dt L_v - L_q + gamma L_v in (q, v, a, t), m expressions (paper (2)).
 
-        Of a Hamiltonian: d/dt (v - H_p) = a - H_pq v + H_pp H_q - H_pt, in (q, v, a, p, t) with v = H_p.
+        For a Hamiltonian: d/dt (v - H_p) = a - H_pq v + H_pp H_q - H_pt, in (q, v, a, p, t) with v = H_p.
         """
         system = self.system
         variables = (*system.velocities, *system.coordinates, system.time, *system.auxiliaries)
@@ -133,10 +133,11 @@ class Forms:
 
     @cached_property
     def multiplied_residual(self) -> Expr:
-        """Lambda . E: the scalar whose stationarity makes a collocation residual vanish, with its multipliers.
+        """Scalar lambda . E whose derivatives with respect to the multipliers lambda are the collocation residuals.
 
-        Of a Hamiltonian also the product of ``constitutive`` with its multipliers. Forces are left out of E: they stand
-        in :attr:`multiplied_forces`.
+        For a Hamiltonian it includes the product of ``constitutive`` with its multipliers. Forces are not part of E
+        here; see
+        :attr:`multiplied_forces`.
         """
         terms: list[Expr] = []
         factors = (*multipliers(self.system), *auxiliary_multipliers(self.system))
@@ -148,11 +149,11 @@ class Forms:
 
     @cached_property
     def multiplied_forces(self) -> tuple[tuple[Expr, ...], ...]:
-        """What forces add to the slopes of ``multiplied_residual`` by q, v, a and lambda, m expressions each; or none.
+        """Contributions of forces to the derivatives of ``multiplied_residual`` by q, v, a and lambda, m each.
 
-        The variations of a curve that a multiplier rules follow the adjoint of the linearised equations of motion:
-        only then is the error of the curve felt in second order, and the order of the method kept. The adjoint of
-        -f_q x - f_v x' is -f_q^T x + (f_v^T x)', and E of L alone is its own.
+        Empty without forces. The multipliers must satisfy the adjoint of the linearised equations of motion: only then
+        is the effect of the error of the curve quadratic, and the order preserved. The adjoint of -f_q x - f_v x'
+        is -f_q^T x + (f_v^T x)'; the E of an unforced L is self-adjoint.
         """
         system, m = self.system, self.system.dimension
         if not system.forces:
@@ -173,9 +174,9 @@ class Forms:
 
     @cached_property
     def separable(self) -> bool:
-        """Whether L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, as seen in the structure of its derivatives.
+        """True if L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, judged by the structure of its derivatives.
 
-        Not with damping: velocities at points are then other sums of forces than those in the tables of a method.
+        False with damping: velocities at the points are then not the sums of forces in the tables of a method.
         """
         if self.system.auxiliaries or self.system.damping != 0:
             return False
@@ -188,7 +189,7 @@ class Forms:
 
     @cached_property
     def split(self) -> bool:
-        """Whether H = T(p) + V(q, t), as seen in the structure of its derivatives; forces may depend on q and t."""
+        """True if H = T(p) + V(q, t), judged by the structure of its derivatives; forces may depend on q and t."""
         system = self.system
         if (
             not system.auxiliaries
@@ -201,7 +202,7 @@ class Forms:
         )
 
     def rates(self, count: int) -> tuple[Expr, ...]:
-        """First dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""
+        """Return dL/dt, .., d^count L/dt^count along a curve, in (q, v, t) and :func:`curve_rates`."""
         system = self.system
         curve = (system.coordinates, system.velocities, *curve_rates(system, count))
         variables = (*(symbol for group in curve[:-1] for symbol in group), system.time)
@@ -219,12 +220,12 @@ class Forms:
 
 @lru_cache(maxsize=64)
 def forms_of(system: MechanicalSystem) -> Forms:
-    """The forms of a system."""
+    """Return the :class:`Forms` of a system; equal systems share one."""
     return Forms(system)
 
 
 def _along(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: Sequence[Expr]) -> tuple[Expr, ...]:
-    """Derivatives along a direction; the time derivatives, along the rates of the variables."""
+    """Return directional derivatives; with the rates of the variables as direction, time derivatives."""
     terms: list[list[Expr]] = [[] for _ in expressions]
     for (i, j), slope in jacobian(expressions, variables).items():
         terms[i].append(slope * direction[j])

@@ -1,8 +1,8 @@
-"""A mechanical system given by its Hamiltonian, and Legendre's transform in both directions.
+"""Hamiltonian systems and Legendre transforms in both directions.
 
 Hamilton's principle in phase space (paper, section 1.1) makes the action of p . v - H(q, p, t) stationary in q and p.
-Nothing there needs a Lagrangian: H = q p or the Hamiltonian of point vortices, for which d2H/dp2 is singular, are
-integrated as well, by methods that do not need one (:attr:`~scvi_codegen.methods.method.Method.needs_regular`).
+It needs no Lagrangian: systems with singular d2H/dp2, such as H = q p or point vortices, are integrated as well, by
+methods that do not require a regular one (:attr:`~scvi_codegen.methods.method.Method.needs_regular`).
 """
 
 from __future__ import annotations
@@ -36,15 +36,16 @@ __all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HamiltonianSystem(MechanicalSystem):
-    """A Hamiltonian H(q, p, t; parameters) in m coordinates and momenta, checked on construction.
+    """Hamiltonian H(q, p, t; parameters) in m coordinates and momenta, validated on construction.
 
-    Build one with ``from_text`` or ``from_sympy``, or from a Lagrangian with :func:`hamiltonian_of`. Every method takes
-    it in place of a Lagrangian; the variational ones then are those of Hamilton's principle in phase space, (35).
+    Build one with ``from_text`` or ``from_sympy``, or from a Lagrangian with :func:`hamiltonian_of`. Every method
+    accepts
+    it in place of a Lagrangian; variational methods then discretise Hamilton's principle in phase space, (35).
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
         momenta: the m momenta, parallel to ``coordinates``.
-        hamiltonian: H, exact: no floating-point number occurs in it.
+        hamiltonian: H, exact: it contains no floating-point numbers.
 
     Raises:
         SystemDefinitionError: naming the symbol at fault.
@@ -93,16 +94,16 @@ class HamiltonianSystem(MechanicalSystem):
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         Args:
-            name: what the system is called.
+            name: name of the system.
             coordinates: names of the coordinates.
             hamiltonian: the formula; it may span several lines.
             momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
-            damping: the rate at which all momenta shrink, a number or a formula of parameters
+            damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
-            constraints: none; :func:`lagrangian_of` takes them.
-            inputs: names of functions of time that are given as data with each run
+            constraints: must be empty; :func:`lagrangian_of` accepts constraints.
+            inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> HamiltonianSystem.from_text(
@@ -159,20 +160,21 @@ class HamiltonianSystem(MechanicalSystem):
         damping: Expr | float | None = None,
         inputs: Sequence[Any] = (),
     ) -> HamiltonianSystem:
-        """Take H from a SymPy expression, in plain symbols or in functions of time.
+        """Create the system from a SymPy expression in plain symbols or in functions of time.
 
-        Floating-point numbers become the rationals their shortest decimal form says; symbols become canonical as
-        :mod:`scvi_codegen.formulas.symbols` describes.
+        Floating-point numbers become the rationals of their shortest decimal form; symbols become canonical as
+        described in
+        :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
-            name: what the system is called.
+            name: name of the system.
             hamiltonian: H.
             coordinates, momenta: symbols or functions of time, parallel to each other.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
             parameters: default value by symbol or by name.
             forces: expression by coordinate, in coordinates, momenta and time.
-            damping: the rate at which all momenta shrink, an expression in parameters.
-            inputs: functions of time that are given as data with each run: as such, by symbol or by name.
+            damping: damping rate of all momenta, an expression in parameters.
+            inputs: functions of time, symbols or names whose values are passed to each run.
         """
         hamiltonian = given_expression(hamiltonian, "Hamiltonian")
         acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
@@ -210,13 +212,13 @@ class HamiltonianSystem(MechanicalSystem):
 
     @property
     def lagrangian(self) -> Expr:
-        """P . v - H, the integrand of Hamilton's principle in phase space."""
+        """Integrand p . v - H of Hamilton's principle in phase space."""
         products = [p * v for p, v in zip(self.momenta, self.velocities, strict=True)]
         return sympy.Add(*products, -self.hamiltonian)
 
     @property
     def auxiliaries(self) -> tuple[Symbol, ...]:
-        """The momenta."""
+        """Momenta."""
         return self.momenta
 
     @property
@@ -226,7 +228,7 @@ class HamiltonianSystem(MechanicalSystem):
 
     @property
     def is_regular(self) -> bool:
-        """Whether d2H/dp2 is regular somewhere: only then velocities determine momenta."""
+        """True if d2H/dp2 is invertible at some sampled point, so that velocities determine momenta."""
         return _is_regular(self)
 
     def _repr_latex_(self) -> str:
@@ -235,14 +237,14 @@ class HamiltonianSystem(MechanicalSystem):
 
 @takes(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
 def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
-    """The Hamiltonian p . v - L of a Lagrangian, v expressed by p = dL/dv (paper, section 1.1).
+    """Return the Hamiltonian p . v - L of a Lagrangian, with v eliminated by p = dL/dv (paper, section 1.1).
 
     Args:
         system: the Lagrangian.
         momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
 
     Raises:
-        SystemDefinitionError: where p = dL/dv has no closed solution that SymPy finds.
+        SystemDefinitionError: if SymPy finds no closed-form solution of p = dL/dv.
 
     >>> oscillator = LagrangianSystem.from_text(
     ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2})
@@ -276,15 +278,16 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
 
 @takes(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
 def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ()) -> LagrangianSystem:
-    """The Lagrangian p . v - H of a Hamiltonian, p expressed by v = dH/dp (paper, section 1.1).
+    """Return the Lagrangian p . v - H of a Hamiltonian, with p eliminated by v = dH/dp (paper, section 1.1).
 
     Args:
         system: the Hamiltonian.
-        constraints: of the motion, as of :meth:`LagrangianSystem.from_text`: with them p' = -H_q + G^T lambda. Momenta
-            are those of the Hamiltonian.
+        constraints: as of :meth:`LagrangianSystem.from_text`; they add G^T lambda to p' = -H_q. Momenta are those of
+        the
+            Hamiltonian.
 
     Raises:
-        SystemDefinitionError: where d2H/dp2 is singular, or v = dH/dp has no closed solution that SymPy finds.
+        SystemDefinitionError: if d2H/dp2 is singular, or SymPy finds no closed-form solution of v = dH/dp.
     """
     found = _lagrangian_of(system)
     if not constraints:
@@ -322,7 +325,7 @@ def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
 
 
 def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
-    """A Lagrangian with the same motion: the system's own, that of a Hamiltonian, or ``None`` where none is found."""
+    """Return an equivalent Lagrangian system, possibly ``system`` itself; ``None`` if none is found."""
     if isinstance(system, LagrangianSystem):
         return system
     return _twin(system) if isinstance(system, HamiltonianSystem) else None

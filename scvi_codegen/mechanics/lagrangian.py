@@ -1,4 +1,4 @@
-"""A mechanical system given by its Lagrangian, from text or from SymPy."""
+"""Lagrangian systems, built from text, from SymPy expressions, or from sympy.physics.mechanics."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ REDUNDANT = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LagrangianSystem(MechanicalSystem):
-    """A Lagrangian L(q, q_dot, t; parameters) in m coordinates, checked on construction.
+    """Lagrangian L(q, q_dot, t; parameters) in m coordinates, validated on construction.
 
     Build one with ``from_text``, ``from_sympy``, or from SymPy's mechanics with ``from_lagranges_method``,
     ``from_kanes_method`` and ``from_system``. Equality is structural.
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
-        lagrangian: L, exact: no floating-point number occurs in it.
+        lagrangian: L, exact: it contains no floating-point numbers.
 
     Raises:
-        SystemDefinitionError: naming the symbol at fault, if a name is unfit or used twice, L contains an unknown
+        SystemDefinitionError: naming the symbol at fault, if a name is invalid or used twice, L contains an unknown
             symbol or an unsupported function, a default value is not a finite number, a velocity does not occur in L,
-            or the mass matrix d2L/dv2 is singular at every point tried.
+            or the mass matrix d2L/dv2 is singular at every sampled point.
     """
 
     lagrangian: Expr
@@ -66,7 +66,7 @@ class LagrangianSystem(MechanicalSystem):
 
     @property
     def auxiliaries(self) -> tuple[Symbol, ...]:
-        """None."""
+        """Empty: a Lagrangian has no auxiliary variables."""
         return ()
 
     @property
@@ -103,17 +103,17 @@ class LagrangianSystem(MechanicalSystem):
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         Args:
-            name: what the system is called.
+            name: name of the system.
             coordinates: names of the coordinates; the velocity of ``q`` is written ``q_dot``, time ``t``.
             lagrangian: the formula; it may span several lines.
             parameters: default value by name.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
-            damping: the rate at which all momenta shrink, a number or a formula of parameters
+            damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
-            constraints: formulas in coordinates and time that stay 0, or equations ``"x**2 + y**2 = l**2"``;
-                linear in velocities those of wheels and skates (:mod:`scvi_codegen.mechanics.constraints`).
-            inputs: names of functions of time that are given as data with each run
+            constraints: formulas in coordinates and time that are 0, or equations ``"x**2 + y**2 = l**2"``;
+                formulas linear in velocities are nonholonomic (:mod:`scvi_codegen.mechanics.constraints`).
+            inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
 
         >>> oscillator = LagrangianSystem.from_text(
@@ -174,24 +174,25 @@ class LagrangianSystem(MechanicalSystem):
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
-        """Take L from a SymPy expression, in plain symbols or in functions of time.
+        """Create the system from a SymPy expression in plain symbols or in functions of time.
 
-        Floating-point numbers become the rationals their shortest decimal form says (``0.1`` is 1/10); symbols become
-        canonical as the module describes.
+        Floating-point numbers become the rationals of their shortest decimal form (``0.1`` is 1/10); symbols become
+        canonical
+        as described in :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
-            name: what the system is called.
+            name: name of the system.
             lagrangian: L.
-            coordinates: symbols, or functions of time such as ``dynamicsymbols`` gives.
+            coordinates: symbols, or functions of time such as ``dynamicsymbols`` returns.
             velocities: parallel to ``coordinates``; by default ``Derivative(q(t), t)`` for a function of time, the
                 symbol called ``q_dot`` for a symbol ``q``.
             time: the symbol for time; by default the argument of the coordinates, or the symbol called ``t``.
-            parameters: default value by symbol, by name, or by a function of time that stays constant.
-            forces: expression by coordinate, as the coordinate is given or by its name.
+            parameters: default value by symbol, by name, or by a function of time that is constant.
+            forces: expression by coordinate, which is a symbol, a function of time or a name.
             dissipation: Rayleigh's function, whose forces -dD/dv are added to them.
-            damping: the rate at which all momenta shrink, an expression in parameters.
-            constraints: expressions in coordinates, time and, linearly, velocities that stay 0, or equations ``Eq``.
-            inputs: functions of time that are given as data with each run: as such, by symbol or by name.
+            damping: damping rate of all momenta, an expression in parameters.
+            constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
+            inputs: functions of time, symbols or names whose values are passed to each run.
         """
         lagrangian = given_expression(lagrangian, "Lagrangian")
         acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
@@ -239,17 +240,19 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
-        """Take over a ``sympy.physics.mechanics.LagrangesMethod`` with its forces and constraints.
+        """Create the system from a ``sympy.physics.mechanics.LagrangesMethod``, with its forces and constraints.
 
-        Forces and torques of its ``forcelist`` act through the velocities of their points, the angular velocities of
-        their frames, projected on the coordinates: f_i = sum F . dv/dq_dot_i. Its ``bodies`` add nothing, as in SymPy:
-        their energies are in its Lagrangian.
+        Forces and torques of its ``forcelist`` are projected on the coordinates by the velocities of their points and
+        the
+        angular velocities of their frames: f_i = sum F . dv/dq_dot_i. As in SymPy its ``bodies`` are not used: their
+        energies
+        are part of its Lagrangian.
         """
         from scvi_codegen.mechanics.multibody.readers import forces_of_lagranges_method
 
-        bound = [sympy.sympify(g) for g in method._hol_coneqs]  # no public name either
-        rolling = list(method.coneqs)[len(bound) :]  # after the rates of those
-        lagrangian = method._L[0]  # LagrangesMethod has no public name for it
+        bound = [sympy.sympify(g) for g in method._hol_coneqs]  # private attribute: SymPy has no public one
+        rolling = list(method.coneqs)[len(bound) :]  # coneqs begins with the rates of the holonomic constraints
+        lagrangian = method._L[0]  # private attribute: SymPy has no public one
         return cls.from_sympy(
             name=name,
             lagrangian=lagrangian,
@@ -270,24 +273,30 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
-        """Take over a ``sympy.physics.mechanics.KanesMethod``: the Lagrangian of its bodies, and its loads.
+        """Create the system from a ``sympy.physics.mechanics.KanesMethod``, by its bodies and loads.
 
-        Generalised speeds are written in the rates of the coordinates. Loads that depend on coordinates alone and are
-        the slopes of a potential become one; all others are forces, and so is what Kane's equations have beyond
-        Lagrange's where constraints are built into velocities (a disc that rolls). Potential energies of bodies are
-        not used, as in Kane's equations; accelerations follow from velocities, and none that were set by hand are used.
-        Constraints on the configuration, and on velocities that say more, become constraints. A speed that is the rate
-        of no coordinate, as nothing depends on it, gets one, ``integral_u``.
+        Generalised speeds are expressed by the rates of the coordinates. Loads that depend only on coordinates and have
+        a
+        potential become a potential energy; all others are generalised forces, as are the terms of Kane's equations
+        beyond
+        Lagrange's if constraints are built into velocities (a rolling disc). Potential energies of bodies are not used,
+        as in
+        Kane's equations; accelerations follow from velocities, and those set by hand are ignored. Holonomic
+        constraints, and
+        velocity constraints that they do not imply, become constraints. A speed without a coordinate, which nothing
+        depends
+        on, gets one, ``integral_u``.
 
         Args:
             method: with bodies and kinematic equations; its equations need not have been formed.
-            name: what the system is called.
-            parameters: default value by symbol, by function of time that stays constant, or by name.
-            inputs: functions of time, such as ``dynamicsymbols("F")``, that are given as data with each run.
+            name: name of the system.
+            parameters: default value by symbol, by function of time that is constant, or by name.
+            inputs: functions of time, such as ``dynamicsymbols("F")``, whose values are passed to each run.
 
         Raises:
-            SystemDefinitionError: where generalised speeds are no invertible combination of the rates of the
-                coordinates, bodies are missing, or a symbol has no value.
+            SystemDefinitionError: if generalised speeds are not an invertible combination of the rates of the
+            coordinates,
+                bodies are missing, or a symbol has no value.
         """
         from scvi_codegen.mechanics.multibody.readers import of_kanes_method
 
@@ -303,10 +312,11 @@ class LagrangianSystem(MechanicalSystem):
         parameters: Mapping[Any, float] | None = None,
         inputs: Sequence[Any] = (),
     ) -> LagrangianSystem:
-        """Take over a ``System`` of ``sympy.physics.mechanics``: bodies, joints, loads, actuators and constraints.
+        """Create the system from a ``System`` of ``sympy.physics.mechanics``: bodies, joints, loads, constraints.
 
-        As :meth:`from_kanes_method`, with the potential energies of its bodies, unless its equations were formed by
-        Kane's method, which does without them.
+        Like :meth:`from_kanes_method`, but with the potential energies of its bodies, unless its equations were formed
+        by
+        Kane's method, which does not use them.
 
         Args:
             system: its equations need not have been formed.
@@ -330,7 +340,7 @@ def _forces(
     dissipation: Any,
     read: Callable[[Any], Expr],
 ) -> tuple[Expr, ...]:
-    """The forces of a system and those of its dissipation."""
+    """Return the forces of a system plus those of its dissipation function."""
     forces = forces_by_coordinate(coordinates, given or {}, read)
     if dissipation is None:
         return forces
@@ -373,7 +383,7 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
 
 
 def _without_kinetic_energy(system: LagrangianSystem, velocities: Sequence[Symbol], how: str) -> str:
-    """The message for coordinates of whose velocities L is at most linear."""
+    """Return the error message for coordinates whose velocities occur at most linearly in L."""
     names = [velocity.name[: -len(DOT)] for velocity in velocities]
     if not hessian(system.lagrangian, system.velocities):
         every = " and ".join(velocity.name for velocity in system.velocities)

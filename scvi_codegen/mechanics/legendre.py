@@ -1,4 +1,4 @@
-"""Legendre's transform of a function, solved symbolically: of quadratic forms by inverses, else by roots."""
+"""Symbolic Legendre transforms: of quadratic forms by matrix inverses, otherwise variable by variable."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["legendre_dual", "positive_parameters"]
 
 LARGEST_INVERSE = 3
-"""Coupled momenta (velocities) whose quadratic form is inverted symbolically."""
+"""Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""
 NEGLIGIBLE = mp.mpf(10) ** -30
 
 
 def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: Sequence[Symbol]) -> Expr:
-    """The product x . y less f(x), with y = df/dx solved for x; f is the system's formula."""
+    """Return the Legendre transform x . y - f(x), where y = df/dx is solved for x; f is the system's formula."""
+    # f = f0 + b . x + x . C x / 2 has the transform (y - b) . C^-1 (y - b) / 2 - f0, block by block.
     f = system.formula
     curvature = hessian(f, variables)
     origin = dict.fromkeys(variables, sympy.S.Zero)
@@ -40,12 +41,12 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
 
 
 def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
-    """Stand-ins for the parameters with positive default values, so that roots of their squares are taken."""
+    """Return positive dummies for the parameters with positive defaults, so that roots of their squares simplify."""
     return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
 
 
 def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
-    """Half of y . C^-1 y over one block."""
+    """Return y . C^-1 y / 2 over one block."""
     if len(block) == 1:
         (i,) = block
         return y[i] ** 2 / (2 * curvature[i, i])
@@ -62,7 +63,7 @@ def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int
 
 
 def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]) -> Expr:
-    """The x with y = slope(x), the branch that holds at random points for parameters of the signs of their defaults."""
+    """Return the x with y = slope(x), whose branch is checked at random points near the default parameters."""
     if slope.free_symbols & (set(variables) - {x}):
         raise SystemDefinitionError(
             f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
@@ -78,7 +79,7 @@ def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, 
 
 
 def _roots(expression: Expr, x: Symbol) -> list[Expr]:
-    """What SymPy finds, without the formulas of Cardano and Ferrari, on which it would spend minutes; unchecked."""
+    """Return unchecked solutions of SymPy, without the formulas of Cardano and Ferrari, which take minutes."""
     try:
         return list(sympy.solve(expression, x, check=False, simplify=False, cubics=False, quartics=False))
     except (NotImplementedError, ArithmeticError, AttributeError, TypeError, ValueError, RecursionError):

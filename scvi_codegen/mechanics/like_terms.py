@@ -1,7 +1,7 @@
-"""Terms of one kind: those that differ in their coordinates, parameters and numbers alone.
+"""Grouping of similar terms: terms that differ only in their coordinates, parameters and numbers.
 
-That two terms are of one kind is read off their trees: arguments of sums and products in the order of what they are
-without names, leaves in the order of that.
+Terms are compared by their expression trees: arguments of sums and products are sorted by their structure without
+names and numbers, so that similar terms have equal texts.
 """
 
 from __future__ import annotations
@@ -23,14 +23,13 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LikeTerms:
-    """Terms of one kind.
+    """Group of similar terms.
 
     Attributes:
-        text: of any of them: ``q{0}`` is the entry of the array q at the first place of a term, ``[0]`` its first
-            constant.
-        terms: as they were given.
-        places: of each term.
-        constants: of each term, numbers or parameters.
+        text: formula common to all: ``q{0}`` is the entry of the array q at its first index, ``[0]`` a constant.
+        terms: the original expressions.
+        places: indices of the coordinates, for each term.
+        constants: numbers or parameters, for each term.
     """
 
     text: str
@@ -39,7 +38,7 @@ class LikeTerms:
     constants: tuple[tuple[Expr, ...], ...]
 
     def written(self, place: Callable[[int], str], constant: Callable[[int], str]) -> str:
-        """The text with places and constants written so."""
+        """Return the text with its placeholders replaced by ``place`` and ``constant``."""
         text = re.sub(r"\[(\d+)\]", lambda found: constant(int(found[1])), self.text)
         return re.sub(r"\{(\d+)\}", lambda found: place(int(found[1])), text)
 
@@ -51,14 +50,14 @@ def like_terms(
     most: int,
     first: Iterable[tuple[int, ...]] = repeat(()),
 ) -> tuple[LikeTerms, ...]:
-    """The kinds of terms, in the order of their texts; none where they are more than ``most``.
+    """Group terms by structure, in the order of their texts; return no groups if there are more than ``most``.
 
     Args:
         terms: in canonical form.
-        places: array and place of each coordinate, velocity or momentum.
-        names: of parameters.
-        most: kinds.
-        first: places of each term that come before those in it: where a force acts.
+        places: array and index of each coordinate, velocity or momentum.
+        names: parameters.
+        most: maximum number of groups.
+        first: indices that precede those of each term, such as the coordinate on which a force acts.
     """
     shapes, known = dict[Expr, str](), set(names)
     kinds: dict[str, list[tuple[Expr, _Term]]] = {}
@@ -80,14 +79,14 @@ def like_terms(
 
 @dataclass(slots=True)
 class _Term:
-    """A term as text with numbered leaves.
+    """Conversion of a term to text with numbered leaves.
 
     Attributes:
-        places: array and place of each coordinate and velocity.
-        names: of parameters.
-        shapes: of formulas, as far as they are known.
-        rows: the places that occur, in order.
-        constants: numbers and parameters, in order, those of one name once.
+        places: array and index of each coordinate and velocity.
+        names: parameters.
+        shapes: cache of the structure of formulas.
+        rows: indices of the coordinates that occur, in order.
+        constants: numbers and parameters that occur, in order, without repetitions.
     """
 
     places: Mapping[Symbol, tuple[str, int]]
@@ -97,7 +96,7 @@ class _Term:
     constants: list[Expr] = field(default_factory=list)
 
     def write(self, formula: Expr) -> str:
-        """Its text; a place is {0}, a constant [0]."""
+        """Return the text of a formula; an index is {0}, a constant [0]."""
         if formula.is_Pow:
             exponent = str(formula.exp) if formula.exp.is_Number else self.write(formula.exp)
             return f"({self.write(formula.base)})**({exponent})"
@@ -114,7 +113,7 @@ class _Term:
         return str(formula)
 
     def shape(self, formula: Expr) -> str:
-        """The same without numbers of leaves."""
+        """Return the structure of a formula: its text without numbered leaves."""
         found = self.shapes.get(formula)
         if found is None:
             found = self.shapes[formula] = self._shape(formula)
@@ -132,7 +131,7 @@ class _Term:
 
 
 def _number(known: list[Item], item: Item) -> int:
-    """The place of an item in a list, at whose end it is put if it is not there."""
+    """Return the index of an item in a list, appending the item if necessary."""
     if item not in known:
         known.append(item)
     return known.index(item)

@@ -1,13 +1,13 @@
-"""Monitor functions g > 0: how long a unit of transformed time is, dt = g dtau, small where the motion is fast.
+"""Time-rescaling functions g > 0 of a time transformation dt = g dtau, small where the motion is fast.
 
-Each is a formula in the coordinates (for a Hamiltonian also in the momenta), made from the system itself:
+Each is a formula in the coordinates (for a Hamiltonian also in the momenta), derived from the system:
 
-* ``"frequency"``: (sum_ij (M^-1 V_qq)_ij^2)^(-1/4), the period of the fastest vibration, r^(3/2) for Kepler's problem
-  (a number in front, which would only rescale tau, is left out). It is the one to begin with near 1/r singularities.
+* ``"frequency"``: (sum_ij (M^-1 V_qq)_ij^2)^(-1/4), the time scale of the fastest vibration, r^(3/2) for Kepler's
+  problem (constant factors, which would only rescale tau, are omitted). The first choice near 1/r singularities.
 * ``"distance"``: (sum_pairs r^-3)^(-1/2) over the distances that occur in the potential: the same scale for bodies of
-  similar masses, and much shorter than the frequency's formula for many of them.
+  similar masses, and a much shorter formula than the frequency for many of them.
 * ``"potential"``: 1/(-V), for potentials that are negative everywhere.
-* ``"arclength"``: (p^T M^-2 p + V_q^T V_q)^(-1/2), equal lengths along the curve in phase space; it contains momenta.
+* ``"arclength"``: (p^T M^-2 p + V_q^T V_q)^(-1/2), equal arc lengths in phase space; it contains momenta.
 
 Sources: E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2-3; V. Duruisseaux, J. Schmitt,
 M. Leok, SIAM J. Sci. Comput. 43 (2021).
@@ -32,19 +32,19 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 __all__ = ["MONITORS", "monitor_function"]
 
 MOST_SIMPLIFIED = 200
-"""Operations of a formula that SymPy simplifies in a second: Kepler's comes out as 5 mu^2/r^6."""
+"""Maximum number of operations of a formula passed to ``simplify``, which takes about a second for so many."""
 
 
 def monitor_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: bool = False) -> Expr:
-    """The formula of a monitor: one by name, or text or an expression in coordinates, momenta and parameters.
+    """Return the formula of a time-rescaling function, from its name, from text or from an expression.
 
     Args:
-        system: what moves.
+        system: the mechanical system.
         monitor: a name among ``MONITORS``, or a formula.
-        in_time: whether it may depend on the time and on inputs, too.
+        in_time: whether it may also depend on time and on inputs.
 
     Raises:
-        SystemDefinitionError: for a formula in other symbols, and a name that the system is not fit for.
+        SystemDefinitionError: for a formula in other symbols, and a name that is not applicable to the system.
     """
     if isinstance(monitor, str) and monitor in MONITORS:
         return MONITORS[monitor](system)
@@ -79,7 +79,7 @@ def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
 
 
 def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr, dict[int, Expr]]:
-    """V(q) and the constant diagonal masses of T = sum m_i v_i^2 / 2."""
+    """Return V(q) and the constant diagonal masses of T = sum m_i v_i^2 / 2."""
     motion = system.auxiliaries or system.velocities
     function = forms_of(system).energy
     rest = function.xreplace(dict.fromkeys(motion, sympy.S.Zero))
@@ -145,4 +145,4 @@ def _arclength(system: MechanicalSystem) -> Expr:
 MONITORS: Mapping[str, Callable[[MechanicalSystem], Expr]] = MappingProxyType(
     {"frequency": _frequency, "distance": _distance, "potential": _potential, "arclength": _arclength}
 )
-"""By name."""
+"""Built-in time-rescaling functions by name."""

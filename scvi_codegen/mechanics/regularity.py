@@ -1,4 +1,4 @@
-"""Whether the Hessian of a function is regular: the mass matrix d2L/dv2 of a Lagrangian, d2H/dp2 of a Hamiltonian."""
+"""Regularity of Hessians: of the mass matrix d2L/dv2 of a Lagrangian, and of d2H/dp2 of a Hamiltonian."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Entries = Mapping[tuple[int, int], Expr]
 
 NEGLIGIBLE = mp.mpf(10) ** -40
 DEPENDENT = 1e-10
-"""Of the largest singular value: rows that depend on each other but for rounding."""
+"""Rank tolerance, relative to the largest singular value of the normalised rows."""
 LARGEST_NULL_SPACE = 8
 
 
 def row_rank(matrix: NDArray[np.float64]) -> int:
-    """How many rows of (n, m) numbers are independent, each by its own size."""
+    """Return the rank of a matrix of shape (n, m) after its rows are scaled to unit length."""
     if not matrix.size:
         return 0
     sizes = np.linalg.norm(matrix, axis=1, keepdims=True)
@@ -35,17 +35,17 @@ def row_rank(matrix: NDArray[np.float64]) -> int:
 def singular_part(
     scalar: Expr, variables: Sequence[Symbol], others: Sequence[Symbol], constants: Mapping[Symbol, float]
 ) -> tuple[tuple[Symbol, ...], Entries] | None:
-    """Variables, coupled with each other, whose block of the Hessian is singular wherever it was tried, and the block.
+    """Return coupled variables whose block of the Hessian is singular at every sampled point, and the block.
 
     Args:
         scalar: L or H.
         variables: with respect to which it is differentiated twice.
-        others: what else it may depend on.
+        others: other variables that it may depend on.
         constants: values of parameters.
 
     Returns:
-        ``None`` if every block is regular at one point at least, or could not be evaluated at any. An empty block says
-        that no choice of values could make it regular.
+        ``None`` if every block is regular at one point at least, or could not be evaluated at any. An empty block means
+        that the Hessian is structurally singular.
     """
     entries = hessian(scalar, variables)
     size = len(variables)
@@ -61,14 +61,14 @@ def singular_part(
             for j, column in enumerate(block)
             if (row, column) in entries
         }
-        points, same = tee(points)  # drawn once, as far as they are asked for
+        points, same = tee(points)  # points are drawn lazily, and shared by all blocks
         if _is_singular(local, len(block), same):
             return tuple(variables[index] for index in block), local
     return None
 
 
 def _is_singular(entries: Entries, size: int, points: Iterable[dict[Symbol, Number]]) -> bool:
-    """Whether a block is singular at every point at which it can be evaluated, and there is one."""
+    """Return whether a block is singular at every point where it has values, of which there is at least one."""
     if size == 1 and entries[0, 0].is_Rational:
         return False
     evaluated, tape = False, None
@@ -85,7 +85,7 @@ def _is_singular(entries: Entries, size: int, points: Iterable[dict[Symbol, Numb
 
 
 def null_direction(entries: Entries, variables: Sequence[Symbol]) -> str:
-    """A combination of variables along which a singular block vanishes, where cheap: few of them, rational entries."""
+    """Return a null vector of a singular block as text; empty for large blocks and irrational entries."""
     size = len(variables)
     if not entries or size > LARGEST_NULL_SPACE or not all(entry.is_Rational for entry in entries.values()):
         return ""
@@ -96,7 +96,7 @@ def null_direction(entries: Entries, variables: Sequence[Symbol]) -> str:
 def sample_points(
     variables: Sequence[Symbol], others: Sequence[Symbol], constants: Mapping[Symbol, float]
 ) -> Iterator[dict[Symbol, Number]]:
-    """Random points, always the same ones: the others of order 1/2, 1 and 10, the variables from 1/1000 to 1."""
+    """Yield reproducible random points: ``others`` of order 1/2, 1 and 10, ``variables`` from 1/1000 to 1."""
     generator = random.Random(20250101)
     fixed = {constant: mp.mpf(value) for constant, value in constants.items()}
 
@@ -109,7 +109,7 @@ def sample_points(
 
 
 def _structural_rank(entries: Entries, size: int) -> int:
-    # Imported here because SciPy is slow to import and most systems do not come here.
+    # imported here because SciPy is slow to import and rarely needed
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import structural_rank
 
@@ -118,7 +118,7 @@ def _structural_rank(entries: Entries, size: int) -> int:
 
 
 def coupled_blocks(entries: Entries, size: int) -> list[list[int]]:
-    """Indices of velocities that are coupled with each other, block by block."""
+    """Return the connected components of the variables, coupled by non-zero entries, as lists of indices."""
     neighbours: list[list[int]] = [[] for _ in range(size)]
     for row, column in entries:
         neighbours[row].append(column)
@@ -137,7 +137,7 @@ def coupled_blocks(entries: Entries, size: int) -> list[list[int]]:
 
 
 def _regular(matrix: dict[tuple[int, int], Number], size: int) -> bool:
-    """Eliminate with complete pivoting in 60 digits, each row scaled by its largest entry, zeros left out."""
+    """Return whether a matrix is regular, by elimination with complete pivoting in 60 digits on sparse, scaled rows."""
     rows: list[dict[int, Number]] = [{} for _ in range(size)]
     for (row, column), value in matrix.items():
         rows[row][column] = value

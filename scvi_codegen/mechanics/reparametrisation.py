@@ -1,19 +1,19 @@
-"""Transformed time: fixed steps in tau that are variable steps in t, and an exactly symplectic map all the same.
+"""Time transformation (Poincare): a fixed step size in fictitious time tau, a varying one in t, and a symplectic map.
 
-With dt = g dtau, g > 0 a monitor (:mod:`scvi_codegen.mechanics.monitors`), Poincare's transformation K = g (H - E)
-of an autonomous Hamiltonian has the same orbits on its level K = 0, that is H = E, run through in tau. Its Lagrangian,
-for g of the coordinates alone, is
+With dt = g dtau, where g > 0 (:mod:`scvi_codegen.mechanics.monitors`), Poincare's transformation K = g (H - E) of an
+autonomous Hamiltonian has the same orbits on the energy surface K = 0, that is H = E, parametrised by tau. If g
+depends on the coordinates only, its Lagrangian is
 
     L^(q, q') = g(q) (L(q, q'/g(q)) + E),                                       p = dL^/dq' = dL/dv unchanged,
 
-regular wherever L is. Every method and solver takes it as it takes L; E is a parameter, the energy of the initial
-state. Time is the integral of g along the curve, summed by the method's own quadrature.
+which is regular wherever L is. Every method and solver applies to it; E is a parameter, the energy of the initial
+state. Time is the integral of g along the curve, computed by the method's own quadrature.
 
 Sources: S. Reich, SIAM J. Numer. Anal. 36 (1999); E. Hairer, Appl. Numer. Math. 25 (1997); V. Duruisseaux, J. Schmitt,
 M. Leok, SIAM J. Sci. Comput. 43 (2021), where the singular p_t direction of K = g (H + p_t) rules a Lagrangian out;
 with p_t = -E constant it does not.
 
-A monitor may leave the system as it is, too, and choose the steps of its runs: see :func:`with_monitor`.
+Alternatively g may leave the system unchanged and control the step sizes of its runs: see :func:`with_monitor`.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from scvi_codegen.mechanics.system import SYSTEM, Clock, MechanicalSystem
 __all__ = ["CONTROLLERS", "reparametrise", "with_monitor"]
 
 CONTROLLERS = ("symplectic", "reversible")
-"""What a monitor may do: transform the time of a system, or control the steps of its runs."""
+"""Uses of a time-rescaling function: transform the time of a system, or control the step sizes of its runs."""
 
 ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
-"""Of the parameter that is the energy: the first that is free."""
+"""Candidate names of the energy parameter; the first that is unused is taken."""
 REVERSIBLE = 'the reversible controller: compile_stepper(..., monitor=...), controller = "reversible" in [run]'
 
 
 @takes(system=SYSTEM)
 def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
-    """The same motion in a time tau with dt = g dtau; constraints of positions hold in it as they did.
+    """Return the system in a fictitious time tau with dt = g dtau; holonomic constraints are unchanged.
 
     Args:
         system: an autonomous Lagrangian or Hamiltonian system.
@@ -53,10 +53,11 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             ``"frequency"``, ``"distance"``, ``"potential"``, ``"arclength"``.
 
     Returns:
-        A system of the same kind with one more parameter, the energy, and a ``clock`` that gives t.
+        A system of the same kind with one more parameter, the energy, and a ``clock``, the rate dt/dtau = g.
 
     Raises:
-        SystemDefinitionError: for a system that depends on time, constraints of velocities, and a monitor that is none.
+        SystemDefinitionError: if the system depends on time, has forces, damping or nonholonomic constraints, or is
+            transformed already, and for an invalid ``monitor``.
 
     >>> kepler = LagrangianSystem.from_text(
     ...     name="Kepler", coordinates=["r", "phi"], lagrangian="(r_dot**2 + r**2*phi_dot**2)/2 + 1/r")
@@ -107,17 +108,17 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
 def with_monitor(
     system: MechanicalSystem, monitor: str | Expr | None, controller: str | None = None
 ) -> tuple[MechanicalSystem, str | Expr | None]:
-    """A system whose pace a monitor sets, and the monitor where its stepper is to be compiled with it.
+    """Return the system to integrate under a time transformation, and the ``monitor`` for its stepper.
 
     Args:
-        system: what moves.
-        monitor: g of dt = g dtau, or ``None`` for steps without one.
+        system: the mechanical system.
+        monitor: g of dt = g dtau, or ``None`` for no time transformation.
         controller: ``"symplectic"`` (also ``None``): the system in transformed time, :func:`reparametrise`;
-            ``"reversible"``: as it is, for ``compile_stepper(..., monitor=...)``. Source of the names: E. Hairer,
+            ``"reversible"``: unchanged, for ``compile_stepper(..., monitor=...)``. Source of the names: E. Hairer,
             Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2 and VIII.3.
 
     Raises:
-        SystemDefinitionError: for a controller without a monitor, or that there is not, and as :func:`reparametrise`.
+        SystemDefinitionError: for a controller without a monitor, an unknown controller, and as :func:`reparametrise`.
     """
     if controller is not None and controller not in CONTROLLERS:
         raise SystemDefinitionError(f"a controller is {' or '.join(CONTROLLERS)}, not {controller!r}")
@@ -131,12 +132,12 @@ def with_monitor(
         raise SystemDefinitionError(
             f"the time of '{system.name}' is transformed already: its steps have one controller"
         )
-    monitor_function(system, monitor, in_time=True)  # refused here, not when the first step is wanted
+    monitor_function(system, monitor, in_time=True)  # validated here rather than at the first step
     return system, monitor
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:
-    """The factor on every term, so that powers of it meet."""
+    """Return factor * total with the factor multiplied into every term, so that its powers combine."""
     return sympy.Add(*(factor * term for term in sympy.Add.make_args(total)))
 
 

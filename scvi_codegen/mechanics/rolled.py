@@ -1,7 +1,7 @@
-"""A system of many like terms in two parts: what is written out, and families of terms that stand in loops.
+"""Systems of many similar terms in two parts: unrolled terms, and term groups that are evaluated in loops.
 
-The potentials of lattices, nets and many bodies are families of terms that differ in their coordinates and constants
-alone (:mod:`scvi_codegen.mechanics.like_terms`). What is derived of a family is derived of one term.
+The potentials of lattices, nets and many bodies consist of groups of terms that differ only in their coordinates and
+constants (:mod:`scvi_codegen.mechanics.like_terms`). A group is differentiated once, for one term.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 __all__ = ["LEAST_ROLLED", "Rolled", "RolledTerms", "rolled"]
 
 LEAST_ROLLED = 300
-"""Terms of one kind: of fewer the code is short enough written out, and shares what they have in common."""
+"""Minimum number of terms of a group; smaller ones are unrolled, which is short enough and shares subexpressions."""
 MOST_KINDS = 64
 
 
 @dataclass(frozen=True, slots=True)
 class RolledTerms:
-    """Terms of L that depend on coordinates, parameters and time.
+    """Group of similar terms of L that depend on coordinates, parameters and time.
 
     Attributes:
-        formula: of one, of ``slots`` and ``given``, parameters and time.
+        formula: of one term, in ``slots``, ``given``, parameters and time.
         slots: symbols of coordinates.
-        given: symbols of what differs from term to term.
-        places: the coordinates in the slots, by their number, of each term.
-        values: of each of ``given`` what it is in each term: numbers, or parameters.
+        given: symbols of the constants that differ between terms.
+        places: indices of the coordinates in ``slots``, for each term.
+        values: numbers or parameters, for each of ``given`` and each term.
     """
 
     formula: Expr
@@ -45,24 +45,24 @@ class RolledTerms:
     values: tuple[tuple[Expr, ...], ...]
 
     def where(self, chosen: Sequence[bool]) -> RolledTerms:
-        """Some of the terms."""
+        """Return the group with only the chosen terms."""
         places, *values = (tuple(compress(column, chosen)) for column in (self.places, *self.values))
         return replace(self, places=places, values=tuple(values))
 
     @property
     def slopes(self) -> tuple[Expr, ...]:
-        """The derivatives of the formula by its slots, factors of sums taken out: many share the rest."""
+        """Derivatives of the formula by ``slots``, with common factors extracted, since many share the rest."""
         found = gradient(self.formula, self.slots)
         return tuple(factor_terms(found.get(k, S.Zero)) for k in range(len(self.slots)))
 
 
 @dataclass(frozen=True, slots=True)
 class Rolled:
-    """The two parts.
+    """System split into unrolled terms and term groups.
 
     Attributes:
-        rest: the same system without the families.
-        families: of L; of -H where a Hamiltonian is given.
+        rest: the same system without the term groups.
+        families: term groups of L, or of -H for a Hamiltonian.
     """
 
     rest: MechanicalSystem
@@ -71,7 +71,7 @@ class Rolled:
 
 @lru_cache(maxsize=16)
 def rolled(system: MechanicalSystem) -> Rolled | None:
-    """The parts of a system; ``None`` of one that has no families so large, and with constraints or in other time."""
+    """Split a system; ``None`` without large term groups, with constraints, or with a time transformation."""
     terms = Add.make_args(system.formula)
     if len(terms) < LEAST_ROLLED or system.constraints or system.clock:
         return None
@@ -90,11 +90,11 @@ def rolled(system: MechanicalSystem) -> Rolled | None:
 
 
 _FUNCTION = {False: "lagrangian", True: "hamiltonian"}
-"""What gives a system, by whether it has momenta."""
+"""Field of the defining function of a system, by whether it has momenta."""
 
 
 def _families(kind: LikeTerms, system: MechanicalSystem) -> Iterator[RolledTerms]:
-    """Those of a kind: in each a constant is a number, or a parameter, of all terms."""
+    """Yield groups in which each constant is a number in all terms, or a parameter in all terms."""
 
     def pattern(constants: Sequence[Expr]) -> tuple[bool, ...]:
         return tuple(constant.is_Number for constant in constants)
@@ -128,7 +128,7 @@ def _family(
 
 
 def _merged(families: Sequence[RolledTerms]) -> tuple[RolledTerms, ...]:
-    """Families of the same places as one."""
+    """Merge groups with the same indices."""
     found: dict[tuple[tuple[int, ...], ...], RolledTerms] = {}
     for family in families:
         other = found.setdefault(family.places, family)
@@ -146,7 +146,7 @@ def _merged(families: Sequence[RolledTerms]) -> tuple[RolledTerms, ...]:
 
 
 def _stem(name: str, parameters: Sequence[Symbol]) -> str:
-    """The beginning of names that no parameter has."""
+    """Return a prefix of symbol names that no parameter has."""
     stem = f"{name}_"
     while any(parameter.name.startswith(stem) for parameter in parameters):
         stem += "_"

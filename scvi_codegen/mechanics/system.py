@@ -1,18 +1,18 @@
-"""What systems given by a Lagrangian and by a Hamiltonian have in common: names, parameters, and one function.
+"""Base class of systems defined by a Lagrangian or a Hamiltonian: names, parameters and one function.
 
-Everything behind the front end sees one thing, a function whose stationary action gives the motion:
+All later stages use one thing, a function whose stationary action gives the equations of motion:
 
-    L(q, v, t)            of a :class:`~scvi_codegen.mechanics.lagrangian.LagrangianSystem`, no auxiliaries,
-    p . v - H(q, p, t)    of a :class:`~scvi_codegen.mechanics.hamiltonian.HamiltonianSystem`, the momenta p its
-    auxiliaries
+    L(q, v, t)            of a :class:`~scvi_codegen.mechanics.lagrangian.LagrangianSystem`, no auxiliary variables,
+    p . v - H(q, p, t)    of a :class:`~scvi_codegen.mechanics.hamiltonian.HamiltonianSystem`, with the momenta p as
+    auxiliary variables
 
-(Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliaries are further unknowns at
-every point where the function is evaluated, and the action is stationary in them, too.
+(Hamilton's principle, and Hamilton's principle in phase space: paper, section 1.1). Auxiliary variables are further
+unknowns at every point where the function is evaluated; the action is stationary in them, too.
 
-A new kind of system is a frozen dataclass of :class:`MechanicalSystem` with these two, ``lagrangian`` and
-``auxiliaries``, and with ``formula``, what its user wrote; it checks itself when it is made. Methods and lowering ask
-for nothing else, and for what follows from them only through :func:`~scvi_codegen.mechanics.forms.forms_of`. Solvers
-without a matrix ask whether a Lagrangian with the same motion is known
+A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem` with the properties ``lagrangian``
+and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
+use nothing else, and expressions derived from them only through :func:`~scvi_codegen.mechanics.forms.forms_of`.
+Matrix-free solvers also use an equivalent Lagrangian, if one is known
 (:func:`~scvi_codegen.mechanics.hamiltonian.lagrangian_twin`).
 """
 
@@ -40,19 +40,19 @@ from scvi_codegen.mechanics.damping import check_damping
 __all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
 
 MOST_OPERATIONS = 200
-"""Of a formula that a notebook shows."""
+"""Maximum number of operations of a formula shown in a notebook."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """How time runs where the system moves in a transformed one, tau (:func:`reparametrise`).
+    """Time transformation dt = g dtau of a system that moves in fictitious time tau (:func:`reparametrise`).
 
     Attributes:
-        rate: dt/dtau, a function of the coordinates (of a Hamiltonian also of the momenta).
+        rate: g = dt/dtau, a function of the coordinates (for a Hamiltonian also of the momenta).
         energy: the parameter that is the energy of the initial state; the function of the system is then
-            rate (energy of the state - energy), zero along the motion.
-        monitor: the rate as it was asked for, by name or as text; it and ``plain`` are for model files.
-        plain: the system in its own time.
+            rate (energy of the state - energy), zero along trajectories.
+        monitor: the rate as requested, by name or as text; it and ``plain`` are for model files.
+        plain: the system in physical time.
     """
 
     rate: Expr
@@ -63,21 +63,22 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MechanicalSystem(ABC):
-    """Coordinates, time and parameters with default values; the function is the subclass's.
+    """Coordinates, time and parameters with default values; subclasses add the function.
 
     Attributes:
-        name: what the system is called.
+        name: name of the system.
         coordinates: the m coordinates, in order.
         time: the symbol ``t``.
         parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
         defaults: their default values, parallel to ``parameters``.
-        clock: how time runs, if not evenly.
-        forces: m forces beside those of the function (:mod:`scvi_codegen.mechanics.forces`), in (q, v, t) of a
-            Lagrangian and (q, p, t) of a Hamiltonian; none where there are none.
-        damping: the rate gamma at which all momenta shrink beside what else they do, a formula of parameters, 0 if
-            they do not (:mod:`scvi_codegen.mechanics.damping`).
-        inputs: names of what is data, each five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
-        constraints: what a Lagrangian's motion keeps at 0, in (q, t), or linear in v
+        clock: time transformation, if any.
+        forces: m generalised forces in addition to the function (:mod:`scvi_codegen.mechanics.forms`), in (q, v, t) for
+        a
+            Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
+        damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
+            (:mod:`scvi_codegen.mechanics.damping`).
+        inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
+        constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.constraints`).
     """
 
@@ -95,52 +96,52 @@ class MechanicalSystem(ABC):
     @property
     @abstractmethod
     def lagrangian(self) -> Expr:
-        """The function of (q, v, t) and of the auxiliaries whose action is stationary."""
+        """Function of (q, v, t) and of the auxiliary variables whose action is stationary."""
 
     @property
     @abstractmethod
     def auxiliaries(self) -> tuple[Symbol, ...]:
-        """Further variables of :attr:`lagrangian`, m or none."""
+        """Auxiliary variables of :attr:`lagrangian`, m or none."""
 
     @property
     @abstractmethod
     def formula(self) -> Expr:
-        """The function that defines the system: L or H."""
+        """Function that defines the system: L or H."""
 
     @property
     def dimension(self) -> int:
-        """The number m of coordinates."""
+        """Number m of coordinates."""
         return len(self.coordinates)
 
     @property
     def velocities(self) -> tuple[Symbol, ...]:
-        """The m velocities, parallel to ``coordinates``."""
+        """Symbols of the m velocities, parallel to ``coordinates``."""
         return tuple(symbol(coordinate.name + DOT) for coordinate in self.coordinates)
 
     @property
     def momentum_symbols(self) -> tuple[Symbol, ...]:
-        """The m momenta: of a Lagrangian ``p_`` and the coordinate, with ``_`` before it where that name is taken."""
+        """Symbols of the m momenta: for a Lagrangian ``p_`` and the coordinate, preceded by ``_`` if not unique."""
         taken = {given.name for given in (*self.coordinates, *self.velocities, *self.parameters)}
         return self.auxiliaries or tuple(symbol(_free(f"p_{q.name}", taken)) for q in self.coordinates)
 
     @property
     def constants(self) -> dict[Symbol, float]:
-        """Default value by parameter."""
+        """Default values by parameter."""
         return dict(zip(self.parameters, self.defaults, strict=True))
 
     @property
     def integrands(self) -> tuple[Expr, ...]:
-        """What a run integrates along its curve, in the coordinates and auxiliaries: the rate of the clock."""
+        """Functions integrated along the curve of each step: the rate dt/dtau of a time transformation."""
         return (self.clock.rate,) if self.clock else ()
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether time occurs in the function, a force or a constraint: energy is then not conserved."""
+        """True if time occurs in the function, a force or a constraint, so that energy is not conserved."""
         return any(self.time in formula.free_symbols for formula in (self.formula, *self.forces, *self.constraints))
 
     @property
     def changes_energy(self) -> str:
-        """Why energy is not conserved; nothing where it is."""
+        """Reason why energy is not conserved; empty if it is."""
         if self.forces or self.damping != 0:
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
@@ -149,12 +150,12 @@ class MechanicalSystem(ABC):
 
     @property
     def balances_energy(self) -> bool:
-        """Whether forces or damping change the energy, and nothing else: by their work."""
+        """True if the energy changes by the work of forces or damping only."""
         acted = bool(self.forces) or self.damping != 0
         return acted and not (self.formula.has(self.time) or self._constraints_work())
 
     def _constraints_work(self) -> bool:
-        """Whether the motions that constraints allow do not include rest: time in them, or A v + b = 0 with b."""
+        """Return whether constraints can do work: they contain time, or A v + b = 0 with non-zero b."""
         at_rest = dict.fromkeys(self.velocities, sympy.S.Zero)
         bound = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
         return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in bound)
@@ -164,15 +165,15 @@ class MechanicalSystem(ABC):
         return (key_of(self),)
 
     def to_text(self) -> str:
-        """The function as text that ``from_text`` reads back."""
+        """Return the function as text that ``from_text`` accepts."""
         return self.text_of(self.formula)
 
     def text_of(self, formula: Expr) -> str:
-        """A formula of the system's, with its inputs by their names."""
+        """Return a formula of the system as text, with its inputs by their names."""
         return format_expression(inputs_by_name(formula, self.inputs))
 
     def with_parameters(self, **values: float) -> Self:
-        """Copy the system with other default values for the parameters named."""
+        """Return a copy of the system with other default values for the named parameters."""
         names = [parameter.name for parameter in self.parameters]
         for key in values:
             if key not in names:
@@ -200,7 +201,7 @@ class MechanicalSystem(ABC):
         )
 
     def _force_facts(self) -> Iterator[tuple[str, Html]]:
-        """The forces, one on each line of a notebook's card."""
+        """Yield forces, damping and constraints as rows of a notebook's card."""
         for q, force in zip(self.coordinates, self.forces, strict=False):
             if force != 0:
                 yield f"force on {q.name}", plain(self.text_of(force))
@@ -210,7 +211,7 @@ class MechanicalSystem(ABC):
             yield "constraint", plain(f"{self.text_of(g)} = 0")
 
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
-        """Raise :class:`SystemDefinitionError` unless names, default values and the symbols of the formula fit."""
+        """Raise :class:`SystemDefinitionError` for invalid names, default values or symbols of the formulas."""
         if not isinstance(self.name, str) or not self.name.strip():
             raise SystemDefinitionError(f"a system needs a name, not {self.name!r}")
         if any("\ud800" <= character <= "\udfff" for character in self.name):
@@ -261,7 +262,7 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:
-    """Default value by name, whether symbols or names were given."""
+    """Return default values by name, for keys that are symbols or names."""
     given = {given_name(key): value for key, value in (parameters or {}).items()}
     if len(given) < len(parameters or {}):
         raise SystemDefinitionError("two parameters have the same name: rename one of them")
@@ -269,4 +270,4 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem (an IndexedSystem goes to compile_indexed)", MechanicalSystem)
-"""For :func:`~scvi_codegen.given.kinds.takes`."""
+"""Type check of mechanical systems, for :func:`~scvi_codegen.given.kinds.takes`."""

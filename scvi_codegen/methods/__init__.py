@@ -1,4 +1,4 @@
-"""Methods as data. Each knows its order, symmetry and symplecticity, and gives its stage equations for a system."""
+"""Integration methods: each has an order, symmetry and symplecticity, and defines its stage equations for a system."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ CALLED: Final = {
     "radau-iia": "radau",
     "composition": "yoshida",
 }
-"""By the name, what a method is called elsewhere."""
+"""Names used elsewhere, by method."""
 METHODS: dict[str, Callable[..., Method]] = {
     "svi": SVI,
     "scvi": SCVI,
@@ -74,10 +74,10 @@ METHODS: dict[str, Callable[..., Method]] = {
     "composition": Composition.of,
     "explicit-euler": ExplicitEuler,
 }
-"""Constructors by the name used in model files and on the command line; their signatures say what they take."""
+"""Constructors by the name used in model files and on the command line."""
 
 ARGUMENTS: dict[str, tuple[str, ...]] = {name: tuple(signature(make).parameters) for name, make in METHODS.items()}
-"""What each takes, by name."""
+"""Arguments of each constructor, by name."""
 
 REQUIRED: dict[str, tuple[str, ...]] = {
     name: tuple(key for key, value in signature(make).parameters.items() if value.default is Parameter.empty)
@@ -86,18 +86,18 @@ REQUIRED: dict[str, tuple[str, ...]] = {
 
 
 SIZES = ("degree", "stages", "order")
-"""The number that a name may end in: ``svi:6``."""
+"""Arguments that can follow the name of a method, as in ``svi:6``."""
 DEFAULT_SIZE = 8
-"""Where the name has none and the method needs one."""
+"""Default of a required degree, number of stages or order."""
 
 
 def as_method(method: Method | str, system: MechanicalSystem | None = None) -> Method:
-    """A method as it is, or of a name as the command line takes it: ``"svi"`` (degree 8), ``"svi:6"``, ``"gauss:3"``.
+    """Return a method from its name: ``"svi"`` (degree 8), ``"svi:6"``, ``"gauss:3"``; methods are returned unchanged.
 
-    With the points that the constraints of a system want.
+    For a system with constraints an SVI gets the quadrature points that they require.
 
     Raises:
-        MethodError: for an unknown name, a number that is none or that the method does not take, and other types.
+        MethodError: for an unknown name, an invalid number or one that the method does not accept, and other types.
     """
     if isinstance(method, Method):
         return method
@@ -107,12 +107,12 @@ def as_method(method: Method | str, system: MechanicalSystem | None = None) -> M
 
 
 def default_method(system: MechanicalSystem) -> Method:
-    """SVI(8); of a system with constraints, which hold at Lobatto's points, SVI(6) with these."""
+    """Return SVI(8); for a system with constraints, SVI(6) with Gauss-Lobatto points, at which they are imposed."""
     return as_method("svi:6", system) if system.constraints else SVI(8)
 
 
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
-    """With Lobatto's points, one more than the degree, for an SVI of constraints whose quadrature is not said."""
+    """Add the default quadrature of an SVI for constraints: Gauss-Lobatto points, one more than the degree."""
     wants = system is not None and system.constraints and specification.get("method") == "svi"
     if not wants or "quadrature" in specification or "degree" not in specification:
         return specification
@@ -120,10 +120,10 @@ def fitted(specification: Specification, system: MechanicalSystem | None) -> Spe
 
 
 def specification_of(name: str) -> dict[str, Any]:
-    """What a name says of a method: ``{"method": "svi", "degree": 6}`` of ``"svi:6"``.
+    """Return the specification of a method's name: ``{"method": "svi", "degree": 6}`` for ``"svi:6"``.
 
     Raises:
-        MethodError: for an unknown name, a number that is none or that the method does not take.
+        MethodError: for an unknown name, an invalid number or one that the method does not accept.
     """
     method, colon, number = name.partition(":")
     _check_name(method)
@@ -139,7 +139,7 @@ def specification_of(name: str) -> dict[str, Any]:
 
 
 def sized(specification: Specification) -> Specification:
-    """With the default degree, number of stages or order where a method needs one that is not given."""
+    """Add the default degree, number of stages or order if the method requires one that is missing."""
     name = str(specification.get("method"))
     size = size_of(name)
     needed = size is not None and size in REQUIRED[name]
@@ -147,7 +147,7 @@ def sized(specification: Specification) -> Specification:
 
 
 def size_of(name: str) -> str | None:
-    """What the number after a method's name is: ``"degree"`` of ``"svi"``, ``None`` of ``"explicit-euler"``."""
+    """Return the argument that follows a method's name: ``"degree"`` for ``"svi"``; ``None`` if it takes none."""
     return next((argument for argument in SIZES if argument in ARGUMENTS.get(name, ())), None)
 
 
@@ -163,10 +163,10 @@ def _listed(arguments: Sequence[str]) -> str:
 
 
 def method_from_specification(specification: Specification) -> Method:
-    """The method described by plain data such as ``{"method": "svi", "degree": 8, "quadrature": "gauss-legendre:8"}``.
+    """Return the method of plain data such as ``{"method": "svi", "degree": 8, "quadrature": "gauss-legendre:8"}``.
 
     Raises:
-        MethodError: on an unknown method, an argument it does not take, or one it needs.
+        MethodError: for an unknown method, an argument that it does not accept, or a missing one.
     """
     arguments: dict[str, Any] = dict(specification)
     name: Any = arguments.pop("method", None)

@@ -1,7 +1,4 @@
-"""Equations with unknowns v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at the stages of a tableau.
-
-V_i = v0 + sum_j a_ij z_j,       q_i = q0 + h sum_j a_ij V_j,       E(q_i, V_i, z_i / h, t_i) = 0.    (18)
-"""
+"""Stage equations in v0 and z_i = h (acceleration at c_i): Euler-Lagrange equations at stages of a tableau."""
 
 from __future__ import annotations
 
@@ -40,7 +37,7 @@ VELOCITY_BLOCK = Block(name="v_0", power=1, straight=(mp.zero, mp.one))
 
 
 def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
-    """(22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
+    """Return (22) on (q, v): unknowns v0 and z_i = h a_i; v0 from p0 by the Legendre transform, p1 from v1."""
     b, size = tableau.b, len(tableau.b)
     momenta = forms_of(system).momentum
     ones, none = Table.constant(1, 1, 1), Table.constant(1, size)
@@ -83,7 +80,7 @@ def residual_family(
     residual: Scatter,
     *others: Scatter,
 ) -> PointFamily:
-    """Collocation nodes of weight 1 with the Euler-Lagrange residual as kernel, scattered as ``residual`` says."""
+    """Return collocation nodes of weight 1 with the Euler-Lagrange residual as kernel, scattered by ``residual``."""
     return PointFamily(
         name="node",
         abscissae=abscissae,
@@ -95,7 +92,7 @@ def residual_family(
 
 
 def acceleration_unknowns(size: int) -> tuple[Block, ...]:
-    """The blocks v0, z_1 .. z_s of a curve given by its initial velocity and scaled accelerations."""
+    """Return the blocks v0, z_1 .. z_s of a curve with initial velocity v0 and scaled accelerations z_i."""
     return (
         VELOCITY_BLOCK,
         *(Block(name=f"z_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
@@ -105,7 +102,7 @@ def acceleration_unknowns(size: int) -> tuple[Block, ...]:
 def acceleration_gathers(
     system: MechanicalSystem, A: Matrix, *, other_blocks: int = 0
 ) -> tuple[Gather, Gather, Gather]:
-    """Position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
+    """Return position, velocity and acceleration at the stages from (q0, v0, z_1 .. z_s).
 
     V_i = v0 + sum_j a_ij z_j and q_i = q0 + h sum_j a_ij V_j; the coefficient of v0 is the row sum of A, which is c_i
     for collocation but not for every tableau.
@@ -127,7 +124,7 @@ def acceleration_gathers(
 
 
 def acceleration_extrapolation(tableau: Tableau) -> Matrix:
-    """The guess for the next step: v0 <- v1 = v0 + sum b_i z_i, accelerations extrapolated."""
+    """Return the predictor for the next step: v0 <- v1 = v0 + sum b_i z_i, accelerations by extrapolation."""
     inner = next_step(tableau.c)
     size = len(tableau.b)
     return ((mp.one, *tableau.b), *((mp.zero, *inner[i]) for i in range(size)))
@@ -136,7 +133,7 @@ def acceleration_extrapolation(tableau: Tableau) -> Matrix:
 def single_point(
     system: MechanicalSystem, name: str, abscissa: Number, position: Table, *, velocity_block: int = 0
 ) -> PointFamily:
-    """One point whose velocity is the block ``velocity_block`` alone; scatters are added by the caller."""
+    """Return a single point whose velocity is the block ``velocity_block``; the caller adds the scatters."""
     columns = len(position.entries[0])
     velocity = Table.named("", [[int(b == velocity_block + 1) for b in range(columns)]])
     return PointFamily(

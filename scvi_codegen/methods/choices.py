@@ -1,4 +1,4 @@
-"""What several methods are given, resolved and checked: nodes, quadrature, space of curves."""
+"""Validation of method arguments: nodes, quadrature and space of trial curves, given as objects or names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["resolve_nodes", "resolve_quadrature", "resolve_space"]
 
 
 def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quadrature:
-    """A quadrature given as an object, a name or not at all (then ``degree`` Gauss points)."""
+    """Return a quadrature from an object or a name; by default ``degree`` Gauss points."""
     if quadrature is None:
         return gauss_legendre(degree)
     if isinstance(quadrature, str):
@@ -22,7 +22,7 @@ def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quad
 
 
 def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
-    """A space given as an object, a name or not at all (then polynomials)."""
+    """Return a space of trial curves from an object or a name; by default polynomials."""
     if space is None:
         return Polynomials()
     if isinstance(space, str):
@@ -33,7 +33,7 @@ def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
 
 
 def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
-    """Nodes given as an object, a name or not at all (then Chebyshev-Lobatto), checked to contain both ends."""
+    """Return nodes from an object or a name, checked to contain both ends; by default Chebyshev-Lobatto nodes."""
     if nodes is None:
         nodes = "chebyshev-lobatto"
     if isinstance(nodes, str):

@@ -1,6 +1,6 @@
 """Spectral collocation (SC), (10)-(21), in position form (q, v) and in phase space (q, p).
 
-At the nodes x_1 .. x_s it is the collocation Runge-Kutta method (22)-(23) on the abscissae c_i = (x_i + 1)/2, and
+At the nodes x_1 .. x_s it is the collocation Runge-Kutta method (22)-(23) on the abscissae c_i = (x_i + 1)/2, and is
 compiled as such (:mod:`scvi_codegen.methods.runge_kutta`).
 """
 
@@ -42,7 +42,7 @@ class SpectralCollocation(Method):
     """Spectral collocation (SC): (18) in position form, (21) in phase space. Neither symplectic nor reversible.
 
     Args:
-        degree: degree s of the collocation polynomial; the nodes 1 .. s carry equations, node 0 does not.
+        degree: degree s of the collocation polynomial; equations are imposed at nodes 1 .. s, not at node 0.
         nodes: of that degree, containing both ends; default Chebyshev-Lobatto.
         form: ``"position"`` collocates the Euler-Lagrange equations, ``"phase-space"`` Hamilton's equations.
     """
@@ -58,48 +58,48 @@ class SpectralCollocation(Method):
 
     @property
     def node_set(self) -> Nodes:
-        """The nodes, resolved."""
+        """Collocation nodes."""
         assert isinstance(self.nodes, Nodes)
         return self.nodes
 
     @property
     def tableau(self) -> Tableau:
-        """The equivalent collocation Runge-Kutta tableau (23), on the nodes 1 .. s."""
+        """Equivalent collocation Runge-Kutta tableau (23), on the nodes 1 .. s."""
         return tableaux.collocation_tableau(self.node_set.abscissae[1:])
 
     @property
     def name(self) -> str:
-        """``sc-<degree>-<nodes>[-phase-space]``."""
+        """Name ``sc-<degree>-<nodes>[-phase-space]``."""
         return f"sc-{self.degree}-{self.node_set.name}" + ("-phase-space" if self.form == "phase-space" else "")
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         return f"Spectral collocation, degree {self.degree}, {self.node_set.name} nodes, {self.form} form"
 
     @property
     def order(self) -> int | None:
-        """From the equivalent tableau."""
+        """Order of the equivalent tableau."""
         return self.tableau.order
 
     @property
     def symmetric(self) -> bool:
-        """From the equivalent tableau."""
+        """True if the equivalent tableau is symmetric."""
         return self.tableau.is_symmetric
 
     @property
     def symplectic(self) -> bool:
-        """From the equivalent tableau, in phase space."""
+        """True if the form is phase space and the equivalent tableau symplectic."""
         return self.form == "phase-space" and self.tableau.is_symplectic
 
     @property
     def needs_regular(self) -> bool:
-        """In position form."""
+        """True if the form is position, which requires a regular Lagrangian."""
         return self.form == "position"
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The nodes; in phase space also the tableau, in which it is written."""
+        """Nodes; in phase space also the tableau in which the equations are written."""
         return (self.node_set,) if self.form == "position" else (self.node_set, self.tableau)
 
     def specification(self) -> Specification:
@@ -107,18 +107,18 @@ class SpectralCollocation(Method):
         return {"method": "sc", "degree": self.degree, "nodes": self.node_set.name, "form": self.form}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """The equivalent Runge-Kutta stage equations."""
+        """Return the equivalent Runge-Kutta stage equations."""
         return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """(18) with unknowns Q^1 .. Q^s and v0, or (21) with the stage velocities V_i as unknowns for H_p."""
+        """Return (18) with unknowns Q^1 .. Q^s and v0, or (21) with the stage velocities V_i as unknowns for H_p."""
         if self.form == "position":
             return nodal_collocation(system, self.node_set)
         return phase_space_system(system, self.tableau)
 
 
 def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
-    """(18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
+    """Return (18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
     size = nodes.degree
     momenta = forms_of(system).momentum
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
@@ -151,12 +151,12 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
 
 
 def nodal_blocks(nodes: Nodes) -> tuple[Block, ...]:
-    """Q^1 .. Q^s and v0."""
+    """Return the blocks Q^1 .. Q^s and v0."""
     return (*(position_block(v, nodes) for v in range(1, nodes.degree + 1)), VELOCITY_BLOCK)
 
 
 def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int = 0) -> tuple[Gather, Gather, Gather]:
-    """Q^i, V_i = (A Q + a0 q0)_i (15) and (A V + a0 v0)_i (16) at nodes 1 .. s, from (q0; Q^1 .. Q^s, v0)."""
+    """Return Q^i, V_i = (A Q + a0 q0)_i (15) and (A V + a0 v0)_i (16) at nodes 1 .. s, from (q0; Q^1 .. Q^s, v0)."""
     size = nodes.degree
     full = differentiation_matrix(nodes.points)[1:]
     first = tuple((line[0],) for line in full)

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
-"""Of a leapfrog step: forces at both ends, which neighbours share, or in the middle."""
+"""Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
 
 FIRST_HALVES = {
     2: (),
@@ -69,23 +69,23 @@ FIRST_HALVES = {
         "0.04967437063972987905456880",
     ),
 }
-"""gamma_1, gamma_2, .. up to the middle one, which makes the sum 1; by order."""
+"""Coefficients gamma_1, gamma_2, .. before the middle one, which makes the sum 1; by order."""
 
 
 def check_sequence(sequence: str) -> None:
-    """Raise :class:`MethodError` for another one."""
+    """Raise :class:`MethodError` for an unknown sequence."""
     if sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
         raise MethodError(f"a leapfrog step is a '{KICK_DRIFT_KICK}' or a '{DRIFT_KICK_DRIFT}', not {sequence!r}")
 
 
 def sequence_of(sequence: str) -> Specification:
-    """What a specification says of it: nothing of the usual one."""
+    """Return the entry of a specification for a sequence; empty for the default."""
     return {} if sequence == KICK_DRIFT_KICK else {"sequence": sequence}
 
 
 @dataclass(frozen=True, slots=True)
 class Composition(Method):
-    """Composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
+    """Symmetric composition of Stoermer-Verlet steps, for L = sum m_i v_i^2 / 2 - V(q, t) with constant masses.
 
     Args:
         order: 2 (Stoermer-Verlet itself), 8 (17 stages, Kahan & Li) or 10 (35 stages, Sofroniou & Spaletta).
@@ -105,54 +105,54 @@ class Composition(Method):
 
     @classmethod
     def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:
-        """The composition of an order."""
+        """Return the composition of an order."""
         return cls(order, sequence)
 
     @property
     def drifts_first(self) -> bool:
-        """As the sequence says."""
+        """True if each leapfrog step begins with a drift."""
         return self.sequence == DRIFT_KICK_DRIFT
 
     @property
     def exactness(self) -> Exactness:
-        """That of Stoermer-Verlet."""
+        """Exactness of Stoermer-Verlet, which composition preserves."""
         return Exactness(curve=1, quadrature=2, gauge=1)
 
     @property
     def implicit(self) -> bool:
-        """No."""
+        """Always false."""
         return False
 
     @property
     def fractions(self) -> Vector:
-        """(s,) gamma_1 .. gamma_s."""
+        """Fractions gamma_1 .. gamma_s of the step size, of shape (s,)."""
         half = tuple(mp.mpf(x) for x in FIRST_HALVES[self.composition_order])
         return (*half, 1 - 2 * mp.fsum(half), *reversed(half))
 
     @property
     def name(self) -> str:
-        """``composition-<order>``."""
+        """Name ``composition-<order>[-<sequence>]``."""
         return f"composition-{self.composition_order}{f'-{self.sequence}' * self.drifts_first}"
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         stages = len(self.fractions)
         return f"Composition of {stages} Stoermer-Verlet step{'s' * (stages > 1)}, order {self.composition_order}"
 
     @property
     def order(self) -> int | None:
-        """The order asked for."""
+        """Order of the composition."""
         return self.composition_order
 
     @property
     def symmetric(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
     @property
     def symplectic(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
     def specification(self) -> Specification:
@@ -160,16 +160,16 @@ class Composition(Method):
         return {"method": "composition", "order": self.composition_order, **sequence_of(self.sequence)}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns: the velocities V_k of the drifts; explicit, row after row."""
+        """Return the leapfrog equations; unknowns are the velocities V_k of the drifts, determined row after row."""
         return leapfrog_system(system, self)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """The same equations: the paper does not use the method."""
+        """Return the same equations: the paper does not use the method."""
         return self.stage_system(system)
 
 
 def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
-    """The leapfrog steps of a method one after the other; unknowns are the velocities V_k of the drifts.
+    """Return the leapfrog steps of a method, one after the other; unknowns are the velocities V_k of the drifts.
 
     Raises:
         MethodError: for a system that is not separable.
@@ -196,7 +196,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
 
 
 def _kick_family(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> PointFamily:
-    """L_q at the positions before, between and after the drifts; it kicks all velocities that follow."""
+    """Return L_q at the positions before, between and after the drifts, added to all later velocities (kicks)."""
     points, moving = ([k for k, x in enumerate(each) if x] for each in (kicks, drifts))
     drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
     before = tuple(tuple(int(n <= k) for k in moving) for n in points)
@@ -223,7 +223,7 @@ def _kick_family(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> Poi
 
 
 def _drift_family(system: MechanicalSystem, drifts: Vector) -> PointFamily:
-    """L_v at the velocity of each drift, which is its momentum."""
+    """Return L_v at the velocity of each drift, which is its momentum."""
     moving = [k for k, x in enumerate(drifts) if x]
     size = len(moving)
     return PointFamily(
@@ -249,9 +249,9 @@ def _drift_family(system: MechanicalSystem, drifts: Vector) -> PointFamily:
 
 
 def kicks_and_drifts(method: Method) -> tuple[Vector, Vector]:
-    """Weights of the kicks and of the drifts of a method, as many: kick 0, drift 0, kick 1, .., the last drift 0.
+    """Return the weights of the kicks and of the drifts: kick 0, drift 0, kick 1, .., the last drift being 0.
 
-    Where drifts come first, so do kick 0 with weight 0 and all drifts.
+    If drifts come first, kick 0 has weight 0.
     """
     padded = (mp.zero, *method.fractions, mp.zero)
     halves = tuple((a + b) / 2 for a, b in pairwise(padded))

@@ -1,29 +1,29 @@
 """Stage equations of a system with constraints: multipliers at points, and the momentum at the end.
 
-With Lobatto's points c_0 = 0 < .. < c_s = 1 as points of the quadrature, stationary is the discrete action with a
-multiplier at each,
+With Gauss-Lobatto points c_0 = 0 < .. < c_s = 1 as quadrature points, the discrete action with a multiplier at each is
+made stationary,
 
     h sum_n b_n [L(q_n, v_n) + lambda_n . g(q_n)],            g(q_n) = 0 for n = 1 .. s
 
-(g(q_0) = 0 is the end of the step before). lambda_s enters p1 alone, and puts it on the tangent space: with v the
-velocity that belongs to p1,
+(g(q_0) = 0 is the last condition of the previous step). lambda_s enters p1 only, and projects it onto the tangent
+space: with v the velocity of p1,
 
     p1 = L_v(q1, v),                                          g_q v + g_t = 0.
 
-That is the pair of Lobatto IIIA and IIIB: order 2s in positions and momenta, symmetric, symplectic on the constrained
-phase space, RATTLE for s = 1. With Gauss's points constraints would hold nowhere but there, and the order would fall.
+This is the Lobatto IIIA-IIIB pair: order 2s in positions and momenta, symmetric, symplectic on the constrained phase
+space, RATTLE for s = 1. With Gauss points constraints would hold only there, and the order would be reduced.
 
-Constraints of velocities, A v + b = 0, act by multipliers at the same points, as A^T lambda beside L_q; what they say
-is asked for at s Gauss points, where the velocity of a curve of degree s is best, and of v at the end:
+Nonholonomic constraints, A v + b = 0, act by multipliers at the same points, as A^T lambda in addition to L_q; they
+are imposed at s Gauss points, where the velocity of a curve of degree s is most accurate, and on v at the end:
 
     A(q(c_j)) q'(c_j) + b = 0 for j = 1 .. s,                 A(q1) v + b = 0.
 
-The order is 2s, measured, and the step symmetric; it is not symplectic, nor is the motion itself. Momenta of symmetries
-along which the constraints do not push are kept.
+The order is 2s, measured, and the step symmetric; like the nonholonomic flow it is not symplectic. Momentum maps of
+symmetries along which constraint forces do no work are conserved.
 
 Sources: L. Jay, SIAM J. Numer. Anal. 33 (1996); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 3.5; T.
-Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017). Other methods for constraints of velocities: R.
-McLachlan, M. Perlmutter, J. Nonlinear Sci. 16 (2006); D. Martin de Diego, R. Sato Martin de Almagro, arXiv 1810.10926.
+Wenger, S. Ober-Bloebaum, S. Leyendecker, Adv. Comput. Math. 43 (2017). Other nonholonomic methods: R. McLachlan, M.
+Perlmutter, J. Nonlinear Sci. 16 (2006); D. Martin de Diego, R. Sato Martin de Almagro, arXiv 1810.10926.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from scvi_codegen.tables.quadrature import gauss_legendre
 __all__ = ["END_VELOCITY", "with_constraints"]
 
 END_VELOCITY = "v_1"
-"""The unknown velocity that belongs to the momentum at the end."""
+"""Name of the unknown velocity that corresponds to the momentum at the end."""
 
 SAME = mp.mpf(10) ** -40
-"""Beside 1: velocities of a polynomial, in 60 digits."""
+"""Largest difference between equal coefficients of order 1, in 60 digits."""
 
 
 def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
-    """The stage equations with the constraints of the system; the same without any.
+    """Return the stage equations with the constraints of the system; unchanged if there are none.
 
     Raises:
         MethodError: unless the method, of this name, is an SVI of degree s with s + 1 points, both ends among them.
@@ -102,7 +102,7 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
 
 
 def _is_polynomial(family: PointFamily) -> bool:
-    """Whether the velocity at the last point follows from those at the others, as that of a curve of degree s does."""
+    """Return whether the velocity at the last point is interpolated by the others, as for a polynomial of degree s."""
     velocities, points = family.gathers[1].table.entries, family.abscissae
     others = Table(entries=velocities[:-1], names=family.gathers[1].table.names[:-1])
     last = _interpolated(others, cardinal_values(points[:-1], points[-1:]), "").entries[0]
@@ -110,7 +110,7 @@ def _is_polynomial(family: PointFamily) -> bool:
 
 
 def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
-    """The quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
+    """Return the quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
     assert family.scalar is not None
     points, factors = len(family.abscissae), constraint_multipliers(system)
     columns, rows = len(family.gathers[0].table.entries[0]), len(family.scatters[0].table.entries[0]) - 1
@@ -137,7 +137,7 @@ def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
 
 
 def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> tuple[PointFamily, ...]:
-    """What constraints say of velocities, at s Gauss points; nothing without such constraints."""
+    """Return the nonholonomic constraints at s Gauss points; empty if there are none."""
     held, size, rows = velocities_held(system), len(stages.blocks), len(stages.rows)
     if not any(held):
         return ()
@@ -165,14 +165,14 @@ def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily)
 
 
 def _interpolated(table: Table, weights: Matrix, name: str) -> Table:
-    """The table of other points, where entries are polynomials of the points."""
+    """Return the table at other points, where its entries are polynomials of the points."""
     columns = list(zip(*table.entries, strict=True))
     lines = [[mp.fdot(zip(line, column, strict=True)) for column in columns] for line in weights]
     return Table.named(name, lines, column=0)
 
 
 def _with_end(table: Table, rows: int, points: int) -> Table:
-    """A table of scatters with the row of p1 once more, of other sign, in that of L_v = p1; nothing for constraints."""
+    """Return a scatter table with the negative row of p1 added to that of L_v = p1, and zeros for constraints."""
     last = table.columns([rows])
     negative = Table(
         entries=tuple((-line[0],) for line in last.entries),
@@ -182,7 +182,7 @@ def _with_end(table: Table, rows: int, points: int) -> Table:
 
 
 def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFamily:
-    """L_v(q1, v) and the rates of the constraints at the end of the step."""
+    """Return L_v(q1, v) and the rates of the constraints at the end of the step."""
     size, rows = len(stages.blocks), len(stages.rows)
     others, column = Table.constant(1, 1 + points), [[0] * (1 + size) + [1] + [0] * points]
     momentum = [[0] * rows + [1] + [0] * (points + 1)]
@@ -205,9 +205,9 @@ def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFam
 
 
 def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
-    """Velocities on the polynomial through those of the curve and the one at the end; multipliers on theirs.
+    """Return the predictor: polynomials through the velocities of the curve and the final one; likewise multipliers.
 
-    The velocity at the end is as good as the step, those of the curve are not: it makes the guess one order better.
+    The final velocity has the order of the step, those of the curve have not: it raises the order of the guess by one.
     """
     blocks = stages.shape.blocks if isinstance(stages.shape, Velocities) else ()
     size, points, known = len(stages.blocks), len(abscissae), (*blocks, mp.one)
@@ -221,5 +221,5 @@ def _extrapolation(stages: StageSystem, abscissae: Vector) -> Matrix:
 
 
 def _ahead(known: Vector) -> Matrix:
-    """From values at points of a step to those that their polynomial has at the same points of the next."""
+    """Return the extrapolation from values at points of a step to the same points of the next step."""
     return cardinal_values([2 * c - 1 for c in known], [2 * c + 1 for c in known])

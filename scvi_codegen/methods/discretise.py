@@ -1,4 +1,4 @@
-"""System and method to the equations of one step."""
+"""Discretisation: the equations of one step for a system and a method."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["discretise", "paper_equations"]
 
 
 def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
-    """The equations as compiled, with momenta at the points where a Hamiltonian is given, multipliers for constraints.
+    """Return the compiled equations, with momenta at the points for a Hamiltonian and multipliers for constraints.
 
     Raises:
-        MethodError: for a system that the method does not serve.
+        MethodError: for a system that the method does not support.
     """
     stages = method.stage_system(system)
     check_regular(method, system)
@@ -28,13 +28,13 @@ def discretise(system: MechanicalSystem, method: Method) -> StageSystem:
 
 
 def paper_equations(system: MechanicalSystem, method: Method) -> StageSystem:
-    """The same equations as the paper prints them. Raises as :func:`discretise`."""
+    """Return the equations in the paper's notation. Raises as :func:`discretise`."""
     check_regular(method, system)
     return _completed(system, method.paper_form(system), method.name)
 
 
 def _completed(system: MechanicalSystem, stages: StageSystem, name: str) -> StageSystem:
-    """The equations with what the system has beside L."""
+    """Add auxiliary variables, constraints and damping to the equations."""
     return replace(with_constraints(system, with_auxiliaries(system, stages), name), damping=system.damping)
 
 

@@ -1,4 +1,4 @@
-"""Which momentum maps a method conserves exactly."""
+"""Exactness of methods: the momentum maps that they conserve to round-off."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ __all__ = ["Exactness"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exactness:
-    """What a method is known to conserve to round-off, for every step; the default claims nothing.
+    """Momentum maps that a method conserves to round-off at any step size; by default none is claimed.
 
     A variational method of degree s conserves a momentum map if the symmetry maps its curves to each other (A constant,
     b of degree s in t) and its quadrature is exact for df/dt along them (of degree d s + k - 1 for terms t^k q^d of f):
-    then L_d changes by what f does from end to end. Runge-Kutta methods in phase space conserve what is linear in
-    (t, q, p), symplectic ones what is quadratic. Of others nothing is claimed: a map may be conserved nevertheless.
+    L_d then changes by the difference of f between the ends. Runge-Kutta methods in phase space conserve momentum maps
+    linear in (t, q, p), symplectic ones also quadratic ones. Other momentum maps may be conserved without being
+    claimed.
 
     Attributes:
-        polynomials: degree of the polynomials in (t, q, p) that are conserved whenever the motion conserves them.
+        polynomials: degree of the polynomials in (t, q, p) that the method conserves whenever the flow does.
         curve, quadrature: degree of the curves, and order of the quadrature along them, of a variational method.
-        gauge: highest degree of f in q, where it is not the quadrature that bounds it.
+        gauge: highest degree of f in q, if bounded otherwise than by the quadrature.
     """
 
     polynomials: int = 0
@@ -31,14 +32,14 @@ class Exactness:
     gauge: float = math.inf
 
     def keeps(self, symmetry: Symmetry) -> bool:
-        """Whether the momentum map of a symmetry is conserved exactly."""
+        """Return whether the momentum map of a symmetry is conserved exactly."""
         terms = symmetry.degrees()
         if terms is None:
             return False
         return max(map(sum, terms)) <= self.polynomials or all(self._allows(*term) for term in terms)
 
     def _allows(self, k: int, d: int, e: int) -> bool:
-        """Whether a term t^k q^d p^e is one of the direction (e = 1) or gauge (e = 0) that the curves allow."""
+        """Return whether a term t^k q^d p^e is admissible: in the direction (e = 1) or the gauge (e = 0)."""
         if e == 0:
             return d <= self.gauge and d * self.curve + k <= self.quadrature
         return e == 1 and ((d == 0 and k <= self.curve) or (d == 1 and k == 0 <= self.curve))

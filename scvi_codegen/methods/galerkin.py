@@ -4,11 +4,11 @@ The discrete Lagrangian is the quadrature of L along a polynomial curve of degre
 
     L_d(Q^0 .. Q^s) = (h/2) sum_n w_n L(q(tau_n), qdot(tau_n), t_n),     q(tau) = sum_v Q^v l_v(tau),       (25)
 
-made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends on the
-degree and the quadrature alone: the nodes parametrise the same polynomials. Compiled, the curve is therefore given by
-the values V_b of its velocity at s points, whatever the nodes: Q = q0 + h sum_b a_nb V_b. Nothing else changes where
-the curves are not polynomials (:mod:`scvi_codegen.tables.spaces`), or where the quadrature uses derivatives of the
-integrand: then dL/dt = L_q v + L_v a + L_t along the curve is summed, too (paper, 4.2.3).
+made stationary in the interior coefficients (26a); p0 = -D_1 L_d and p1 = D_{s+1} L_d (27). The step depends only on
+the degree and the quadrature: the nodes parametrise the same polynomials. The compiled form therefore represents the
+curve by its velocities V_b at s points, for any nodes: Q = q0 + h sum_b a_nb V_b. The same holds for curves that are
+not polynomials (:mod:`scvi_codegen.tables.spaces`). If the quadrature uses derivatives of the integrand,
+dL/dt = L_q v + L_v a + L_t along the curve is summed as well (paper, 4.2.3).
 """
 
 from __future__ import annotations
@@ -58,11 +58,12 @@ class SVI(Method):
             polynomials.
 
     Raises:
-        MethodError: on a degree below 1, nodes without the end points or of another degree, or for curves other than
-            polynomials.
+        MethodError: for a degree below 1, for nodes without the end points or of another degree, and for nodes of
+        curves
+            that are not polynomials.
 
     Warns:
-        MethodWarning: with fewer quadrature points than the degree, where the stage equations are singular.
+        MethodWarning: with fewer quadrature points than the degree, for which the stage equations are singular.
     """
 
     degree: int
@@ -88,31 +89,31 @@ class SVI(Method):
 
     @property
     def curves(self) -> CurveSpace:
-        """The space of trial curves, resolved."""
+        """Space of trial curves."""
         assert isinstance(self.space, CurveSpace)
         return self.space
 
     @property
     def rule(self) -> Quadrature:
-        """The quadrature along the step."""
+        """Quadrature along the step."""
         assert isinstance(self.quadrature, Quadrature)
         return self.curves.along(self.quadrature)
 
     @property
     def node_set(self) -> Nodes:
-        """The nodes, resolved."""
+        """Nodes of the paper's parametrisation."""
         assert isinstance(self.nodes, Nodes)
         return self.nodes
 
     @property
     def name(self) -> str:
-        """``svi-<degree>-<quadrature>[-<curves>]``."""
+        """Name ``svi-<degree>-<quadrature>[-<curves>]``."""
         own = [] if self.curves.nodal else [self.curves.name]
         return "-".join(["svi", str(self.degree), self.rule.name, *own]).replace(":", "-").replace(" ", "-")
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         own = "" if self.curves.nodal else f" {self.curves.name},"
         return f"Galerkin spectral variational integrator,{own} degree {self.degree}, {self.rule.name}"
 
@@ -121,7 +122,7 @@ class SVI(Method):
         """min(2s, q, 2 (q - s + 1)), q the order of the quadrature; ``None`` with too few points, and for trigonometric
         curves.
 
-        The last bound is felt by rules whose order is hardly their number of points (Clenshaw-Curtis, Fejer): the
+        The last bound is attained by rules whose order hardly exceeds their number of points (Clenshaw-Curtis, Fejer):
         stationarity conditions integrate products with variations of degree s, which do not get smoother with h.
         """  # noqa: D205
         best, q = self.curves.order(self.degree), self.rule.order
@@ -131,27 +132,27 @@ class SVI(Method):
 
     @property
     def symmetric(self) -> bool:
-        """True for a symmetric quadrature along symmetric curves."""
+        """True if both the quadrature and the space of curves are symmetric."""
         return self.rule.symmetric and self.curves.symmetric
 
     @property
     def symplectic(self) -> bool:
-        """Always."""
+        """Always true."""
         return True
 
     @property
     def needs_regular(self) -> bool:
-        """With more (or fewer) points than the degree: velocities at the points are then not independent."""
+        """True if the number of points differs from the degree, so that velocities at the points are dependent."""
         return len(self.rule) != self.curves.dimension(self.degree) or bool(self.rule.derivative_weights)
 
     @property
     def needs_lagrangian(self) -> bool:
-        """With derivatives of L along the curve of positions, which a Hamiltonian does not have."""
+        """True if the quadrature uses derivatives of L along the curve, which a Hamiltonian does not provide."""
         return bool(self.rule.derivative_weights)
 
     @property
     def exactness(self) -> Exactness:
-        """Of the curves; with as many points as the degree and the highest order all that Gauss methods conserve."""
+        """Exactness of the curves; for the Gauss method also that of symplectic Runge-Kutta methods."""
         if not self.curves.nodal:
             return Exactness(curve=0)
         gauss = len(self.rule) == self.degree and self.rule.order == 2 * self.degree
@@ -159,12 +160,12 @@ class SVI(Method):
 
     @property
     def frequency(self) -> float | None:
-        """That of trigonometric curves."""
+        """Fitted frequency of trigonometric curves, in radians per step."""
         return self.curves.fitted
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """Nodes of polynomials, and the quadrature along the step."""
+        """Nodes (of polynomials) and the quadrature along the step."""
         return (self.node_set, self.rule) if self.curves.nodal else (self.rule,)
 
     def specification(self) -> Specification:
@@ -176,7 +177,7 @@ class SVI(Method):
         return common | {"space": self.curves.name}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns V_b at the quadrature points if there are s of them, else at points of the space of curves."""
+        """Return the stage equations; unknowns are velocities V_b at the points of :meth:`CurveSpace.points`."""
         return self._equations(system, rounded=True)
 
     def _equations(self, system: MechanicalSystem, *, rounded: bool) -> StageSystem:
@@ -197,9 +198,9 @@ class SVI(Method):
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c).
+        """Return the equations with unknowns Q^1 .. Q^s, rows (27a) and (27b), p1 by (27c).
 
-        Of curves other than polynomials, and of quadratures with derivatives, the compiled equations, all digits kept.
+        For curves other than polynomials, and quadratures with derivatives, the compiled equations with all digits.
         """
         if not self.curves.nodal or self.rule.derivative_weights:
             return self._equations(system, rounded=False)

@@ -1,6 +1,6 @@
-"""The equations of Galerkin methods: stationary quadratures of L along curves, (25)-(27).
+"""Stage equations of Galerkin methods: stationary quadratures of L along curves, (25)-(27).
 
-Compiled, a curve is given by the values V_b of its velocity at s points: Q = q0 + h sum_b a_nb V_b. In the paper's
+The compiled form represents a curve by its velocities V_b at s points: Q = q0 + h sum_b a_nb V_b. In the paper's
 notation it is the polynomial through the positions Q^v at the nodes.
 """
 
@@ -50,20 +50,22 @@ def galerkin_system(
     derivatives: Sequence[Matrix] = (),
     rounded: bool = True,
 ) -> StageSystem:
-    """Stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1 = q0 + h sum_b beta_b V_b.
+    """Return the stationarity of h sum_n w_n L(q0 + h sum_b a_nb V_b, sum_b l_nb V_b, t_n) at fixed q1.
+
+    The end point is q1 = q0 + h sum_b beta_b V_b.
 
     Args:
-        system: the Lagrangian.
+        system: the mechanical system.
         abscissae: (g,) points in [0, 1].
         weights: (g,) with sum 1.
         position: (g, s) matrix a.
         velocity: (g, s) matrix l.
         end_position: (s,) vector beta.
-        extrapolation: (s, s), the guess for the next step.
-        blocks: (s,) where the velocities are; left out, the points.
+        extrapolation: (s, s) predictor for the next step.
+        blocks: (s,) abscissae of the velocities V_b; by default ``abscissae``.
         derivative_weights: rows of (g,) weights of h^k d^k L/dt^k, k = 1, 2, ..
         derivatives: as many (g, s) matrices of the k-th derivatives of the l_nb.
-        rounded: whether tables are those of doubles, or have all their digits.
+        rounded: whether to round tables to doubles that preserve symplecticity, instead of keeping all digits.
     """
     size = len(end_position)
     shape = exact = Velocities(
@@ -94,16 +96,16 @@ def galerkin_system(
 def action_families(
     system: MechanicalSystem, abscissae: Vector, weights: Matrix, gathers: tuple[Gather, ...]
 ) -> tuple[ScalarFamily, ...]:
-    """sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at the points of a curve, a family for each row of weights (paper, 4.2.3).
+    """Return sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at points of a curve, a family per row of weights (paper, 4.2.3).
 
     Args:
-        system: the Lagrangian.
+        system: the mechanical system.
         abscissae: (g,) points in [0, 1].
         weights: rows of (g,) weights, of L first, then of its derivatives.
         gathers: position, velocity and as many further derivatives of the curve as L has.
 
     Raises:
-        MethodError: for derivatives of the L of a Hamiltonian, which depends on momenta, too.
+        MethodError: for derivatives of the L of a Hamiltonian, which depends on momenta, or of a system with forces.
     """
     if len(weights) > 1 and system.auxiliaries:
         raise MethodError(
@@ -132,7 +134,7 @@ def action_families(
 
 
 def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Sequence[Matrix]) -> tuple[Gather, ...]:
-    """Q, v and as many further time derivatives of the curve as there are tables."""
+    """Return Q, v and further time derivatives of the curve, one per table."""
     points = len(position)
     rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
     place = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
@@ -152,9 +154,9 @@ def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Seque
 def nodal_quadrature_family(
     system: MechanicalSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
 ) -> ScalarFamily:
-    """The quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
+    """Return the quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
 
-    ``other_blocks`` unknown blocks behind Q^s (velocities, multipliers) do not move the curve.
+    The curve does not depend on the ``other_blocks`` unknowns after Q^s (velocities, multipliers).
     """
     padding = Table.constant(len(rule), other_blocks)
     values = Table.named("l", cardinal_values(nodes.points, rule.points), column=0)
@@ -175,5 +177,5 @@ def nodal_quadrature_family(
 
 
 def position_block(v: int, nodes: Nodes) -> Block:
-    """The unknown Q^v, first guessed on the straight line."""
+    """Return the block of the unknown Q^v, whose initial guess is on the straight line."""
     return Block(name=f"Q_{v}", power=0, straight=(mp.one, nodes.abscissae[v]))

@@ -1,10 +1,10 @@
-"""What every method is: frozen data that knows its properties and gives its stage equations for a system.
+"""Base class of integration methods: frozen data with properties and stage equations for a system.
 
-A method is a frozen dataclass of :class:`Method` in a file of its own and a line in ``METHODS``
-(:mod:`scvi_codegen.methods`). It must give a name, a title, its order, whether it is symmetric and symplectic, a
-specification, and two readings of its equations, which may be one: as compiled, and as the paper prints them. What else
-others ask of it (solvers, certificates, momentum maps) has an answer here that claims nothing, which it may better.
-Nobody outside of this folder asks what kind of method it is.
+A method is a frozen dataclass derived from :class:`Method` in a file of its own and a line in ``METHODS``
+(:mod:`scvi_codegen.methods`). It must define a name, a title, its order, whether it is symmetric and symplectic, a
+specification, and two forms of its equations, which may coincide: as compiled, and as printed in the paper. Other
+properties (for solvers, verification reports, momentum maps) have defaults here that claim nothing and may be
+overridden. Code outside this package does not distinguish between kinds of methods.
 """
 
 from __future__ import annotations
@@ -40,82 +40,82 @@ __all__ = [
 ]
 
 degree_count = partial(checked_count, least=1, most=MOST_STAGES, error=MethodError)
-"""A degree, or a number of stages."""
+"""Validation of a degree or a number of stages."""
 
 Specification = Mapping[str, str | int | bool | Sequence[float]]
 
 
 class Method(ABC):
-    """One-step method for the Euler-Lagrange equations: (t, q0, p0), h -> (q1, p1)."""
+    """Base class of one-step methods for the Euler-Lagrange equations: (t, q0, p0), h -> (q1, p1)."""
 
     __slots__ = ()
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """Short identifier, unique among methods: ``"svi-8-gauss-legendre-8"``."""
+        """Identifier, unique among methods: ``"svi-8-gauss-legendre-8"``."""
 
     @property
     @abstractmethod
     def order(self) -> int | None:
-        """Order of convergence in h for smooth regular systems; ``None`` where none is claimed."""
+        """Order of convergence in h for smooth regular systems; ``None`` if none is claimed."""
 
     @property
     @abstractmethod
     def symmetric(self) -> bool:
-        """Whether the step with -h undoes the step with h."""
+        """True if the step with -h is the inverse of the step with h."""
 
     @property
     @abstractmethod
     def symplectic(self) -> bool:
-        """Whether the step preserves dq ^ dp for every regular Lagrangian."""
+        """True if the step preserves dq ^ dp for every regular Lagrangian."""
 
     @property
     def needs_regular(self) -> bool:
-        """Whether momenta must be determined by velocities: for a Hamiltonian, d2H/dp2 regular."""
+        """True if velocities must determine momenta: for a Hamiltonian, d2H/dp2 must be regular."""
         return False
 
     @property
     def needs_lagrangian(self) -> bool:
-        """Whether a Hamiltonian will not do."""
+        """True if the method applies to Lagrangians only."""
         return False
 
     @property
     def exactness(self) -> Exactness:
-        """Which momentum maps are conserved to round-off; by default none is claimed."""
+        """Momentum maps conserved to round-off; by default none is claimed."""
         return Exactness()
 
     @property
     def fractions(self) -> Vector:
-        """Sizes of the leapfrog steps, as fractions of h, that the step consists of where L is separable; or none.
+        """Fractions of h of the leapfrog steps that form a step for separable L; empty for other methods.
 
-        With some the method is explicit there.
+        A method with fractions is explicit for separable L.
         """
         return ()
 
     @property
     def drifts_first(self) -> bool:
-        """Whether each of these leapfrog steps is a drift, a kick and a drift, not a kick, a drift and a kick."""
+        """True if its leapfrog steps are drift-kick-drift instead of kick-drift-kick."""
         return False
 
     @property
     def implicit(self) -> bool:
-        """Whether there are equations to solve; not for methods that are nothing but leapfrog steps."""
+        """True if a step requires the solution of equations; false for compositions of leapfrog steps."""
         return True
 
     @property
     def frequency(self) -> float | None:
-        """In radians a step, where the curves are fitted to one: then nothing is promised for h to 0."""
+        """Fitted frequency in radians per step, or ``None``; with one, no order for h to 0 is claimed."""
         return None
 
     @property
     @abstractmethod
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The nodes, quadrature and tableau that its numbers are made from."""
+        """Nodes, quadrature and tableau that the method is made from."""
         return ()
 
     def _repr_html_(self) -> str:
@@ -133,19 +133,19 @@ class Method(ABC):
 
     @abstractmethod
     def specification(self) -> Specification:
-        """The method as plain data, read back by ``method_from_specification`` (model files, command line)."""
+        """Return the method as plain data that ``method_from_specification`` accepts (model files, command line)."""
 
     @abstractmethod
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """The equations as compiled: velocities as unknowns."""
+        """Return the compiled equations, with velocities as unknowns."""
 
     @abstractmethod
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """The equations as the paper prints them."""
+        """Return the equations in the paper's notation."""
 
 
 def check_regular(method: Method, system: MechanicalSystem) -> None:
-    """Raise :class:`MethodError` for a Hamiltonian that determines no velocities and a method that needs them."""
+    """Raise :class:`MethodError` for a Hamiltonian with singular d2H/dp2 and a method that requires regularity."""
     if method.needs_regular and isinstance(system, HamiltonianSystem) and not system.is_regular:
         raise MethodError(
             f"{method.name} needs a Hamiltonian that determines momenta by velocities, but d2H/dp2 of '{system.name}' "
@@ -155,19 +155,19 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
 
 
 def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Whether the steps preserve dq ^ dp: of a symplectic method, where no forces act and nothing holds velocities."""
+    """Return whether the steps preserve dq ^ dp: not with forces, damping or nonholonomic constraints."""
     return system.damping == 0 and is_conformally_symplectic(method, system)
 
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Whether they multiply dq ^ dp by exp(-gamma h), gamma the damping, with nothing else that changes it."""
+    """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
     return method.symplectic and not system.forces and not any(velocities_held(system))
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:
-    """Weights in [0, 1] rounded to multiples of 2^-52, the largest adjusted so that they sum to exactly 1.
+    """Round weights in [0, 1] to multiples of 2^-52 and adjust the largest so that they sum to exactly 1.
 
-    Weights whose sum is not 1 (of an unusual quadrature) are rounded only.
+    Weights whose sum is not 1 (of an unusual quadrature) are only rounded.
     """
     rounded = list(dyadic([weights])[0])
     excess = mp.fsum(rounded) - 1
@@ -180,7 +180,7 @@ def unit_sum(weights: Sequence[Number]) -> Vector:
 def lagrangian_scatters(
     family: PointFamily, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
 ) -> PointFamily:
-    """``family`` with L_q and L_v as kernel results, scattered as given (their ``results`` are filled in)."""
+    """Return ``family`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
     filled = (
         _with_results(force_scatter, forms_of(system).force),
         _with_results(momentum_scatter, forms_of(system).momentum),

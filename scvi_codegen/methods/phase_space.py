@@ -1,13 +1,13 @@
-"""Stage equations of a system given by its Hamiltonian: the momenta at the points become unknowns, too.
+"""Stage equations of a Hamiltonian system: the momenta at the points become unknowns.
 
-Methods write their equations as if L were known. Where the function of the system is p . v - H their kernels depend on
-momenta p_n at the points; each family of points gets them as further blocks, with the rows in which the action is
-stationary in them,
+Methods write their equations in terms of L. If the function of the system is p . v - H, their kernels depend on
+momenta p_n at the points; each group of points gets them as further blocks, with rows that make the action stationary
+in them,
 
     0 = v_n - H_p(q_n, p_n)                                                                            (35f),
 
-and, where a multiplied residual is stationary (shooting), one pair of such rows a node. With d2H/dp2 regular the method
-is the one of the Lagrangian, step for step: (35f) is Legendre's transform at the points.
+and one such pair of rows per node where a multiplied residual is made stationary (shooting). If d2H/dp2 is regular,
+the method equals that of the Lagrangian, step for step: (35f) is the Legendre transform at the points.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from scvi_codegen.tables.precision import Matrix, Vector, mp
 __all__ = ["with_auxiliaries"]
 
 NUMBERS = {"34a": "35a", "34c": "35c", "34d": "35d", "34e": "35e"}
-"""The paper's numbers of the shooting method in phase space."""
+"""Equation numbers of the paper for the shooting method in phase space, by those for Lagrangians."""
 BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", "start": "S", "end": "E", "drift": "P"}
-"""Of the momenta at the points of a family."""
+"""Names of the momenta at the points, by group of points."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Group:
-    """M unknowns a point of one family: symbols, equations, and the matrix of their next guess."""
+    """Group of m unknowns per point of one family: symbols, equations, and the matrix of their predictor."""
 
     family: int
     name: str
@@ -45,7 +45,7 @@ class _Group:
 
 
 def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSystem:
-    """The stage equations with the auxiliaries of the system at all points that need them; the same without any."""
+    """Return the stage equations with auxiliary variables at all points that need them; unchanged if there are none."""
     groups = [group for f, family in enumerate(stages.families) for group in _groups(system, f, family)]
     if not groups:
         return stages
@@ -68,7 +68,7 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
 
 
 def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_Group]:
-    """The auxiliaries that occur in a family, and the multipliers of their equations."""
+    """Yield the auxiliary variables that occur in a family, and the multipliers of their equations."""
     free = set().union(*(result.free_symbols for result in family.results))
     free |= family.scalar.free_symbols if family.scalar is not None else set()
     points = family.abscissae
@@ -87,7 +87,7 @@ def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_
 def _stationary(
     system: MechanicalSystem, family: PointFamily, symbols: Sequence[sympy.Symbol]
 ) -> tuple[sympy.Expr, ...]:
-    """What vanishes: the gradient of the family's scalar by these symbols, v - H_p where there is none."""
+    """Return the equations of these symbols: the gradient of the family's scalar, or v - H_p if it has none."""
     if family.scalar is None:
         return forms_of(system).constitutive
     slopes = gradient(family.scalar, symbols)
@@ -102,7 +102,7 @@ def _block(group: _Group, n: int) -> Block:
 def _extended(
     family: PointFamily, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
 ) -> PointFamily:
-    """A family with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
+    """Return a family with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
     points, rows = len(family.abscissae), len(family.scatters[0].table.entries[0]) - 1
     none = Table.constant(points, len(added))
     gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in family.gathers]
@@ -117,12 +117,12 @@ def _extended(
 
 
 def _inserted(table: Table, columns: Table, at: int) -> Table:
-    """``columns`` before the last one of ``table``, that of p1."""
+    """Insert ``columns`` before the last column of ``table``, that of p1."""
     return Table.joined(table.columns(range(at)), columns, table.columns([at]))
 
 
 def _diagonal(blocks: Sequence[Matrix]) -> Matrix:
-    """The block diagonal matrix."""
+    """Return the block diagonal matrix."""
     size, offset = sum(map(len, blocks)), 0
     lines: list[Vector] = []
     for block in blocks:

@@ -1,7 +1,7 @@
 """Runge-Kutta methods, (22)-(23), in phase space (q, p) and in position-velocity form (q, v).
 
 Spectral collocation at the nodes x_1 .. x_s is the collocation Runge-Kutta method (22)-(23) on the abscissae
-c_i = (x_i + 1)/2, so the compiled form of all of them is a tableau (A, b, c). On Hamilton's equations, with stage
+c_i = (x_i + 1)/2, so the compiled form of both is a tableau (A, b, c). On Hamilton's equations, with stage
 velocities V_i as unknowns,
 
     q_i = q0 + h sum_j a_ij V_j,     L_v(q_i, V_i) = p0 + h sum_j a_ij L_q(q_j, V_j),                   (22), (21)
@@ -10,7 +10,7 @@ and on (q, v), with v0 and z_i = h (acceleration at c_i) as unknowns,
 
     V_i = v0 + sum_j a_ij z_j,       q_i = q0 + h sum_j a_ij V_j,       E(q_i, V_i, z_i / h, t_i) = 0,    (18)
 
-E the Euler-Lagrange residual. When the mass is not constant these are two different maps.
+where E is the Euler-Lagrange residual. If the mass is not constant these are two different maps.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ FORMS = ("phase-space", "position")
 
 @dataclass(frozen=True, slots=True)
 class RungeKutta(Method):
-    """A Runge-Kutta method on Hamilton's equations (``form="phase-space"``) or on (q, v) (``form="position"``).
+    """Runge-Kutta method on Hamilton's equations (``form="phase-space"``) or on (q, v) (``form="position"``).
 
     Args:
         tableau: (A, b, c); its order, symmetry and symplecticity are computed from the coefficients (paper, Table 4).
@@ -81,39 +81,39 @@ class RungeKutta(Method):
 
     @property
     def name(self) -> str:
-        """``<tableau>`` or ``<tableau>-position``."""
+        """Name ``<tableau>`` or ``<tableau>-position``."""
         base = self.tableau.name.replace(":", "-")
         return base if self.form == "phase-space" else f"{base}-position"
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         stages = len(self.tableau.b)
         return f"Runge-Kutta {self.tableau.name}, {stages} stage{'s' * (stages > 1)}, {self.form} form"
 
     @property
     def order(self) -> int | None:
-        """From the simplifying conditions of the tableau."""
+        """Order by the simplifying conditions of the tableau."""
         return self.tableau.order
 
     @property
     def symmetric(self) -> bool:
-        """From the tableau."""
+        """True if the tableau is symmetric."""
         return self.tableau.is_symmetric
 
     @property
     def symplectic(self) -> bool:
-        """From the tableau; never promised in position form, where p is not an unknown."""
+        """True if the tableau is symplectic and the form phase space; in position form p is not an unknown."""
         return self.form == "phase-space" and self.tableau.is_symplectic
 
     @property
     def needs_regular(self) -> bool:
-        """In position form."""
+        """True if the form is position, which requires a regular Lagrangian."""
         return self.form == "position"
 
     @property
     def exactness(self) -> Exactness:
-        """In phase space linear maps, quadratic ones where it is symplectic; Gauss methods are variational."""
+        """Exactness in phase space: linear maps, quadratic ones if symplectic; Gauss methods are variational."""
         if self.form == "position":
             return Exactness()
         stages = len(self.tableau.b)
@@ -123,7 +123,7 @@ class RungeKutta(Method):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The tableau."""
+        """Tableau."""
         return (self.tableau,)
 
     def specification(self) -> Specification:
@@ -136,7 +136,7 @@ class RungeKutta(Method):
         return {"method": "collocation", "abscissae": [float(c) for c in self.tableau.c], "form": self.form}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Symplectic tableaux by their generating function (exactly symplectic when rounded), others as they are."""
+        """Return stage equations: from a generating function for symplectic tableaux, otherwise (22)."""
         tableau = self.tableau
         if self.form == "position":
             return position_system(system, tableau)
@@ -154,12 +154,12 @@ class RungeKutta(Method):
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """The stage equations (22)-(23)."""
+        """Return the stage equations (22)-(23)."""
         return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
 
 
 def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
-    """(22) on Hamilton's equations, momenta eliminated by p_i = L_v(q_i, V_i)."""
+    """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
     family = PointFamily(
         name="stage",
@@ -222,49 +222,49 @@ def _transposed_row(column: Table) -> Table:
 
 
 def check_form(form: str) -> None:
-    """Raise :class:`MethodError` for a form that does not exist."""
+    """Raise :class:`MethodError` for an unknown form."""
     if form not in FORMS:
         raise MethodError(f"form must be 'phase-space' or 'position', not {form!r}")
 
 
 @takes(MethodError, abscissae=NUMBERS)
 def CollocationRK(abscissae: Sequence[float], *, form: str = "phase-space") -> RungeKutta:
-    """Collocation Runge-Kutta method (22)-(23) on any distinct abscissae c_1 < .. < c_s, usually in [0, 1]."""
+    """Return the collocation Runge-Kutta method (22)-(23) on distinct abscissae c_1 < .. < c_s, usually in [0, 1]."""
     return RungeKutta(tableaux.collocation_tableau(tuple(abscissae)), form)
 
 
 def Gauss(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Gauss collocation: order 2 stages, symplectic, symmetric, A-stable (paper, Tables 1-3)."""
+    """Return the Gauss collocation method: order 2 stages, symplectic, symmetric, A-stable (paper, Tables 1-3)."""
     return RungeKutta(tableaux.gauss(stages), form)
 
 
 def RadauIIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Radau IIA collocation: order 2 stages - 1, A-stable, stiffly accurate."""
+    """Return the Radau IIA collocation method: order 2 stages - 1, A-stable, stiffly accurate."""
     return RungeKutta(tableaux.radau_iia(stages), form)
 
 
 def RadauIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Radau IA: order 2 stages - 1, A-stable; not a collocation method."""
+    """Return the Radau IA method: order 2 stages - 1, A-stable; not a collocation method."""
     return RungeKutta(tableaux.radau_ia(stages), form)
 
 
 def LobattoIIIA(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Lobatto IIIA collocation: order 2 stages - 2, symmetric, A-stable."""
+    """Return the Lobatto IIIA collocation method: order 2 stages - 2, symmetric, A-stable."""
     return RungeKutta(tableaux.lobatto_iiia(stages), form)
 
 
 def ChebyshevGauss(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Collocation at the Chebyshev points of the first kind: order s (even s) or s + 1 (odd s), symmetric."""
+    """Return collocation at the Chebyshev points of the first kind: order s (even s) or s + 1 (odd s), symmetric."""
     return RungeKutta(tableaux.chebyshev_gauss(stages), form)
 
 
 def ChebyshevLobatto(stages: int, *, form: str = "phase-space") -> RungeKutta:
-    """Collocation at the Chebyshev-Lobatto points, both ends stages: order s (even s) or s + 1 (odd s), symmetric."""
+    """Return collocation at the Chebyshev-Lobatto points: order s (even s) or s + 1 (odd s), symmetric."""
     return RungeKutta(tableaux.chebyshev_lobatto(stages), form)
 
 
 def ExplicitEuler(*, form: str = "phase-space") -> RungeKutta:
-    """Explicit Euler: order 1, neither symplectic nor symmetric; a baseline."""
+    """Return explicit Euler: order 1, neither symplectic nor symmetric; a baseline."""
     return RungeKutta(tableaux.explicit_euler(), form)
 
 
@@ -276,4 +276,4 @@ TABLEAU_METHODS: dict[str, Callable[..., RungeKutta]] = {
     "chebyshev-gauss": ChebyshevGauss,
     "chebyshev-lobatto": ChebyshevLobatto,
 }
-"""Runge-Kutta families by the name of their tableau; each takes ``stages`` and ``form``."""
+"""Constructors of Runge-Kutta methods by the name of their tableau; each takes ``stages`` and ``form``."""

@@ -1,8 +1,8 @@
-"""The shapes that stage equations have: what a solver must know of them to do without a Newton matrix.
+"""Shapes of stage equations: the structure that a solver without a Newton matrix must know.
 
-A method says with its stage system which of these it is (:attr:`~scvi_codegen.methods.stage_system.StageSystem.shape`);
-a solver says which of these it serves (:mod:`scvi_codegen.lowering.solvers.choice`). A shape is numbers of the method
-alone, in 60 digits, whatever the system. Stage equations of no shape are solved by Newton's iteration.
+A method states the shape of its stage system (:attr:`~scvi_codegen.methods.stage_system.StageSystem.shape`); a solver
+states which shapes it supports (:mod:`scvi_codegen.lowering.solvers.choice`). A shape consists of numbers of the
+method, in 60 digits, independent of the system. Stage equations without a shape are solved by Newton's iteration.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ class Velocities(Shape):
 
         q_n = q0 + h sum_b position[n][b] V_b,    v_n = sum_b velocity[n][b] V_b,    q1 = q0 + h sum_b end[b] V_b,
 
-    ``variational``: stationary is h sum_n weights[n] L(q_n, v_n). Otherwise the momenta at the points, which are the
+    If ``variational``, h sum_n weights[n] L(q_n, v_n) is stationary. Otherwise the momenta at the points, which are the
     blocks, are p0 + h sum_j position[n][j] L_q, and p1 = p0 + h sum_n weights[n] L_q.
 
     Attributes:
-        abscissae: (g,) of the points; blocks: (s,) of the velocities.
-        position, velocity: (g, s); end: (s,); weights: (g,).
-        variational: which of the two it is.
-        unrounded: the same, where these numbers are doubles that belong together.
+        abscissae: (g,) of the points.
+        blocks: (s,) abscissae of the velocities.
+        position, velocity: (g, s) matrices.
+        end: (s,) vector.
+        weights: (g,) vector.
+        variational: whether the equations are those of a stationary action.
+        unrounded: the same shape in 60 digits, if these numbers are rounded to doubles.
     """
 
     abscissae: Vector
@@ -45,14 +48,14 @@ class Velocities(Shape):
 
 @dataclass(frozen=True, slots=True)
 class Accelerations(Shape):
-    """Unknown accelerations at the stages of a tableau in position form, p0 and p1 being L_v at the ends (18)."""
+    """Unknown accelerations at the stages of a tableau in position form; p0 and p1 are L_v at the ends (18)."""
 
     tableau: Tableau
 
 
 @dataclass(frozen=True, slots=True)
 class ShotCurve(Shape):
-    """Accelerations and multipliers at the nodes of a curve, its action by a quadrature, differentiated in full."""
+    """Accelerations and multipliers at the nodes of a curve; momenta are total derivatives of its action (SCVI)."""
 
     tableau: Tableau
     rule: Quadrature
@@ -60,7 +63,7 @@ class ShotCurve(Shape):
 
 @dataclass(frozen=True, slots=True)
 class PrintedCurve(Shape):
-    """The same curve, its momenta at both ends as the paper prints them: (34a), (34d), (34e)."""
+    """Accelerations at the nodes of a curve; momenta as the paper prints them: (34a), (34d), (34e)."""
 
     tableau: Tableau
     rule: Quadrature

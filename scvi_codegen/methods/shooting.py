@@ -1,16 +1,16 @@
-"""Shooting-based spectral-collocation variational integrators (SCVI), section 4, (33)-(34), differentiated in full.
+"""Shooting-based spectral-collocation variational integrators (SCVI), section 4, (33)-(34), with total derivatives.
 
 The curve is the spectral-collocation solution of the Euler-Lagrange boundary-value problem from q0 to q1: with
-V = A Q + a0 q0 and Acc = A V + a0 v0, the residual E_i(Q^i, V_i, Acc_i) vanishes at nodes 1 .. s (34a). L_d is the
+V = A Q + a0 q0 and Acc = A V + a0 v0, the residual E_i(Q^i, V_i, Acc_i) is zero at nodes 1 .. s (34a). L_d is the
 quadrature of L along it (33), a function of (q0, q1) alone, because v0 and the interior Q solve E = 0. Hence
 
     p0 = -dG/dq0,   0 = dG/d(v0, Q^1 .. Q^{s-1}),   0 = dG/dlambda,   p1 = dG/dq1,    G = L_d(Q) + sum_i lambda_i . E_i,
 
-the multipliers lambda carrying the dependence of the inner curve on the end points (the chain rule). The map is
-symplectic, conserves the momenta of affine symmetries and has order min(2s, order of the quadrature).
+where the multipliers lambda account for the dependence of the interior curve on the end points (the chain rule). The
+map is symplectic, conserves the momenta of affine symmetries and has order min(2s, order of the quadrature).
 
 The paper prints (34d), (34e) with the *partial* derivatives of L_d instead. With more than two nodes that is another
-map: ``variational=False`` gives it, to reproduce the paper.
+map: ``variational=False`` selects it, to reproduce the paper.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by
 __all__ = ["SCVI"]
 
 COLLOCATION_FAMILIES = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
-"""Families of tableaux that are collocation on their abscissae."""
+"""Families of tableaux that are collocation methods."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +49,19 @@ class SCVI(Method):
     Args:
         degree: degree s of the collocation polynomial, at least 1.
         quadrature: rule for the action, an object or a name; default: s-point Gauss-Legendre. Rules with derivatives,
-            ``"hermite:2"``, sum dL/dt along the curve, too (paper, 4.2.3).
+            ``"hermite:2"``, also sum dL/dt along the curve (paper, 4.2.3).
         nodes: collocation nodes of that degree, containing both ends; default Chebyshev-Lobatto (the paper's).
-        abscissae: collocation abscissae in [0, 1] in place of nodes, s distinct numbers or the name of a family:
-            ``"gauss"``, ``"radau-iia"``, ``"lobatto-iiia"``, ``"chebyshev-gauss"`` or ``"chebyshev-lobatto"``, s points
-            of it. On symmetric ones the step is reversible; Gauss with s Gauss points is, for constant mass, the SVI.
-        variational: ``True`` differentiates the discrete Lagrangian in full: symplectic and momentum-preserving, order
-            min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which drops the
+        abscissae: collocation abscissae in [0, 1] in place of nodes, s distinct numbers or the name of a family of s
+            points: ``"gauss"``, ``"radau-iia"``, ``"lobatto-iiia"``, ``"chebyshev-gauss"`` or ``"chebyshev-lobatto"``.
+            With symmetric ones the step is reversible; Gauss with s Gauss points is, for constant mass, the SVI.
+        variational: ``True`` uses total derivatives of the discrete Lagrangian: symplectic and momentum-preserving,
+        order
+            min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which omits the
             chain-rule term: for degree >= 2 it is neither symplectic nor momentum-preserving.
 
     Raises:
-        MethodError: on a degree below 1, nodes without the end points or of another degree, abscissae beside nodes or
-            of another number, and for the printed form on abscissae, which needs nodes at both ends, or derivatives.
+        MethodError: for a degree below 1, nodes without the end points or of another degree, abscissae together with
+            nodes or of another number, and for the printed form with abscissae or with a quadrature with derivatives.
     """
 
     degree: int
@@ -88,19 +89,19 @@ class SCVI(Method):
 
     @property
     def rule(self) -> Quadrature:
-        """The quadrature, resolved."""
+        """Quadrature of the action."""
         assert isinstance(self.quadrature, Quadrature)
         return self.quadrature
 
     @property
     def node_set(self) -> Nodes:
-        """The nodes, resolved; without meaning where abscissae are given."""
+        """Collocation nodes; unused with ``abscissae``."""
         assert isinstance(self.nodes, Nodes)
         return self.nodes
 
     @property
     def tableau(self) -> Tableau:
-        """The collocation tableau (23) on the nodes 1 .. s, or on the abscissae."""
+        """Collocation tableau (23) on the nodes 1 .. s, or on the abscissae."""
         if self.abscissae is None:
             return collocation_tableau(self.node_set.abscissae[1:])
         if isinstance(self.abscissae, str):
@@ -109,21 +110,21 @@ class SCVI(Method):
 
     @property
     def places(self) -> str:
-        """Where the curve is collocated, for people: ``chebyshev-lobatto nodes``, ``gauss abscissae``."""
+        """Description of the collocation points: ``chebyshev-lobatto nodes``, ``gauss abscissae``."""
         if self.abscissae is None:
             return f"{self.node_set.name} nodes"
         return f"{self.abscissae} abscissae" if isinstance(self.abscissae, str) else "own abscissae"
 
     @property
     def name(self) -> str:
-        """``scvi[-printed]-<degree>-<nodes or abscissae>-<quadrature>``."""
+        """Name ``scvi[-printed]-<degree>-<nodes or abscissae>-<quadrature>``."""
         form = "scvi" if self.variational else "scvi-printed"
         places = self.places.removesuffix(" nodes").replace(" ", "-")
         return f"{form}-{self.degree}-{places}-{self.rule.name.replace(':', '-')}"
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         form = "" if self.variational else ", as printed in the paper"
         return (
             f"Spectral-collocation variational integrator, degree {self.degree}, {self.places}, {self.rule.name}{form}"
@@ -131,41 +132,41 @@ class SCVI(Method):
 
     @property
     def order(self) -> int | None:
-        """min(2s, order of the quadrature); as printed about s - 1 for s >= 2, where none is claimed."""
+        """Order min(2s, order of the quadrature); ``None`` for the printed form with s >= 2 (measured: about s - 1)."""
         if self.variational or self.degree == 1:
             return min(2 * self.degree, self.rule.order)
         return None
 
     @property
     def symmetric(self) -> bool:
-        """True where the step equals the symmetric SVI (degree 1) or the abscissae and the quadrature are symmetric."""
+        """True if abscissae and quadrature are symmetric; for degree 1 if the quadrature is."""
         if self.degree == 1:
             return self.rule.symmetric
         return self.variational and self.tableau.is_symmetric and self.rule.symmetric
 
     @property
     def symplectic(self) -> bool:
-        """Yes, but for the printed form of degree >= 2."""
+        """True if total derivatives are used, or the degree is 1, for which both forms coincide."""
         return self.variational or self.degree == 1
 
     @property
     def needs_regular(self) -> bool:
-        """The Euler-Lagrange equations are collocated, but for degree 1 with one point."""
+        """True unless the degree is 1 with one quadrature point: the Euler-Lagrange equations are collocated."""
         return self.degree > 1 or len(self.rule) > 1
 
     @property
     def needs_lagrangian(self) -> bool:
-        """With derivatives of L along the curve of positions, which a Hamiltonian does not have."""
+        """True if the quadrature uses derivatives of L along the curve, which a Hamiltonian does not provide."""
         return bool(self.rule.derivative_weights)
 
     @property
     def exactness(self) -> Exactness:
-        """That of its curves; of the printed form nothing is claimed."""
+        """Exactness of the curves; none is claimed for the printed form."""
         return Exactness(curve=self.degree, quadrature=self.rule.order) if self.symplectic else Exactness()
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """Nodes or the tableau of the abscissae, and the quadrature."""
+        """Nodes, or the tableau of the abscissae, and the quadrature."""
         return (self.node_set if self.abscissae is None else self.tableau, self.rule)
 
     def specification(self) -> Specification:
@@ -178,11 +179,11 @@ class SCVI(Method):
 
     @property
     def _line(self) -> SVI:
-        """What degree 1 is."""
+        """Equivalent SVI for degree 1."""
         return SVI(1, self.rule, self.node_set)
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """Unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI of degree 1 with the same quadrature."""
+        """Return equations with unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI with the same quadrature."""
         if self.degree == 1:
             return self._line.stage_system(system)
         if self.variational:
@@ -190,10 +191,11 @@ class SCVI(Method):
         return printed_increments(system, self.tableau, self.rule, self.node_set)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """(34a)-(34e), with the multiplier terms unless the degree is 1 (where they vanish) or as printed.
+        """Return (34a)-(34e), with the multiplier terms unless they are zero (degree 1) or omitted (printed form).
 
-        On abscissae and of quadratures with derivatives, which the paper does not write out: the compiled equations,
-        unknowns v0, h a_i and h^-2 lambda_i, all digits kept.
+        With abscissae, and for quadratures with derivatives, which the paper does not write out: the compiled equations
+        with
+        unknowns v0, h a_i and h^-2 lambda_i, with all digits.
         """
         if self.abscissae is not None or self.rule.derivative_weights:
             if self.degree == 1:
@@ -205,7 +207,7 @@ class SCVI(Method):
 
 
 def _resolve_abscissae(abscissae: Sequence[Any] | str, degree: int) -> Vector | str:
-    """The name of a family of collocation methods, or s numbers."""
+    """Return the validated name of a family of collocation methods, or s numbers."""
     if isinstance(abscissae, str):
         if abscissae not in COLLOCATION_FAMILIES:
             raise MethodError(

@@ -1,4 +1,4 @@
-"""The equations of shooting-based methods, (33)-(34), compiled and as printed; differentiated in full, and not."""
+"""Stage equations of shooting-based methods, (33)-(34): compiled and nodal, with total and partial derivatives."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ __all__ = ["printed_increments", "printed_nodal", "shooting_increments", "shooti
 def shooting_increments(
     system: MechanicalSystem, tableau: Tableau, rule: Quadrature, *, rounded: bool = True
 ) -> StageSystem:
-    """G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i).
+    """Return the stationarity of G = h sum w_n L(q_n, v_n) + sum_i h^2 m_i . E_i, unknowns (v0, z_i = h a_i, m_i).
 
-    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve. Not
-    ``rounded``, all tables have all their digits.
+    A quadrature with derivatives adds h^(k + 1) sum w_kn d^k L/dt^k, with the derivatives of the same curve. Unless
+    ``rounded``, tables have all digits.
     """
     if system.forces and system.auxiliaries:
         raise MethodError(
@@ -90,7 +90,7 @@ def shooting_increments(
 
 
 def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: bool) -> ScalarFamily:
-    """The collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
+    """Return the collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
     size = len(tableau.b)
     position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
     if rounded:
@@ -115,9 +115,9 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: b
 
 
 def _curve(tableau: Tableau, rule: Quadrature) -> tuple[Matrix, tuple[Matrix, ...], Vector]:
-    """The polynomial through V_i = v0 + sum a_ij z_j at the points of ``rule``.
+    """Return the polynomial through V_i = v0 + sum a_ij z_j at the points of ``rule``.
 
-    Rows for q / h; for v and h^k d^k v/dt^k, as many as the rule has derivatives; the row of q1 / h.
+    The result is the rows of q / h; of v and h^k d^k v/dt^k for each derivative of the rule; the row of q1 / h.
     """
     curves, at = Polynomials(), rule.abscissae
     moved = tuple((mp.one, *line) for line in tableau.A)
@@ -152,7 +152,7 @@ def _curve_gathers(
 
 
 def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, nodes: Nodes) -> StageSystem:
-    """(34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
+    """Return (34a) and the partial derivatives (34d), (34e), unknowns (v0, z_i = h a_i)."""
     size, points = len(tableau.b), len(rule)
     position_rows, velocities, end_row = _curve(tableau, rule)
     abscissae = nodes.abscissae
@@ -197,7 +197,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
 
 
 def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
-    """G = L_d + sum lambda_i . E_i in the paper's unknowns Q^1 .. Q^s, v0 and lambda_1 .. lambda_s."""
+    """Return the stationarity of G = L_d + sum lambda_i . E_i in the paper's Q^1 .. Q^s, v0, lambda_1 .. lambda_s."""
     size = nodes.degree
     own = Gather(
         arguments=multipliers(system),
@@ -233,7 +233,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
 
 
 def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
-    """(34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
+    """Return (34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
     size = nodes.degree
     action = nodal_quadrature_family(system, nodes, rule, other_blocks=1)
     none = Table.constant(len(rule), size)

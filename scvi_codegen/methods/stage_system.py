@@ -1,22 +1,22 @@
-"""The shape every method shares: points on the step, a small symbolic kernel at each, and tables of numbers between.
+"""Stage equations common to all methods: points on the step, a small symbolic kernel at each, and tables of numbers.
 
-A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B, of m components each unless they say otherwise
-(multipliers of constraints). At point n of a *family*
-(quadrature points, collocation nodes, the start, the end) the arguments of a kernel are *gathered* from the unknowns,
+A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B, of m components each unless declared
+otherwise (multipliers of constraints). At point n of a *family* (quadrature points, collocation nodes, the start, the
+end) the arguments of a kernel are *gathered* from the unknowns,
 
     u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b),                       t_n = t + c_n h,
 
-the kernel phi (results in the arguments, time and parameters) is evaluated, its results are *scattered* into rows,
+the kernel phi (results in the arguments, time and parameters) is evaluated, and its results are *scattered* into rows,
 
     R_r = (momentum coefficient) p0 + sum_families sum_n scale w_n h^(power + power of r) S_nr phi(u_n) = 0,
 
-the last column of S belonging to p1, which is a row like the others; q1 is one more gather. With damping gamma weights
-are w_n e^(gamma c_n h), and the row of p1 gives e^(gamma h) p1. The symbolic work is the
-kernel: it knows neither the degree nor the number of points. Everything else is a table, kept in 60 digits.
+where the last column of S belongs to p1, a row like the others; q1 is one more gather. With damping gamma the weights
+are w_n e^(gamma c_n h), and the row of p1 yields e^(gamma h) p1. Only kernels are symbolic; they are independent of
+the degree and the number of points. Everything else is a table in 60 digits.
 
-Two parametrisations of the same method use this shape. The *paper's* has the positions Q^v at the nodes as unknowns;
+There are two parametrisations of the same method. The *paper's* has the positions Q^v at the nodes as unknowns;
 ``derive`` shows it. The *compiled* one has velocities as unknowns: its tables are free of h, the known state enters as
-"q0" and "p0" alone, and p1 = p0 + increments, so nothing cancels for small steps or far from the origin.
+"q0" and "p0" alone, and p1 = p0 + increments, which avoids cancellation for small steps and far from the origin.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ __all__ = [
 
 DYADIC_BITS = 52
 ROUNDING = mp.mpf("1e-50")
-"""Entries below are what rounding leaves of sums that are 0."""
+"""Bound below which entries are set to 0: round-off of sums that are 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A matrix of numbers, each with a name for display.
+    """Matrix of numbers, each with a name for display.
 
     Attributes:
-        entries: one row a point, one column a block; 60-digit numbers.
+        entries: one row per point, one column per block; 60-digit numbers.
         names: parallel to ``entries``; ``""`` marks an entry shown as its value (0, 1, -1).
     """
 
@@ -65,7 +65,7 @@ class Table:
 
     @classmethod
     def named(cls, prefix: str, entries: Sequence[Sequence[Number]], *, row: int = 1, column: int = 1) -> Table:
-        """Name the entries ``prefix_n_b``, counting from ``row`` and ``column``; 0, 1 and -1 stay anonymous."""
+        """Return a table with names ``prefix_n_b``, counting from ``row`` and ``column``; 0, 1 and -1 get no name."""
         rows = tuple(tuple(mp.mpf(x) if abs(x) > ROUNDING else mp.zero for x in line) for line in entries)
         names = tuple(
             tuple("" if x in (0, 1, -1) else f"{prefix}_{n}_{b}" for b, x in enumerate(line, column))
@@ -75,7 +75,7 @@ class Table:
 
     @classmethod
     def joined(cls, *tables: Table) -> Table:
-        """The tables side by side."""
+        """Return the tables side by side."""
         return cls(
             entries=tuple(sum(rows, ()) for rows in zip(*(table.entries for table in tables), strict=True)),
             names=tuple(sum(rows, ()) for rows in zip(*(table.names for table in tables), strict=True)),
@@ -83,16 +83,16 @@ class Table:
 
     @classmethod
     def constant(cls, points: int, columns: int, value: int = 0) -> Table:
-        """A table of one small integer."""
+        """Return a table of one small integer."""
         return cls.named("", [[value] * columns] * points)
 
     @classmethod
     def identity(cls, size: int, sign: int = 1) -> Table:
-        """The identity matrix, or its negative."""
+        """Return the identity matrix, or its negative."""
         return cls.named("", [[sign * int(i == j) for j in range(size)] for i in range(size)])
 
     def columns(self, indices: Sequence[int]) -> Table:
-        """The columns named, in that order."""
+        """Return the columns with these indices, in that order."""
         return Table(
             entries=tuple(tuple(line[i] for i in indices) for line in self.entries),
             names=tuple(tuple(line[i] for i in indices) for line in self.names),
@@ -108,9 +108,10 @@ class Block:
         power: the power of h that makes it a position.
         straight: (a, b) of the straight-line guess z = a q0 + b h^(1 - power) v0.
         momentum: coefficient of p0 in that guess.
-        moves: whether it is measured in positions, once multiplied by h^power; momenta and their multipliers are not.
-        size: how many components it has; ``None``: m. Other blocks than of m components begin with 0, and q1 does not
-            depend on them.
+        moves: whether h^power times the block has the unit of a position; false for momenta and their multipliers.
+        size: number of components; ``None``: m. Blocks of other sizes have the initial guess 0, and q1 does not depend
+        on
+            them.
     """
 
     name: str
@@ -123,9 +124,9 @@ class Block:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """Equations: their number in the paper, kind (``"stage"``, ``"IDEL"``), coefficient of p0, extra power of h, size.
+    """Equations: number in the paper, kind (``"stage"``, ``"IDEL"``), coefficient of p0, extra power of h, size.
 
-    ``size`` is how many they are, m unless it is said; then p0 does not occur in them.
+    ``size`` is the number of equations, m if ``None``; with another size they do not contain p0.
     """
 
     number: str
@@ -139,7 +140,7 @@ class Row:
 class Gather:
     """Kernel arguments u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b); column 0 multiplies q0.
 
-    They are as many as the blocks have components that are gathered; columns of other blocks are 0.
+    Their number equals the size of the gathered blocks; columns of other blocks are 0.
     """
 
     arguments: tuple[sympy.Symbol, ...]
@@ -152,7 +153,7 @@ class Gather:
 class Scatter:
     """Kernel results, added to row r as h^(power + power of r) S_nr phi_n; the last column of S belongs to p1.
 
-    They are as many as the rows have equations to which they are added; columns of other rows are 0.
+    Their number equals the size of the rows to which they are added; columns of other rows are 0.
     """
 
     results: tuple[sympy.Expr, ...]
@@ -165,9 +166,9 @@ class Scatter:
 class PointFamily:
     """Points c_n in [0, 1] with weights, evaluated by one kernel.
 
-    Where the kernel is the gradient of a ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
-    function, and of the discrete Lagrangian if ``in_action``; where it is ``forced``, forces stand beside the gradient.
-    ``computes`` says what the kernel gives, where its name does not.
+    If the kernel is the gradient of ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
+    function, and of the discrete Lagrangian if ``in_action``; if ``forced``, forces are added to the gradient.
+    ``computes`` describes the results of the kernel if the name does not.
     """
 
     name: str
@@ -184,35 +185,35 @@ class PointFamily:
 
     @property
     def arguments(self) -> tuple[sympy.Symbol, ...]:
-        """All kernel arguments, gather after gather."""
+        """Arguments of the kernel, gather after gather."""
         return sum((gather.arguments for gather in self.gathers), ())
 
     @property
     def results(self) -> tuple[sympy.Expr, ...]:
-        """All kernel results, scatter after scatter."""
+        """Results of the kernel, scatter after scatter."""
         return sum((scatter.results for scatter in self.scatters), ())
 
 
 class Shape:
-    """Base of what a solver without a matrix must know of stage equations: :mod:`scvi_codegen.methods.shapes`."""
+    """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.shapes`."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageSystem:
-    """The equations of one step of one method for one system, points and tables not yet multiplied out.
+    """Equations of one step of one method for one system, in terms of points and tables.
 
     Attributes:
         blocks: the unknowns.
         rows: the equations, as many as blocks.
-        families: where the kernels are evaluated.
+        families: groups of points at which kernels are evaluated.
         end_position: one row, 1 + B columns: q1 = E_0 q0 + sum_b h^(power of b) E_b z_b.
         end_momentum: coefficient of p0 in p1.
         end_numbers: the paper's numbers of the equations for q1 and p1.
-        extrapolation: (B, B) matrix from the unknowns of one step to a guess for the next, or ``None``.
+        extrapolation: (B, B) matrix of the predictor from the unknowns of one step to the next, or ``None``.
         damping: gamma, a formula of parameters.
-        shape: what a solver without a matrix must know of the equations, or ``None``: only Newton's iteration is left.
+        shape: structure used by matrix-free solvers, or ``None``: then only Newton's iteration applies.
     """
 
     blocks: tuple[Block, ...]
@@ -226,11 +227,11 @@ class StageSystem:
     damping: sympy.Expr = sympy.S.Zero
 
     def block_sizes(self, dimension: int) -> tuple[int, ...]:
-        """How many components each block has."""
+        """Return the number of components of each block."""
         return tuple(dimension if block.size is None else block.size for block in self.blocks)
 
     def row_sizes(self, dimension: int) -> tuple[int, ...]:
-        """How many equations each row has; the last are the m of p1."""
+        """Return the number of equations of each row; the last entry is m, for p1."""
         return (*(dimension if row.size is None else row.size for row in self.rows), dimension)
 
 
@@ -238,8 +239,8 @@ class StageSystem:
 class ScalarFamily:
     """Points whose weighted sum sum_n scale w_n h^(1 + power) s(u_n) is part of a generating function.
 
-    ``forces`` f_g, for the first gathers, stand beside its slopes, as in the principle of Lagrange and d'Alembert: the
-    variation is ds + sum_g f_g . du_g.
+    ``forces`` f_g, for the first gathers, are added to its derivatives, as in the principle of Lagrange and d'Alembert:
+    the variation is ds + sum_g f_g . du_g.
     """
 
     name: str
@@ -254,7 +255,7 @@ class ScalarFamily:
     forces: tuple[tuple[sympy.Expr, ...], ...] = ()
 
     def slopes(self) -> list[tuple[Gather, tuple[sympy.Expr, ...]]]:
-        """The derivatives of the scalar and the forces, one tuple of m a gather."""
+        """Return the derivatives of the scalar plus the forces, one tuple of m per gather."""
         slopes = []
         for g, gather in enumerate(self.gathers):
             entries = gradient(self.scalar, gather.arguments)
@@ -263,7 +264,7 @@ class ScalarFamily:
         return slopes
 
     def point_family(self, tables: Sequence[Table]) -> PointFamily:
-        """The family with its gradient as kernel, scattered through ``tables`` (one a gather)."""
+        """Return the family with its gradient as kernel, scattered through ``tables`` (one per gather)."""
         scatters = tuple(
             Scatter(
                 results=results,
@@ -302,11 +303,11 @@ def stationary_increments(
     extrapolation: Matrix | None,
     shape: Shape | None = None,
 ) -> StageSystem:
-    """The variational method of G(q0, z, mu, q1) = S(q0, z) + mu . (q0 + h sum_b beta_b z_b - q1), unknowns velocities.
+    """Return the variational method of G(q0, z, mu, q1) = S(q0, z) + mu . (q0 + h sum_b beta_b z_b - q1).
 
-    Stationarity gives p1 = -mu = p0 + dS/dq0 and the rows beta_b p1 - (1/h) dS/dz_b = 0: every scatter table is
-    beta_b G_n0 - G_nb with the gather's own G. The map has a generating function whatever the numbers in the tables,
-    rounded ones included (paper (5); see :func:`dyadic` for why the differences lose nothing).
+    The unknowns z are velocities. Stationarity gives p1 = -mu = p0 + dS/dq0 and the rows beta_b p1 - (1/h) dS/dz_b = 0:
+    every scatter table is beta_b G_n0 - G_nb with the gather's own G. The map has a generating function for any numbers
+    in the tables, rounded ones included (paper (5); :func:`dyadic` makes the differences exact).
     """
     beta, number = tuple(end_position), count(1)
     built = []
@@ -339,7 +340,7 @@ def stationary_nodal(
     rows: tuple[Row, ...],
     end_numbers: tuple[str, str],
 ) -> StageSystem:
-    """The variational method of G(q0, .., q1) in the paper's unknowns, q1 being the block ``end_block``.
+    """Return the variational method of G(q0, .., q1) in the paper's unknowns, where q1 is the block ``end_block``.
 
     Rows: p0 + dG/dq0 = 0, then dG/dz = 0 for every other block in order; p1 = dG/dq1 (paper (5), (26), (27)).
     """

@@ -1,4 +1,4 @@
-"""The Stoermer-Verlet method as an implicit pair, which is explicit for separable systems."""
+"""Stoermer-Verlet method as an implicit pair, explicit for separable systems."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ class StoermerVerlet(Method):
     Lubich & Wanner, Geometric Numerical Integration, II.2.
 
     Args:
-        sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: explicit alone, with forces in the middle of steps.
+        sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: for separable systems only, with forces at the
+        middle
+            of steps.
     """
 
     sequence: str = KICK_DRIFT_KICK
@@ -48,49 +50,49 @@ class StoermerVerlet(Method):
 
     @property
     def drifts_first(self) -> bool:
-        """As the sequence says."""
+        """True if a step begins with a drift."""
         return self.sequence == DRIFT_KICK_DRIFT
 
     @property
     def name(self) -> str:
-        """``stoermer-verlet``."""
+        """Name ``stoermer-verlet[-<sequence>]``."""
         return f"stoermer-verlet{f'-{self.sequence}' * self.drifts_first}"
 
     @property
     def title(self) -> str:
-        """One line for people."""
+        """Display title."""
         if self.drifts_first:
             return "Stoermer-Verlet (drift, kick, drift)"
         return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
 
     @property
     def order(self) -> int | None:
-        """2."""
+        """Order 2."""
         return 2
 
     @property
     def symmetric(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
     @property
     def symplectic(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
     @property
     def exactness(self) -> Exactness:
-        """Straight lines; f may be linear in q."""
+        """Exactness of straight lines; f may be linear in q."""
         return Exactness(curve=1, quadrature=2, gauge=1)
 
     @property
     def fractions(self) -> Vector:
-        """One step."""
+        """Fractions of a single leapfrog step: 1."""
         return (mp.one,)
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The tableau of positions."""
+        """Tableau of the positions."""
         return (lobatto_iiia(2),)
 
     def specification(self) -> Specification:
@@ -98,7 +100,7 @@ class StoermerVerlet(Method):
         return {"method": "stoermer-verlet", **sequence_of(self.sequence)}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
-        """The pair written by its generating function, unknowns V_1, V_2; of drifts first their velocities."""
+        """Return the pair by its generating function, unknowns V_1, V_2; drift-kick-drift as leapfrog equations."""
         if self.drifts_first:
             return leapfrog_system(system, self)
         tableau = lobatto_iiia(2)
@@ -113,5 +115,5 @@ class StoermerVerlet(Method):
         )
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
-        """The same equations: the paper uses the method without printing it."""
+        """Return the same equations: the paper uses the method without printing it."""
         return self.stage_system(system)

@@ -1,1 +1,1 @@
-"""A system with a method, an initial state and a length: catalogue, TOML, grids, generated folders."""
+"""Models: a system with a method, an initial state and a time span; model files, ensembles, generated folders, FMUs."""

@@ -1,13 +1,13 @@
-"""Arrays in model files: numbers, lists, files beside it, and formulas in the indices of their places.
+"""Arrays in model files: numbers, lists, files, and formulas in the indices of their entries.
 
-    q = 0.5                                             # everywhere
+    q = 0.5                                             # all entries
     q = [0.1, 0.2, 0.3]                                 # its length is the size
     q = { file = "q.npy" }                              # .npy, .npz, .csv; of several arrays in a file: array = "name"
-    q = "sin(2*pi*i/N)"                                 # of the indices i, j, k of its axes, sizes and parameters
+    q = "sin(2*pi*i/N)"                                 # in the indices i, j, k of its axes, sizes and parameters
     r = ["cos(2*pi*i/N)", "sin(2*pi*i/N)", 0.0]         # each component of r[N, 3]
 
-Formulas are those of :mod:`scvi_codegen.formulas.grammar`: read by its parser, computed node by
-node, never run as code.
+Formulas are those of :mod:`scvi_codegen.formulas.grammar`: parsed by it and evaluated node by node, never executed as
+code.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ __all__ = ["INDICES", "is_filled", "read_array"]
 Numbers: TypeAlias = NDArray[np.float64]
 
 INDICES = ("i", "j", "k")
-"""Of the axes of an array, in order."""
+"""Names of the indices in formulas, by axis."""
 FILE_KEYS = ("file", "array")
 
 
 def is_filled(value: Any) -> bool:
-    """Whether a value says no sizes: a number or a formula, or one for each component."""
+    """Return whether a value leaves sizes open: a number or a formula, or one for each component."""
     if isinstance(value, list):
         return any(isinstance(entry, str) for entry in value)
     return not isinstance(value, dict)
@@ -56,18 +56,18 @@ def read_array(
     sizes: Mapping[str, int],
     parameters: Mapping[str, float],
 ) -> Numbers:
-    """The array that a value of a model file means.
+    """Return the array defined by a value of a model file.
 
     Args:
-        array: as declared.
+        array: its declaration.
         value: of the file.
-        where: what errors begin with.
-        folder: where files are that have no absolute path.
-        sizes: those known, for what is filled.
+        where: beginning of error messages.
+        folder: base of relative paths.
+        sizes: known sizes, for numbers and formulas.
         parameters: numbers that formulas may use.
 
     Raises:
-        ModelFileError: naming the place, the file and the line at fault.
+        ModelFileError: naming the key, the file and the line at fault.
     """
     if isinstance(value, dict):
         return _from_file(array, value, where, Path(folder))
@@ -88,7 +88,7 @@ def read_array(
 
 
 def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, float]) -> Numbers:
-    """A number or a formula at every place."""
+    """Return a number or a formula evaluated at every index."""
     if not isinstance(value, str):
         return np.full(shape, real(value, where))
     indices = INDICES[: len(shape)]
@@ -149,7 +149,7 @@ def _read_npz(path: Path, name: str, array: Array) -> Numbers:
 
 
 def _read_csv(path: Path, name: str, array: Array) -> Numbers:
-    """A column of the name, or the only one; of an array with components a column each."""
+    """Read the column of that name, or the only one; an array with components has one column each."""
     columns = parse_table(path.read_text(encoding="utf-8-sig")).columns
     if len(array.axes) > 1:
         return np.stack(list(columns.values()), axis=-1)

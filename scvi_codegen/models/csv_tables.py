@@ -1,4 +1,4 @@
-"""Tables in CSV: a header of names, then a line of numbers each; blank lines count for nothing."""
+"""Tables in CSV: a header of names, then one line of numbers per row; blank lines are ignored."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from scvi_codegen.errors import ModelFileError
 __all__ = ["CsvTable", "parse_table"]
 
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
-"""Of digits alone: Python takes 1_0 and digits of other scripts for numbers, too."""
+"""Pattern of numbers in ASCII digits; Python also accepts 1_0 and digits of other scripts."""
 LONGEST_SHOWN = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvTable:
-    """Numbers in columns.
+    """Columns of numbers.
 
     Attributes:
         columns: (n,) values by name, in the order of the file.
-        lines: (n,) the line of the file, from 1, that each stands in; none for a file without lines.
+        lines: (n,) line numbers of the rows, from 1; empty for a file without lines.
     """
 
     columns: dict[str, NDArray[np.float64]]
     lines: tuple[int, ...]
 
     def place(self, k: int) -> str:
-        """Where row k stands."""
+        """Return the location of row k for messages."""
         return f"line {self.lines[k]}" if self.lines else f"row {k}"
 
 
 def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> CsvTable:
-    """The table in a text, with a look at its names before its numbers.
+    """Parse a table; ``check`` is called with its names before its numbers are parsed.
 
     Raises:
         ModelFileError: naming the column or line at fault.

@@ -1,13 +1,13 @@
-"""Initial states of an ensemble, from a grid in TOML or a table in CSV; what a file does not name is the model's.
+"""Initial states of an ensemble, from a grid in TOML or a table in CSV; other values are those of the model.
 
-A grid gives some quantities several values; every combination is a trajectory, the last name varying fastest:
+A grid lists values of some quantities; every combination is a trajectory, the last name varying fastest:
 
     [grid]
     q1 = { from = 0.5, to = 1.5, count = 11 }           # equally spaced, both ends included
     p_q2 = [0.9, 1.0, 1.1]                              # a list
     mu = 2.0                                            # or one number
 
-A table has a header of names and a line a trajectory:
+A table has a header of names and one line per trajectory:
 
     q1,q1_dot,mu
     0.5,0.0,1.0
@@ -45,16 +45,16 @@ Array = NDArray[np.float64]
 Check = Callable[[Sequence[str]], None]
 
 MOST = 10**8
-"""Trajectories of a grid."""
+"""Maximum number of trajectories of a grid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EnsembleStates:
-    """What a file says of k trajectories.
+    """Initial values of k trajectories from a file.
 
     Attributes:
         columns: (k,) values by name.
-        model: gives all other values.
+        model: provides all other values.
     """
 
     columns: Mapping[str, Array]
@@ -65,20 +65,20 @@ class EnsembleStates:
 
     @property
     def parameters(self) -> Array:
-        """(k, number of parameters)."""
+        """Parameters of shape (k, number of parameters)."""
         system = self.model.system
         return self._table([symbol.name for symbol in system.parameters], system.defaults)
 
     @property
     def q(self) -> Array:
-        """(k, m) coordinates."""
+        """Coordinates of shape (k, m)."""
         return self._table(self._coordinates, self.model.q)
 
     def momenta(self, stepper: Stepper) -> Array:
-        """(k, m) momenta: those of the file, or the Legendre transforms of its velocities; others are the model's.
+        """Return (k, m) momenta: those of the file, or Legendre transforms of its velocities; others from the model.
 
         Raises:
-            StateError: where a velocity has no momentum.
+            StateError: if a velocity has no momentum.
         """
         model = self.model
         if self._names(self._momenta) or (model.velocity is None and not self._names(self._velocities)):
@@ -91,7 +91,7 @@ class EnsembleStates:
         return np.array([stepper.momentum(q, v, model.t, values) for q, v, values in states])
 
     def _at_start(self, stepper: Stepper) -> Array:
-        """(k, number of parameters), with those of inputs where the model gives them."""
+        """Return (k, number of parameters), including the initial coefficients of the model's inputs."""
         if not self.model.inputs:
             return self.parameters
         return self._table(list(stepper.parameters), self.model.parameters_at_start(stepper))
@@ -109,7 +109,7 @@ class EnsembleStates:
         return [f"p_{name}" for name in self._coordinates]
 
     def _names(self, names: list[str]) -> bool:
-        """Whether the file names one of them."""
+        """Return whether the file contains one of the names."""
         return not set(names).isdisjoint(self.columns)
 
     def _table(self, names: list[str], defaults: Any) -> Array:
@@ -156,7 +156,7 @@ def _read_grid(text: str, check: Check) -> dict[str, Array]:
 
 
 def _axis(value: Any, where: str) -> Array:
-    """Values of one quantity: a number, a list, or from, to and count."""
+    """Return the values of one quantity: a number, a list, or from, to and count."""
     if isinstance(value, dict):
         if set(value) != {"from", "to", "count"}:
             raise ModelFileError(f"{where} must have from, to and count, not {', '.join(value) or 'nothing'}")

@@ -1,11 +1,11 @@
-"""A model as an FMU: co-simulation by FMI 3.0, for Modelica tools, Simulink, FMPy and whatever else imports these.
+"""Export of models as FMUs: co-simulation by FMI 3.0, for Modelica tools, Simulink, FMPy and others.
 
-    pendulum.fmu   modelDescription.xml          variables, the step, what it can do
-                   binaries/x86_64-linux/..      the library, compiled here, and those for platforms asked for
+    pendulum.fmu   modelDescription.xml          variables, step size, capabilities
+                   binaries/x86_64-linux/..      the library, compiled here, and those for requested platforms
                    sources/                      the integrator and FMI's functions, C99, for any other machine
-                   resources/model.toml          what it was made from
+                   resources/model.toml          the model file
 
-The name of the file, without its suffix, begins every C name and is the model identifier.
+The name of the file, without its suffix, is the prefix of all C names and the model identifier.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ __all__ = ["generate_fmu"]
 
 DESCRIPTION = "modelDescription.xml"
 EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Of every file in the archive: equal models give equal bytes."""
+"""Time stamp of every file in the archive, so that equal models produce equal bytes."""
 PROCESSORS = {"amd64": "x86_64", "arm64": "aarch64", "i686": "x86", "i386": "x86"}
 SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
 SUFFIXES = {"darwin": ".dylib", "windows": ".dll"}
-"""Of libraries, where it is not .so."""
+"""File suffixes of libraries other than .so."""
 
 
 @takes(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, platforms=TEXTS, force=SWITCH)
@@ -59,25 +59,27 @@ def generate_fmu(
 ) -> Path:
     """Write a model as an FMU 3.0 for co-simulation: a library for this machine, and the sources for others.
 
-    Positions, velocities, momenta and the energy are outputs; parameters may be set, also on the way; inputs of the
-    system are continuous inputs, held from one communication point to the next. It steps by the model's step, which
-    divides the communication step, or by the equal parts of that which come next below.
+    Positions, velocities, momenta and the energy are outputs; parameters are tunable; inputs of the system are
+    continuous
+    inputs with zero-order hold between communication points. The step size is the model's if it divides the
+    communication
+    step, else the largest smaller one that does.
 
     Args:
-        model: system, method, initial state, and the step.
-        path: where to, ``<name>.fmu``; the name begins the C names.
+        model: system, method, initial state, and the step size.
+        path: target file, ``<name>.fmu``; the name is the prefix of the C names.
         solver: of the stage equations, as for ``compile_stepper``.
-        flags: for the C compiler; by default those with which every processor of the kind computes the same bits.
-        platforms: for which it has libraries besides, as FMI names them: ``x86_64-windows``, ``aarch64-darwin``, ..
-        force: overwrite a file that is no FMU.
+        flags: for the C compiler; by default those with bitwise equal results on all processors of a kind.
+        platforms: further platforms of libraries, as FMI names them: ``x86_64-windows``, ``aarch64-darwin``, ..
+        force: overwrite a file that is not an FMU.
 
     Returns:
         The path.
 
     Raises:
-        ModelFileError: for a model whose steps choose their length, or go backward, or are of transformed time.
-        PackageError: if a name does not serve, or the file cannot be written or is no FMU.
-        MethodError: for a solver that the method does not have.
+        ModelFileError: for a model with adaptive steps, a negative step size or a time transformation.
+        PackageError: for an invalid name, or if the file cannot be written or is not an FMU.
+        MethodError: for a solver that does not support the method.
         BuildError: without a C compiler, or for further platforms without the extra ``compiler``.
     """
     target = Path(path)
@@ -105,7 +107,7 @@ def _check(platforms: tuple[str, ...]) -> None:
 
 
 def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, bytes]]:
-    """What is compiled, and what stands in the archive beside libraries, by name."""
+    """Return the source to compile, and the archive's text files by name."""
     source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
     by_velocity = model.velocity is not None
     start = _start(model)
@@ -123,7 +125,7 @@ def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, by
 
 
 def _start(model: Model) -> ExampleRun:
-    """The initial state as it was given, by velocities or by momenta, and the step."""
+    """Return the initial state, with velocities or momenta as in the model, and the step size."""
     if model.h is None or model.paced:
         raise ModelFileError("an FMU has steps of one length, in time: give a step h (--step, [run] step), no monitor")
     if model.h < 0:
@@ -133,25 +135,25 @@ def _start(model: Model) -> ExampleRun:
 
 
 def _token(text: str, interface: Interface, start: ExampleRun) -> str:
-    """Made from all that the library and its description are made from."""
+    """Return the instantiation token, a hash of everything that determines library and description."""
     made_from = "\0".join([__version__, text, interface.to_json(), repr(start)])
     return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
 
 
 def _here() -> str:
-    """The platform that this machine is, as FMI names it."""
+    """Return the platform of this machine, as FMI names it."""
     processor = platform.machine().lower()
     system = SYSTEMS.get(sys.platform, re.sub(r"\W", "", sys.platform))
     return f"{PROCESSORS.get(processor, processor)}-{system}"
 
 
 def _place(platform: str, prefix: str) -> str:
-    """Of a library in the archive."""
+    """Return the path of a library in the archive."""
     return f"binaries/{platform}/{prefix}{SUFFIXES.get(platform.rpartition('-')[2], '.so')}"
 
 
 def _refuse_to_lose(target: Path) -> None:
-    """Raise :class:`PackageError` if something stands there that is no FMU."""
+    """Raise :class:`PackageError` if the target exists and is not an FMU."""
     if target.exists() and not (zipfile.is_zipfile(target) and DESCRIPTION in zipfile.ZipFile(target).namelist()):
         raise PackageError(f"{target} is no FMU: choose another name, or overwrite it with --force (force=True)")
 

@@ -1,4 +1,4 @@
-"""``modelDescription.xml`` and ``buildDescription.xml`` of an FMU, as FMI 3.0 lays them down."""
+"""XML descriptions of an FMU, ``modelDescription.xml`` and ``buildDescription.xml``, as specified by FMI 3.0."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["build_description", "model_description"]
 
 ENERGY, HELD = "energy", "input, held from one communication point to the next"
 LOGGED = {"logStatusError": "why a call failed", "logStatusDiscard": "why a step was not taken"}
-"""Categories of messages."""
+"""Categories of log messages."""
 ABLE = {
     "canGetAndSetFMUState": "true",
     "canSerializeFMUState": "true",
@@ -24,9 +24,9 @@ ABLE = {
 
 
 class Variable(NamedTuple):
-    """One of the FMU's, whose reference is its place among all. Without a description it is not shown.
+    """Variable of the FMU, whose value reference is its index; without a description it is not exported.
 
-    An output without a value at the start follows from the others.
+    An output without a start value is computed from the others.
     """
 
     name: str
@@ -37,13 +37,13 @@ class Variable(NamedTuple):
 
 
 def model_description(interface: Interface, start: ExampleRun, *, by_velocity: bool, token: str) -> str:
-    """The text of ``modelDescription.xml``.
+    """Return the text of ``modelDescription.xml``.
 
     Args:
         interface: of the integrator, whose prefix is the model identifier.
-        start: initial state, velocities in the place of p if ``by_velocity``; parameters, time, span and step.
-        by_velocity: whether an importer gives velocities at the start, not momenta.
-        token: by which the FMU knows this description.
+        start: initial state, with velocities in place of p if ``by_velocity``; parameters, time, span and step.
+        by_velocity: whether initial velocities are variables with start values, instead of momenta.
+        token: instantiation token.
     """
     root = Element(
         "fmiModelDescription",
@@ -73,7 +73,7 @@ def model_description(interface: Interface, start: ExampleRun, *, by_velocity: b
 
 
 def build_description(prefix: str, sources: Sequence[str]) -> str:
-    """The text of ``sources/buildDescription.xml``: one shared library of these files, and libm."""
+    """Return the text of ``sources/buildDescription.xml``: one shared library of these files, and libm."""
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     configuration = SubElement(root, "BuildConfiguration", modelIdentifier=prefix)
     files = SubElement(configuration, "SourceFileSet", language="C99")
@@ -84,7 +84,7 @@ def build_description(prefix: str, sources: Sequence[str]) -> str:
 
 
 def _variables(interface: Interface, start: ExampleRun, *, by_velocity: bool) -> Iterator[Variable]:
-    """By reference, as the C has them: t, positions, velocities, momenta, the energy, parameters."""
+    """Yield the variables by reference, as in C: t, positions, velocities, momenta, the energy, parameters."""
     names = interface.coordinates
     nothing: Sequence[None] = (None,) * len(names)
     velocities, momenta = (start.p, nothing) if by_velocity else (nothing, start.p)
@@ -101,7 +101,7 @@ def _variables(interface: Interface, start: ExampleRun, *, by_velocity: bool) ->
 
 
 def _parameters(interface: Interface, values: Sequence[float]) -> Iterator[Variable]:
-    """Of what an input is made of its value alone is shown, under its own name."""
+    """Yield the parameters; an input is one variable of its own name, and its other coefficients are hidden."""
     inputs: Mapping[str, str] = {f"{name}_0": name for name in interface.inputs}
     hidden = {f"{name}_{part}" for name in interface.inputs for part in "123t"}
     for name, value in zip(interface.parameters, values, strict=True):
@@ -114,7 +114,7 @@ def _parameters(interface: Interface, values: Sequence[float]) -> Iterator[Varia
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """The name, or where it is taken the first with underscores behind it that is not; taken from now on."""
+    """Return the name, with underscores appended until it is unused, and mark it as used."""
     while name in taken:
         name += "_"
     taken.add(name)

@@ -1,4 +1,4 @@
-"""Folders that are written whole, in which nothing of others, and nothing that was edited, is lost unasked."""
+"""Generated folders: written completely, without overwriting edited files or files of others unless forced."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FILE_NAME = re.compile(r"(support/)?[\w.]+")
 
 
 def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None:
-    """Texts by file name, ``interface.json`` among them, which says what may be overwritten. Raises PackageError."""
+    """Write texts by file name; checksums in ``interface.json`` tell what may be overwritten. Raises PackageError."""
     try:
         target.mkdir(parents=True, exist_ok=True)
         stale = _stale(target, texts)
@@ -37,7 +37,7 @@ def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None
 
 
 def record_text(texts: Mapping[str, str], **described: Any) -> str:
-    """``interface.json`` of files, with what else it describes."""
+    """Return the text of ``interface.json``: checksums of files, and further entries."""
     files = {name: _checksum(text.encode()) for name, text in texts.items()}
     return json.dumps({"format": FORMAT, **described, "files": files}, indent=1) + "\n"
 
@@ -51,7 +51,7 @@ def _checksum(data: bytes) -> str:
 
 
 def _stale(folder: Path, texts: Mapping[str, str]) -> list[str]:
-    """Files of the integrator that is there which this one has not; its certificate, unless the code is the same."""
+    """Return obsolete files of an older integrator, including its verification report unless the code is unchanged."""
     known = _recorded(folder)
     if known is None:
         return []
@@ -63,7 +63,7 @@ def _stale(folder: Path, texts: Mapping[str, str]) -> list[str]:
 
 
 def _refuse_to_lose(folder: Path, texts: Mapping[str, str], stale: Sequence[str]) -> None:
-    """Raise :class:`PackageError` if a file to be lost exists and was neither written by us nor is the same."""
+    """Raise :class:`PackageError` if a file to be replaced or removed was edited or not generated."""
     known = _recorded(folder)
     for name, text in ({name: "" for name in stale if name != CERTIFICATE_FILE} | dict(texts)).items():
         try:
@@ -82,7 +82,7 @@ def _refuse_to_lose(folder: Path, texts: Mapping[str, str], stale: Sequence[str]
 
 
 def _recorded(folder: Path) -> dict[str, str] | None:
-    """Checksums by file name from ``interface.json``, or ``None`` if that is missing or not ours."""
+    """Return checksums by file name from ``interface.json``, or ``None`` if it is missing or not generated."""
     try:
         record = json.loads((folder / INTERFACE_FILE).read_text(encoding="utf-8"))
         files = record["files"] if isinstance(record["format"], int) else None

@@ -1,4 +1,4 @@
-"""The model file in a generated folder of sums over indices, with the arrays that it takes from files beside it."""
+"""Model files in generated folders of indexed systems, with tables of the arrays that it reads from files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["MODEL_FILE", "model_texts"]
 
 MODEL_FILE = "model.toml"
 STATES = {"q": "q", "p": "p", "q_dot": "velocity"}
-"""What each key of the initial state is called by a model."""
+"""Field of a model by key of the initial state."""
 
 
 def model_texts(model: IndexedModel) -> dict[str, str]:
-    """The model file and the tables that it names, by their names; nothing of a model that was not read from a file."""
+    """Return the model file and the tables that it refers to, by file name; empty for models not read from a file."""
     if model.document is None:
         return {}
-    import tomli_w  # here, because reading does not need it
+    import tomli_w  # imported here: not needed for reading
 
     files = _Files()
     document = {**model.document, "method": {**method_section(model.method), "solver": model.solver}}
@@ -38,18 +38,18 @@ def model_texts(model: IndexedModel) -> dict[str, str]:
 
 
 class _Files:
-    """Tables in place of files that stand elsewhere."""
+    """Tables that replace references to files outside the folder."""
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
 
     def section(self, section: str, given: Section, known: Mapping[str, Any]) -> dict[str, Any]:
-        """The values of a section, by declarations."""
+        """Return the values of a section, by declarations."""
         names = {key: key.partition("[")[0] for key in given}
         return {key: self.value(f"{section}_{names[key]}", given[key], known.get(names[key])) for key in given}
 
     def state(self, key: str, given: Any, known: Mapping[str, Any]) -> Any:
-        """What is said of one array, or of several by name."""
+        """Return the value of one array, or of several by name."""
         if not isinstance(given, dict):
             return given
         if "file" in given:
@@ -57,7 +57,7 @@ class _Files:
         return {name: self.value(f"{key}_{name}", value, known[name]) for name, value in given.items()}
 
     def value(self, name: str, given: Any, values: Any) -> Any:
-        """A table of columns for what was read from a file, or a list where it has more axes; else what was given."""
+        """Return a reference to a new table (or a list) for values read from a file, else the value itself."""
         if not isinstance(given, dict):
             return given
         if np.ndim(values) > 2:

@@ -1,4 +1,4 @@
-"""Model files of sums over indices: those of :mod:`scvi_codegen.models.model_file` with arrays.
+"""Model files of indexed systems: those of :mod:`scvi_codegen.models.model_file` with arrays.
 
     [system]
     name = "ring"
@@ -7,34 +7,34 @@
     # dissipation = "sum(i in N, c*q_dot[i]**2/2)"      # Rayleigh's function
     # constraints = ["(q[i+1] - q[i])**2 = 1 for i in 0..N-2"]
 
-    [forces]                                            # on coordinates, at every place or at one; left out: 0
+    [forces]                                            # on coordinates, for all indices or for one; default: 0
     # "q[i]" = "-c*q_dot[i]"
     # "q[0]" = "cos(w*t)"
 
-    [sizes]                                             # where no list or file of numbers says them
+    [sizes]                                             # unless determined by a list or file of numbers
     N = 1000
 
     [parameters]
     k = 1.0
-    "m[N]" = 1.0                                        # an array: as [initial] has them
+    "m[N]" = 1.0                                        # an array: values as in [initial]
 
     [tables]                                            # whole numbers; or { file = "bonds.csv" }
     # "bonds[B, 2]" = [[0, 1], [1, 2]]
 
     [initial]                                           # of several arrays: [initial.q] with a line each
     q = "sin(2*pi*i/N)"                                 # a number, a list, { file = "q.npy" }, a formula
-    q_dot = 0.0                                         # or p; left out: 0
+    q_dot = 0.0                                         # or p; default: 0
 
     [method]
     method = "svi:4"
-    # solver = "newton"                                 # for stiff systems; left out: "fixed-point", sweeps
+    # solver = "newton"                                 # for stiff systems; default: "fixed-point"
 
     [run]
-    step = 0.1                                          # or tolerance = 1e-9 (without both: round-off): steps
-    span = 100.0                                        # that choose their length; or steps of h
+    step = 0.1                                          # fixed step size; or tolerance = 1e-9 for adaptive steps
+    span = 100.0                                        # (without both: adaptive, errors at round-off level)
     save_every = 10
 
-Hamiltonians, and sections laid over others, are as there.
+Hamiltonians, and the merging of sections, are as in model files of other systems.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ OTHERS = {
     "system": ("inputs", "catalogue", "monitor"),
     "run": ("controller",),
 }
-"""What other models have."""
+"""Keys of models without arrays, which indexed systems do not support."""
 GROUPS = ("q", "p", "q_dot", "parameters", "tables")
-"""Of arrays."""
+"""Sections and keys whose values are arrays."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What a file says of an array, and where."""
+    """Value of an array in a file, and its location for messages."""
 
     array: Array
     value: Any
@@ -100,7 +100,7 @@ class Entry:
 
 
 def read_indexed(document: Document, given: Document, folder: str | os.PathLike[str]) -> IndexedModel:
-    """The model of a file, with the sections ``given`` laid over it.
+    """Return the model of a file, with the sections ``given`` merged over it.
 
     Raises:
         ModelFileError: naming the key at fault.
@@ -145,7 +145,7 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
 
 
 def _check_known(document: Document) -> None:
-    """Refuse what sums over indices do not have, in other words than what nobody knows."""
+    """Raise an error for unknown keys, and a specific one for keys that indexed systems do not support."""
     for name, section in (("", document), *document.items()):
         for key in section if name in OTHERS else ():
             if key in OTHERS[name]:
@@ -159,7 +159,7 @@ def _check_known(document: Document) -> None:
 
 
 def _declared(section: Section, given: Section) -> dict[str, Any]:
-    """Parameters by declaration, ``m[N]``, with values laid over by name."""
+    """Return parameters by declaration, ``m[N]``, with ``given`` values by name replacing those of the section."""
     names = {key.partition("[")[0]: key for key in section}
     for name in given:
         if name not in names:
@@ -194,7 +194,7 @@ def _read_system(document: Document) -> IndexedSystem:
 
 
 def _state_entries(section: Section, system: IndexedSystem) -> dict[tuple[str, str], Entry]:
-    """What is said of each array of coordinates, and of its velocities or momenta."""
+    """Return the values of each array of coordinates, and of its velocities or momenta."""
     check_one(section, "initial", "p", "q_dot")
     required(section, "q", "[initial]")
     names = [array.name for array in system.coordinates]
@@ -228,7 +228,7 @@ def _read_arrays(
     folder: str | os.PathLike[str],
     numbers: Mapping[str, float],
 ) -> dict[tuple[str, str], Any]:
-    """Lists and files first: they say sizes, of which the others are filled."""
+    """Read all arrays: lists and files first, since they determine sizes, then numbers and formulas."""
     sizes, found = dict(sizes), {}
     for key, entry in sorted(entries.items(), key=lambda item: is_filled(item[1].value)):
         values = read_array(entry.array, entry.value, entry.where, folder=folder, sizes=sizes, parameters=numbers)

@@ -1,4 +1,4 @@
-"""A system of sums over indices with a method, sizes, an initial state and the length of a run, checked."""
+"""Validated model of an indexed system: method, sizes, initial state and time span."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ __all__ = ["IndexedModel"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IndexedModel:
-    """A system of sums over indices, a method, an initial state and the length of a run.
+    """Indexed system with a method, an initial state and a time span.
 
     Attributes:
-        system: what moves.
-        method: how its motion is discretised.
-        solver: of the equations of a step, as of :func:`~scvi_codegen.compile_indexed`.
-        q: initial positions by the name of their array; their shapes are the sizes.
-        p, velocity: initial momenta or velocities by the same names, one of both; or neither: 0.
-        h: step, not 0, negative for a run backward; or ``None`` for adaptive steps.
+        system: the indexed system.
+        method: its discretisation.
+        solver: of the stage equations, as of :func:`~scvi_codegen.compile_indexed`.
+        q: initial positions by the name of their array; their shapes determine the sizes.
+        p, velocity: initial momenta or velocities by the same names, at most one of both; default: 0.
+        h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps.
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off.
-        error: in place of both, bound of the relative global error of all states, as of :class:`Model`.
-        span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
+        error: instead of both, bound of the relative global error of all states, as of :class:`Model`.
+        span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
         steps: number of steps, or ``None`` if ``span`` is given.
-        save_every: distance between kept states in steps.
+        save_every: stride of saved states, in steps.
         t: initial time.
         parameters: numbers, and arrays of them, by name; others keep their defaults.
-        tables: whole numbers, (rows, columns), by name.
+        tables: index tables of shape (rows, columns), by name.
         document: the sections of the file that it was read from.
 
     Raises:
-        ModelFileError: naming the field; what the arrays are is checked where a run begins.
+        ModelFileError: naming the field; arrays are validated when a run begins.
     """
 
     system: IndexedSystem
@@ -100,14 +100,14 @@ class IndexedModel:
 
     @property
     def step(self) -> float:
-        """The step h, for what works with steps of one length; ModelFileError where there is none."""
+        """Fixed step size h; ModelFileError for adaptive steps."""
         if self.h is None:
             raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
         return self.h
 
     @property
     def step_count(self) -> int:
-        """Number of steps of h: ``steps``, or the whole number (at least 1) of steps nearest to ``span``."""
+        """Number of fixed steps: ``steps``, or the integer (at least 1) nearest to ``span`` / h."""
         if self.steps is not None:
             return self.steps
         assert self.span is not None  # by construction
@@ -115,15 +115,15 @@ class IndexedModel:
 
     @property
     def covered(self) -> float:
-        """The span of time, negative for a run backward."""
+        """Time span, negative for a run backward in time."""
         if self.h is None:
             assert self.span is not None  # by construction
             return self.span
         return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def stepper(self) -> IndexedStepper:
-        """Compiled for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""
-        from scvi_codegen.indexed_compiler import compile_indexed  # here: reading a model does not wait for it
+        """Compile a stepper for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""
+        from scvi_codegen.indexed_compiler import compile_indexed  # imported here: not needed for reading a model
 
         return compile_indexed(self.system, self.method, solver=self.solver)
 
@@ -134,7 +134,7 @@ class IndexedModel:
         options: SolverOptions | None = None,
         threads: int | None = None,
     ) -> IndexedRun:
-        """The run of this model from its initial state; raises as :meth:`IndexedStepper.start`."""
+        """Start the run of this model at its initial state; raises as :meth:`IndexedStepper.start`."""
         beside: dict[str, Any] = {"options": options, "threads": threads}
         stepper, lengths = stepper or self.stepper(), self._lengths
         if self.error is not None:
@@ -143,19 +143,19 @@ class IndexedModel:
         return stepper.start(**self._beginning, **lengths, **beside)
 
     def confirmed(self, stepper: IndexedStepper, **beside: Any) -> GlobalError:
-        """Return the local tolerance for :attr:`error` and what runs of other steps confirm, as of :class:`Model`."""
+        """Return the local tolerance for :attr:`error`, confirmed by further runs, as in :class:`Model`."""
         found = stepper.integrate(**self._beginning, **self._lengths, **beside).confirmation
         assert found is not None  # by construction
         return found
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
-        """All of it; raises as :meth:`IndexedStepper.integrate`."""
+        """Integrate over the whole span; raises as :meth:`IndexedStepper.integrate`."""
         lengths = self._lengths if self.h is None else {**self._lengths, "steps": self.step_count}
         return self.stepper().integrate(**self._beginning, **lengths, save_every=self.save_every, progress=progress)
 
     @property
     def _lengths(self) -> dict[str, Any]:
-        """Of steps: the one of all, or where those lead that choose theirs."""
+        """Arguments for the step size: h, or t_end with a tolerance."""
         if self.h is not None:
             return {"h": self.h}
         chosen = {"tolerance": self.tolerance} if self.error is None else {"error": self.error}

@@ -1,10 +1,10 @@
-"""A folder with the C of sums over indices, and a program that runs it from the initial state beside it.
+"""Generated folders of indexed systems: C code, and a program that runs it from the initial state in files.
 
-ring_svi/  ring_svi.h  ring_svi.c  support/         the integrator, of any number of coordinates
+ring_svi/  ring_svi.h  ring_svi.c  support/         the integrator, for any number of coordinates
            main.c  Makefile                         ``make run`` runs it with a C compiler and libm
-           q.txt  velocity.txt  field_m.txt  ..     arrays, a number a line
-           model.toml  model_q.csv  ..              what it was made from, for ``scvi-codegen verify ring_svi``
-           interface.json                           checksums: what was edited since is not overwritten unasked
+           q.txt  velocity.txt  field_m.txt  ..     arrays, one number per line
+           model.toml  model_q.csv  ..              the model file, for ``scvi-codegen verify ring_svi``
+           interface.json                           checksums, so that edited files are not overwritten
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ __all__ = ["generate_sums", "load_sums"]
 
 @takes(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
 def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the integrator of a model of sums over indices into a folder, as :func:`generate_package` does.
+    """Write the integrator of a model of an indexed system into a folder, as :func:`generate_package` does.
 
     Raises:
-        PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
-        MethodError: for a method without sweeps, and a solver that it does not have.
-        StateError: where arrays do not fit.
+        PackageError: if the folder's name is invalid, it cannot be written, or a file in it would be lost.
+        MethodError: for a method without fixed-point iteration, and a solver that does not support it.
+        StateError: for arrays of wrong shape.
     """
     target = Path(folder)
     source, interface = generate_indexed(model.system, model.method, solver=model.solver, prefix=prefix_of(target))
@@ -70,7 +70,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
 
 
 def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedStepper:
-    """The stepper of a generated folder of a model, compiled from the C text in it.
+    """Return the stepper of a generated folder of a model, compiled from the C code in it.
 
     Raises:
         PackageError: if the folder lacks a file or was written by another version.

@@ -1,11 +1,11 @@
-"""Inputs in model files: tables that are written out, or stand in files beside it.
+"""Inputs in model files: tables in the model file or in separate files.
 
     [inputs]
-    u = { file = "u.csv", kind = "cubic" }              # .csv or .npz, beside the model file; columns t and u
+    u = { file = "u.csv", kind = "cubic" }              # .csv or .npz, relative to the model file; columns t and u
     w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
 
-Between its values an input is ``constant`` (each from its time on), ``linear`` (left out: that) or ``cubic``. The
-column of an input has its name, or is called ``value``, or is the only one beside ``t``: one file may hold several.
+Values are interpolated as ``constant`` (zero-order hold), ``linear`` (default) or ``cubic``. The column of an input has
+its name, or is called ``value``, or is the only one other than ``t``: one file may contain several inputs.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ KEYS = ("file", "t", "values", "kind")
 
 
 def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTable:
-    """What a model file says of an input.
+    """Read the entry of an input in a model file.
 
     Args:
         name: of the input.
         entry: ``{file, kind}`` or ``{t, values, kind}``.
-        folder: where files are that have no absolute path.
+        folder: base of relative paths.
 
     Raises:
         ModelFileError: naming the input, the file and the line or row at fault.
@@ -71,7 +71,7 @@ def _numbers(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Times and values of an input in a file."""
+    """Return times and values of an input in a file."""
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
         raise ModelFileError(f"inputs are read from {' and '.join(readers)} files")
@@ -109,7 +109,7 @@ def _read_csv(path: Path) -> CsvTable:
 
 
 def _read_npz(path: Path) -> CsvTable:
-    """Its arrays of one axis as columns."""
+    """Return the one-dimensional arrays of the file as columns."""
     try:
         with loaded(path) as arrays:
             columns = {name: real_array(arrays[name], name) for name in arrays}

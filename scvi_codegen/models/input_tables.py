@@ -1,4 +1,4 @@
-"""Inputs of a model: functions of time as tables of plain numbers, which compare and are written as they are."""
+"""Inputs of a model: functions of time as tables of plain numbers, which can be compared and written to files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["InputTable", "checked_tables", "tables_of_example"]
 
 
 class InputTable(NamedTuple):
-    """A function of time, as :meth:`Stepper.drive` takes it: n ascending times, n values, and what is between them."""
+    """Function of time as :meth:`Stepper.drive` accepts it: n ascending times, n values, kind of interpolation."""
 
     t: tuple[float, ...]
     values: tuple[float, ...]
@@ -24,10 +24,10 @@ class InputTable(NamedTuple):
 
 
 def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[str, InputTable]:
-    """Tables by name, plain and known to be functions of time; some may be missing.
+    """Return validated tables by name, as plain numbers; some may be missing.
 
     Raises:
-        ModelFileError: for a name that is no input of the system, and what is no table.
+        ModelFileError: for a name that is not an input of the system, and a value that is not a table.
     """
     found = {}
     for name, table in given.items():
@@ -49,7 +49,7 @@ def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[s
 def tables_of_example(
     system: MechanicalSystem, inputs: Mapping[str, InputTable], span: tuple[float, float]
 ) -> tuple[tuple[ExampleInput, ...], tuple[float, ...]]:
-    """Inputs as C takes them, all or none, and all parameters where a run over that span of time begins."""
+    """Return the tables of all inputs (or none) for C, and all parameters at the start of a run over that time span."""
     data = {name: input_of(name, tuple(inputs[name])) for name in system.inputs if inputs}
     tables = tuple(
         ExampleInput(name, tuple(each.breakpoints.tolist()), tuple(map(tuple, each.pieces[:, :POWERS].tolist())))

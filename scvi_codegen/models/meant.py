@@ -1,4 +1,4 @@
-"""What a key of a model file may have been meant to say: words of other programs, and keys of other sections."""
+"""Suggestions for unknown keys of model files: synonyms of other programs, and keys of other sections."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ PLACES: Final = {
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
     **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},
 }
-"""By the key, where it is said."""
+"""Location of each key in a model file."""
 
 
 def meant_by(key: str, names: Iterable[str]) -> str:
-    """``"; did you mean 'step'?"`` or ``"; it belongs in [run], as 'step'."``, or a full stop.
+    """Return ``"; did you mean 'step'?"`` or ``"; it belongs in [run], as 'step'."``, or a full stop.
 
     Args:
-        key: one that is not known.
-        names: those known in its place.
+        key: the unknown key.
+        names: known keys of its section.
     """
     known = list(names)
     if key in ("event", "events"):

@@ -1,4 +1,4 @@
-"""A system with a method, an initial state and the length of a run, checked."""
+"""Validated model: a system with a method, an initial state and a time span."""
 
 from __future__ import annotations
 
@@ -39,37 +39,38 @@ __all__ = [
 ]
 
 DEFAULT_METHOD = SVI(8)
-"""What the problems of the catalogue are integrated with unless another method is chosen."""
+"""Default method for the problems of the catalogue."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """A system, a method, an initial state and the length of a run; equality is structural.
+    """System, method, initial state and time span; equality is structural.
 
     Attributes:
-        system: what moves, with the parameter values of the run as its defaults.
-        method: how its motion is discretised; a name, ``"svi:8"``, becomes the method.
+        system: the mechanical system, with the parameter values of the run as its defaults.
+        method: its discretisation; a name, ``"svi:8"``, is converted to the method.
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
-        h: step size, not 0, negative for a run backward; or ``None`` for adaptive steps. In transformed time
-            steps are of tau, as with a monitor.
-        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. In
-            transformed time, and with a monitor, :func:`longest_step` chooses one length of tau for it.
-        error: in place of both, bound of the relative global error of all states: runs choose their local tolerance as
-            ``integrate(error=)`` does, and warn where the bound is not confirmed. Needs adaptive steps.
-        span: length of time, positive, or ``None`` if ``steps`` is given. With a tolerance negative for a run backward.
-        steps: number of steps of h, or ``None`` if ``span`` is given.
-        monitor: of the reversible controller, as text, see :func:`~scvi_codegen.compile_stepper`; its runs have a span.
-            A system in transformed time has its own.
-        save_every: distance between kept states in steps.
+        h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps. With a time
+            transformation, the step size in tau.
+        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. With a time
+            transformation, :func:`longest_step` chooses the step size in tau for it.
+        error: instead of both, bound of the relative global error of all states: runs choose their local tolerance as
+            ``integrate(error=)`` does, and warn if the bound is not confirmed. Requires adaptive steps.
+        span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
+        steps: number of fixed steps, or ``None`` if ``span`` is given.
+        monitor: time-rescaling function of the reversible controller, as text, see
+            :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
+        save_every: stride of saved states, in steps.
         t: initial time.
-        inputs: of a system that has any, by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as
-            :meth:`Stepper.drive` takes it; all of them for a run.
+        inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.drive` accepts it;
+            a run requires all inputs of the system.
 
     Raises:
-        ModelFileError: naming the field, unless exactly one of p and velocity, one of h and tolerance and one of span
-            and steps is given, each vector has m entries, and every number is finite and in its range.
+        ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
+        and
+            exactly one of span and steps is given, each vector has m entries, and every number is finite and valid.
     """
 
     system: MechanicalSystem
@@ -106,13 +107,13 @@ class Model:
             self, "save_every", checked_count(self.save_every, "save_every", least=1, error=ModelFileError)
         )
         if self.inputs:
-            from scvi_codegen.models.input_tables import checked_tables  # here: reading a model does not wait for NumPy
+            from scvi_codegen.models.input_tables import checked_tables  # not needed for reading a model
 
             object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
 
     @classmethod
     def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
-        """An entry of the catalogue with a method."""
+        """Return the model of a catalogue entry with a method."""
         return cls(
             system=entry.system,
             method=method,
@@ -125,10 +126,10 @@ class Model:
 
     @property
     def step_count(self) -> int:
-        """Number of steps of h: ``steps``, or the whole number (at least 1) of steps nearest to ``span``.
+        """Number of fixed steps: ``steps``, or the integer (at least 1) nearest to ``span`` / h.
 
         Raises:
-            ModelFileError: where the run ends at a time.
+            ModelFileError: if the number is not known in advance, because the run ends at a time.
         """
         if self.steps is not None:
             return self.steps
@@ -142,23 +143,23 @@ class Model:
 
     @property
     def ends_at_time(self) -> bool:
-        """Whether it is a time that ends the run, after a number of steps that is not known before."""
+        """True if the run ends at a time, after a number of steps that is not known in advance."""
         return self.h is None or (self.paced and self.span is not None)
 
     @property
     def paced(self) -> bool:
-        """Whether a monitor sets the pace, so that a step, if one is given, is of tau."""
+        """True if there is a time transformation, so that a step size is one in tau."""
         return self.monitor is not None or self.system.clock is not None
 
     @property
     def parameters(self) -> dict[str, float]:
-        """By name: the defaults of the system, but for an energy that is the initial state's, and those of inputs."""
+        """Parameters by name: the system's defaults, without the energy of a transformation and inputs."""
         others = {self.system.clock.energy.name if self.system.clock else "", *input_parameters(self.system.inputs)}
         return {given.name: value for given, value in self.system.constants.items() if given.name not in others}
 
     @property
     def step(self) -> float:
-        """The step h, for what works with steps of one length; ModelFileError where there is none."""
+        """Fixed step size h; ModelFileError for adaptive steps."""
         if self.h is None:
             raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
         if self.monitor is not None:
@@ -166,7 +167,7 @@ class Model:
         return self.h
 
     def first_step(self, stepper: Stepper) -> float:
-        """The step h; where steps choose their length, that of the first one, of tau in transformed time."""
+        """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
         if self.h is not None and self.monitor is None:
             return self.h
         run = self.start(stepper)
@@ -177,21 +178,21 @@ class Model:
 
     @property
     def covered(self) -> float:
-        """The span of time, negative for a run backward."""
+        """Time span, negative for a run backward in time."""
         if self.h is None:
             assert self.span is not None  # by construction
             return self.span
         return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def stepper(self, *, solver: str = "auto") -> Stepper:
-        """Compiled for the runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
-        from scvi_codegen.compiler import compile_stepper  # here: reading a model does not wait for it
+        """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
+        from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
         return compile_stepper(self.system, self.method, solver=solver, monitor=self.monitor)
 
     def momenta(self, stepper: Stepper) -> Array:
-        """(m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
-        import numpy as np  # here, so that reading a model does not wait for it
+        """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
+        import numpy as np  # imported here: not needed for reading a model
 
         if self.p is not None:
             return np.array(self.p)
@@ -199,7 +200,7 @@ class Model:
         return stepper.momentum(self.q, self.velocity, self.t, self.parameters_at_start(stepper))
 
     def parameters_at_start(self, stepper: Stepper) -> Mapping[str, float] | Array:
-        """What the parameters are, those of inputs too where these are given."""
+        """Return the initial parameters, including components of inputs if these are given."""
         if not self.inputs:
             return self.parameters
         from scvi_codegen.runtime.driven import entered
@@ -207,31 +208,31 @@ class Model:
         return self._driven(stepper)[1](entered(self.t, self.end))
 
     def stretches(self, run: Run) -> Iterator[int | None]:
-        """Has a run of this model ready for each stretch from breakpoint to breakpoint of its inputs, or for all of it.
+        """Prepare a run of this model for each segment between breakpoints of its inputs, or for the whole span.
 
         Yields:
-            How many steps it takes; ``None`` where steps choose their length and lead to the goal of the run.
+            Number of steps of the segment; ``None`` for steps up to the target time of the run.
 
         Raises:
-            ModelFileError, StateError: for inputs that are not given, or not for all of the run.
+            ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
         if not self.system.inputs:
             yield None if run.goal else self.step_count
             return
-        from scvi_codegen.runtime.driven import stretches  # here, as NumPy above
+        from scvi_codegen.runtime.driven import stretches  # imported here, as NumPy above
 
         inputs, values = self._driven(run.stepper)
         yield from stretches(run, inputs, self.end, values)
 
     @property
     def end(self) -> float:
-        """The time to which a run with inputs leads."""
+        """Final time of a run with inputs."""
         from scvi_codegen.runtime.driven import end_of
 
         return end_of(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
 
     def all_inputs(self) -> Mapping[str, InputTable]:
-        """The inputs; ModelFileError unless all that the system has are given."""
+        """Return the inputs; ModelFileError unless all inputs of the system are given."""
         for name in self.system.inputs:
             if name not in self.inputs:
                 way = f'[inputs] {name} = {{ file = "{name}.csv" }}, or --input {name}=FILE'
@@ -239,17 +240,17 @@ class Model:
         return self.inputs
 
     def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
-        """The inputs, and what they make of the parameters at a time."""
+        """Return the inputs, and the parameters as a function of time."""
         from scvi_codegen.runtime.driven import checked_inputs, parameters_of
 
         found = checked_inputs(stepper.interface, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """The run of this model from its initial state, to be advanced by :attr:`step_count` steps or to its end."""
+        """Start the run of this model at its initial state, to be advanced :attr:`step_count` steps or to its end."""
         p, h = self.momenta(stepper), self.h
         if h is None and self.paced:
-            from scvi_codegen.runtime.longest_step import longest_step  # here: reading a model does not wait for NumPy
+            from scvi_codegen.runtime.longest_step import longest_step  # imported here: not needed for reading
 
             if self.system.inputs:
                 raise ModelFileError("with inputs no pilot run finds a step of tau: give one (--step, [run] step)")
@@ -269,9 +270,9 @@ class Model:
         )
 
     def confirmed(self, stepper: Stepper, *, options: SolverOptions | None = None) -> GlobalError:
-        """Return the local tolerance for :attr:`error` and what runs of other steps confirm.
+        """Return the local tolerance for :attr:`error`, confirmed by runs with other tolerances.
 
-        Steps of that tolerance are the same, to the last bit, as those that were confirmed.
+        Steps with that tolerance are bitwise equal to those that were confirmed.
         """
         p = self.momenta(stepper)
         common: dict[str, Any] = {"t": self.t, "t_end": self.t + self.covered, "error": self.error}
@@ -305,7 +306,7 @@ class Model:
 
 
 def check_step(h: float, span: float | None) -> None:
-    """Refuse a step of 0, and a span that is no number of steps."""
+    """Raise an error for a step size of 0, and a span that is not a positive number of steps."""
     if h == 0.0:
         raise ModelFileError("the step is 0: it must be positive, or negative to go back")
     if span is not None and not 0.0 < span / abs(h) <= LARGEST_COUNT:
@@ -316,7 +317,7 @@ def check_step(h: float, span: float | None) -> None:
 
 
 def check_controlled(tolerance: float | None, span: float | None) -> None:
-    """Refuse what cannot be the tolerance and the span of steps that choose their length."""
+    """Raise an error for an invalid tolerance or span of adaptive steps."""
     if tolerance is not None:
         check_tolerance(tolerance, ModelFileError)
     if span is None:
@@ -326,19 +327,19 @@ def check_controlled(tolerance: float | None, span: float | None) -> None:
 
 
 def steps_in(span: float, h: float) -> int:
-    """The whole number (at least 1) of steps nearest to a length of time."""
+    """Return the integer (at least 1) nearest to span / h."""
     return max(1, round(span / abs(h)))
 
 
 def check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:
-    """Refuse values that are not one for each name."""
+    """Raise an error unless there is one value per name."""
     if len(values) != len(names):
         shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
         raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
 
 
 def check_at_most_one(h: float | None, tolerance: float | None, error: float | None) -> None:
-    """Refuse several choices of the step size; none means adaptive steps with errors at round-off level."""
+    """Raise an error for several step-size options; none means adaptive steps with errors at round-off level."""
     if sum(each is not None for each in (h, tolerance, error)) > 1:
         raise ModelFileError(
             "give h (step) for a fixed step size, tolerance for the error of each adaptive step or error for that of "
@@ -347,7 +348,7 @@ def check_at_most_one(h: float | None, tolerance: float | None, error: float | N
 
 
 def check_error(error: float | None, *, paced: bool) -> None:
-    """Refuse what is no bound of a global error, and one for steps of tau."""
+    """Raise an error for an invalid bound of the global error, and for one with a time transformation."""
     if error is not None and not 0.0 < error < 1.0:
         raise ModelFileError(f"error is {error:g}: the bound of the relative global error is between 0 and 1")
     if error is not None and paced:
@@ -362,13 +363,13 @@ def allowed_error(model: Any) -> float | None:
 
 
 def check_one_of(one: str, first: object, other: str, second: object) -> None:
-    """Refuse both of two fields, and neither."""
+    """Raise an error unless exactly one of two fields is given."""
     if (first is None) == (second is None):
         raise ModelFileError(f"give exactly one of {one} and {other}")
 
 
 def real(value: Any, where: str) -> float:
-    """A finite number, or an error that begins with ``where``."""
+    """Return a finite number, or raise an error that begins with ``where``."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise ModelFileError(f"{where} must be a number, not {value!r}")
     try:

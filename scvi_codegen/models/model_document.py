@@ -1,4 +1,4 @@
-"""A model as the sections of a model file."""
+"""Conversion of models to the sections of a model file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TEXT_WIDTH = 100
 
 
 def document_of(model: Model) -> dict[str, Any]:
-    """All sections, in the order of a file."""
+    """Return all sections, in the order of a file."""
     clock = model.system.clock
     system = clock.plain if clock and clock.plain else model.system
     names = [coordinate.name for coordinate in system.coordinates]
@@ -51,7 +51,7 @@ def _written_out(table: InputTable) -> dict[str, Any]:
 
 
 def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
-    """The sections beside the system."""
+    """Return the sections other than the system."""
     vectors = (("q", model.q), ("p", model.p), ("q_dot", model.velocity))
     initial = {key: _named(names, vector) for key, vector in vectors if vector is not None}
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
@@ -63,16 +63,16 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
 
 
 def method_section(method: Method) -> dict[str, Any]:
-    """``[method]``."""
+    """Return the section ``[method]``."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in method.specification().items()}
 
 
 def _wrapped(formula: str) -> str:
-    """A formula, on several lines if it is long."""
+    """Return a formula, wrapped to several lines if it is long."""
     lines = textwrap.wrap(formula, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
     return lines[0] if len(lines) == 1 else "\n".join(["", *lines, ""])
 
 
 def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
-    """A short vector as a list, a long one by name."""
+    """Return a short vector as a list, a long one by name."""
     return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))

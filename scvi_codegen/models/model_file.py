@@ -1,25 +1,25 @@
-'''Model files: one TOML file holds a system, a method, an initial state and the length of a run.
+'''Model files: a TOML file with a system, a method, an initial state and a time span.
 
     [system]
     name = "planar pendulum"
     coordinates = ["q"]
     lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
-    # monitor = "1/(1 + sin(q)**2)"                     # dt/dtau, or a name: steps are then of tau, the span is of
-                                                        # time; without a step adaptive ones
+    # monitor = "1/(1 + sin(q)**2)"                     # time transformation dt/dtau, or a name: the step size is then
+                                                        # in tau, the span in time; default: adaptive steps
 
-    dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; left out: 0
-    # damping = "gamma"                                 # the rate at which all momenta shrink, or a number; left out: 0
+    dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; default: 0
+    # damping = "gamma"                                 # damping rate of all momenta, or a number; default: 0
     # constraints = ["x**2 + y**2 = l**2"]              # g(q, t) = 0, or equations
-    # inputs = ["u"]                                    # functions of time that are data
+    # inputs = ["u"]                                    # functions of time given as data
 
-    [forces]                                            # on coordinates; left out: 0
+    [forces]                                            # on coordinates; default: 0
     q = "F*cos(w*t)"
 
     [inputs]                                            # of the inputs named above; see models/input_files.py
-    # u = { file = "u.csv", kind = "cubic" }            # beside this file; or constant, linear (left out: that)
+    # u = { file = "u.csv", kind = "cubic" }            # relative to this file; or constant, linear (default)
     # w = { t = [0.0, 1.0, 2.0], values = [0.0, 0.5, 0.0] }
 
-    [parameters]                                        # default values; the section may be left out
+    [parameters]                                        # default values; the section is optional
     m = 1.0
     l = 1.0
     g = 9.81
@@ -30,31 +30,30 @@
     [initial]
     q = [2.0]                                           # or by name: a table [initial.q] with a line theta = 2.0
     q_dot = [0.0]                                       # velocities, or p = [...] for momenta, not both
-    t = 0.0                                             # left out: 0
+    t = 0.0                                             # default: 0
 
-    [method]                                            # left out: SVI(8); with constraints SVI(6)
+    [method]                                            # default: SVI(8); with constraints SVI(6)
     method = "svi"                                      # then its arguments: degree, quadrature, nodes, ...
     degree = 8
 
     [run]
-    step = 0.5                                          # negative: backward
-    span = 100.0                                        # length of time, or steps = 200
-                                                        # or tolerance = 1e-9 (without both: round-off): steps
-                                                        # choose their length; then a negative span goes back
-    # controller = "reversible"                         # of a monitor: time as it is, steps whose density it carries
-    save_every = 1                                      # distance between kept states; left out: 1
+    step = 0.5                                          # negative: backward in time
+    span = 100.0                                        # time span, or steps = 200
+                                                        # or tolerance = 1e-9 for adaptive steps (without both:
+                                                        # errors at round-off level); then negative spans go backward
+    # controller = "reversible"                         # of a monitor: physical time, integrated step density
+    save_every = 1                                           # stride of saved states; default: 1
 
-A Hamiltonian stands in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
+A Hamiltonian is given in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
 the names ``p_q``; with constraints the model is that of its Lagrangian.
 
-``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and what
-``[initial]`` and ``[run]`` leave out is the catalogue's. Files are written complete in themselves.
+``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and missing
+entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are complete.
 
-Coordinates that are arrays, ``coordinates = ["q[N]"]``, make it a model of sums over indices: see
+Coordinates that are arrays, ``coordinates = ["q[N]"]``, make it a model of an indexed system: see
 :mod:`scvi_codegen.models.indexed_file`.
 
-Sections may be laid over those of a file, as the options of a command line are: they supply what it lacks and replace
-what it says.
+Further sections, such as command-line options, can be merged over those of a file: they add and replace entries.
 '''
 
 from __future__ import annotations
@@ -119,14 +118,14 @@ RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_e
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ARRAY_SECTIONS = ("sizes", "tables")
-"""Of sums over indices."""
+"""Additional sections of indexed systems."""
 NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
-"""Keys, or their alternatives, without which there is nothing to run."""
+"""Required keys, or their alternatives."""
 
 
 @takes(path=PATH)
 def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
-    """Read a model file, with the sections ``given`` laid over its own.
+    """Read a model file, with the sections ``given`` merged over its own.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
@@ -136,7 +135,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
 
 @takes(path=PATH)
 def load_indexed_model(path: str | os.PathLike[str], given: Document | None = None) -> IndexedModel:
-    """Read a model file whose coordinates are arrays (:mod:`scvi_codegen.models.indexed_file`); as :func:`load_model`.
+    """Read the model file of an indexed system (:mod:`scvi_codegen.models.indexed_file`); see :func:`load_model`.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
@@ -147,7 +146,7 @@ def load_indexed_model(path: str | os.PathLike[str], given: Document | None = No
 
 
 def read_model_file(path: str | os.PathLike[str], given: Document | None = None) -> Model | IndexedModel:
-    """A model of either kind. Raises as :func:`load_model`."""
+    """Read a model of either kind. Raises as :func:`load_model`."""
     try:
         text = Path(path).read_text(encoding="utf-8")
     except OSError as error:
@@ -168,27 +167,27 @@ def _of_kind(path: str | os.PathLike[str], model: object, kind: type[Kind], othe
 
 @takes(model=of("a Model", Model), path=PATH)
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
-    """Write a model file, whole or not at all; reading it gives an equal model.
+    """Write a model file atomically; reading it returns an equal model.
 
     Raises:
-        ModelFileError: if the model has no exact text (a quadrature or tableau of the user's own).
+        ModelFileError: if the model cannot be represented exactly (a user-defined quadrature or tableau).
     """
     text = dump_model(model)
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def catalogue_model(name: str, given: Document | None = None) -> Model:
-    """An entry of the catalogue, with the sections ``given`` laid over it. Raises as :func:`load_model`."""
+    """Return a catalogue entry with the sections ``given`` merged over it. Raises as :func:`load_model`."""
     return _read_model({"system": {"catalogue": name}}, given or {})
 
 
 def parse_model(text: str, given: Document | None = None, *, folder: str | os.PathLike[str] = ".") -> Model:
-    """The model described by TOML text; see the module's docstring. Raises as :func:`load_model`.
+    """Return the model of TOML text; see the module's docstring. Raises as :func:`load_model`.
 
     Args:
         text: of the file.
-        given: sections laid over it.
-        folder: where the tables of inputs are.
+        given: sections merged over it.
+        folder: base of relative paths.
     """
     return _of_kind("the text", _parsed(text, given, folder), Model, "load_indexed_model")
 
@@ -200,7 +199,7 @@ def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -
         if not isinstance(content, dict):
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     if _has_arrays(document):
-        from scvi_codegen.models.indexed_file import read_indexed  # here: other models are read without NumPy
+        from scvi_codegen.models.indexed_file import read_indexed  # imported here: other models are read without NumPy
 
         return read_indexed(document, given or {}, folder)
     for name in ARRAY_SECTIONS:
@@ -212,14 +211,14 @@ def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -
 
 
 def _has_arrays(document: Document) -> bool:
-    """Whether coordinates are arrays, ``q[N]``."""
+    """Return whether coordinates are arrays, ``q[N]``."""
     coordinates = document.get("system", {}).get("coordinates", ())
     return isinstance(coordinates, list) and any(isinstance(name, str) and "[" in name for name in coordinates)
 
 
 def dump_model(model: Model) -> str:
-    """TOML text that :func:`parse_model` reads back as an equal model. Raises as :func:`save_model`."""
-    import tomli_w  # here, because reading does not need it
+    """Return TOML text that :func:`parse_model` converts to an equal model. Raises as :func:`save_model`."""
+    import tomli_w  # imported here: not needed for reading
 
     text = tomli_w.dumps(document_of(model), multiline_strings=True)
     again = parse_model(text)
@@ -259,7 +258,7 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
 
 
 def _with_own_step(layer: Document) -> Document:
-    """Where time is transformed a step given for another time is of no use: one is chosen unless it is said with it."""
+    """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau."""
     run = layer.get("run", {})
     if "monitor" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
         return layer
@@ -267,7 +266,7 @@ def _with_own_step(layer: Document) -> Document:
 
 
 def _check_kept(error: Any, run: Section) -> None:
-    """Refuse a monitor laid over a bound of the global error that it would replace."""
+    """Raise an error for a time transformation added to a model with ``error``, unless that is replaced."""
     if not {"step", "tolerance"} & run.keys():
         raise ModelFileError(
             f"[run] error = {error} needs adaptive steps, and a monitor has fixed steps of tau: give --tolerance or "
@@ -276,7 +275,7 @@ def _check_kept(error: Any, run: Section) -> None:
 
 
 def _check_complete(document: Document) -> None:
-    """Name all that is missing at once."""
+    """Raise an error that lists all missing keys."""
     missing = []
     for name, keys in NEEDED.items():
         for key in keys:
@@ -289,7 +288,7 @@ def _check_complete(document: Document) -> None:
 
 
 def _check_used(document: Document, parameters: Section) -> None:
-    """Refuse a parameter laid over a system that knows none of that name."""
+    """Raise an error for an added parameter that no formula contains."""
     section = document["system"]
     formulas = [section.get(key, "") for key in (*FORMULAS, "monitor")]
     formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
@@ -362,6 +361,6 @@ def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...
 def _read_inputs(section: Section, folder: str | os.PathLike[str]) -> dict[str, InputTable]:
     if not section:
         return {}
-    from scvi_codegen.models.input_files import read_input  # here: other models are read without NumPy
+    from scvi_codegen.models.input_files import read_input  # imported here: other models are read without NumPy
 
     return {name: read_input(name, entry, folder) for name, entry in section.items()}

@@ -1,14 +1,14 @@
-"""A folder with everything one integrator needs: C for C programs, an importable package for Python.
+"""Generated folders: a complete integrator as C code for C programs, and as an importable package for Python.
 
     pendulum_svi/  pendulum_svi.h  pendulum_svi.c   the integrator, C99
-                   support/                         what it includes, the same C for every integrator but for the
-                                                    tables of steps that choose their length
+                   support/                         headers, the same for every integrator except for the tables of
+                                                    adaptive steps
                    main.c  Makefile                 ``make run`` runs the example with a C compiler and libm
-                   __init__.py  interface.json      ``import pendulum_svi`` gives ``pendulum_svi.stepper``
-                   model.toml  README.md            what it was made from, and how to use it
+                   __init__.py  interface.json      ``import pendulum_svi`` provides ``pendulum_svi.stepper``
+                   model.toml  README.md            the model file, and instructions
 
-The folder's name begins every C name. Importing it compiles the C text once, as it stands there, and never needs SymPy.
-``interface.json`` also records a checksum of each file, so that a file edited since is not overwritten unasked.
+The name of the folder is the prefix of all C names. Importing it compiles the C code once, without SymPy.
+``interface.json`` also contains a checksum of each file, so that edited files are not overwritten unless forced.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ __all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_
 
 OUTPUTS = 20
 COMPARED = 1e-9
-"""Tolerance of steps that choose their length beside an example of steps that do not."""
+"""Tolerance of adaptive steps shown next to an example with a fixed step size."""
 ADVANCE_TO = "_advance_to("
-"""In the header of an integrator whose steps may choose their length."""
+"""Declaration in the header of an integrator with adaptive steps."""
 
 OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
-"""Folder names that would collide with ``main.c`` or hide what the package imports."""
+"""Folder names that would collide with ``main.c`` or shadow imports of the package."""
 
 
 MODEL = Kind("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
@@ -58,24 +58,24 @@ def generate_package(
     embedded: Embedded | None = None,
     single_file: bool = False,
 ) -> Path:
-    """Write the integrator of a model into a folder, made if it is missing; files of others in it are left alone.
+    """Write the integrator of a model into a folder, created if necessary; other files in it are not changed.
 
-    What an older integrator left there, and the certificate of other code, is removed.
+    Obsolete files of an older integrator, and the verification report of other code, are removed.
 
     Args:
-        model: system, method, and the initial state and step of the example.
-        folder: where to; its name becomes the prefix of the C names and the name of the Python package.
+        model: system, method, and the initial state and step size of the example.
+        folder: target; its name becomes the prefix of the C names and the name of the Python package.
         solver: of the stage equations, as for ``compile_stepper``.
-        force: overwrite files of the same names that were edited or written by someone else.
+        force: overwrite files of the same names that were edited or not generated.
         embedded: the precision, ``"double"`` or ``"single"``, of C for a microcontroller, without a Python package.
-        single_file: the support headers inside the one source, each once where it is included, not beside it.
+        single_file: include the support headers in the single source file instead of separate files.
 
     Returns:
         The folder.
 
     Raises:
-        PackageError: if the folder's name does not serve, it cannot be written, or a file in it would be lost.
-        MethodError: for a solver that the method does not have, and for a number beyond single precision.
+        PackageError: if the name of the folder is invalid, it cannot be written, or a file in it would be lost.
+        MethodError: for a solver that does not support the method, and for a number beyond single precision.
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
@@ -86,11 +86,11 @@ def generate_package(
 
 @takes(folder=PATH)
 def load_package(folder: str | os.PathLike[str]) -> Stepper:
-    """The stepper of a generated folder, compiled from the C text in it (from the cache if that is unchanged).
+    """Return the stepper of a generated folder, compiled from the C code in it (from the cache if that is unchanged).
 
     Raises:
         PackageError: if the folder lacks a file or was written by another version.
-        BuildError: without a C compiler, or if it refuses the text.
+        BuildError: without a C compiler, or if compilation fails.
     """
     target, record = Path(folder), read_record(folder)
     try:
@@ -111,7 +111,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 
 def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a generated folder says of itself; raises as :func:`source_in`."""
+    """Return ``interface.json`` of a generated folder; raises as :func:`source_in`."""
     target = Path(folder)
     try:
         record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
@@ -125,7 +125,7 @@ def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def source_in(folder: Path, prefix: str) -> Source:
-    """The C text in a generated folder.
+    """Return the C code in a generated folder.
 
     Raises:
         PackageError: if the folder lacks a file or was written by another version.
@@ -154,8 +154,8 @@ def _read(file: Path) -> str:
 
 
 def prefix_of(folder: Path) -> str:
-    """The name of the folder, fit to begin C names and to be imported."""
-    from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # here, because it imports SymPy
+    """Return the name of the folder, validated as a prefix of C names and as a Python module."""
+    from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
 
     try:
         name = folder.resolve().name
@@ -174,7 +174,7 @@ def prefix_of(folder: Path) -> str:
 
 
 def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
-    """Text by file name, ``interface.json`` last."""
+    """Return texts by file name, ``interface.json`` last."""
     from scvi_codegen.compiler import generate_source
     from scvi_codegen.rendering.text import render_example
 
@@ -203,7 +203,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
 
 
 def example_of(model: Model, *, controlled: bool) -> ExampleRun:
-    """The whole run of the model in at most about twenty lines of output."""
+    """Return the example run: the whole run of the model with about twenty lines of output at most."""
     from scvi_codegen.models.input_tables import tables_of_example
     from scvi_codegen.rendering.text import ExampleRun
 
@@ -240,14 +240,14 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
 
 
 def _chosen_by(model: Model) -> float:
-    """What steps choose their length by: a tolerance, or tau."""
+    """Return the tolerance of adaptive steps, or the step size in tau."""
     if model.monitor is not None and model.h is not None:
         return abs(model.h)
     return COMPARED if model.h is not None else model.tolerance or 0.0
 
 
 def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
-    """(m,) initial momenta from the velocities, in 60 digits: generating a package takes no compiler."""
+    """Return the (m,) initial momenta from the velocities, in 60 digits, so that no C compiler is required."""
     from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.mechanics.forms import forms_of
     from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
@@ -267,7 +267,7 @@ def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
 
 
 def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> Any:
-    """dt/dtau at a state, in 60 digits."""
+    """Return dt/dtau at a state, in 60 digits."""
     from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.tables.precision import mp
 
@@ -290,7 +290,7 @@ Time is transformed: steps `h` are of tau, dt = g dtau with the monitor g, and `
 
 
 def model_text(model: Model) -> str | None:
-    """The model file, or ``None`` for a method that a file cannot hold (a quadrature of the user's own)."""
+    """Return the model file, or ``None`` for a method that a file cannot represent (a user-defined quadrature)."""
     from scvi_codegen.models.model_file import dump_model
 
     try:
@@ -332,7 +332,7 @@ for (long long steps; (steps = ${prefix}_next_steps(&run, t_end, h, inputs, para
 
 
 def _further(text: str, interface: Interface) -> str:
-    """A part of the description that not every folder has."""
+    """Return an optional part of the README."""
     inputs = ", ".join(f"`{name}`" for name in interface.inputs)
     return Template(text).substitute(prefix=interface.prefix, inputs=inputs, monitor=interface.monitor)
 

@@ -1,4 +1,4 @@
-"""A catalogue of systems with an initial state, a step and a span to try them with, by their command-line names."""
+"""Catalogue of example problems: a system, an initial state, a step size and a time span, by command-line name."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ __all__ = ["PROBLEMS", "Problem", "problem"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
-    """A system with everything needed to integrate it once.
+    """System with everything needed to integrate it once.
 
     Attributes:
         name: the name on the command line.
-        title: one line that says what it is.
-        system: the Lagrangian.
+        title: one-line description.
+        system: the Lagrangian or Hamiltonian.
         q: initial coordinates, m numbers.
-        velocity: initial velocities, m numbers, or ``None`` where ``p`` is given.
+        velocity: initial velocities, m numbers, or ``None`` if ``p`` is given.
         p: initial momenta, m numbers, or ``None``.
-        step: a step size that suits a method of eight points.
-        span: a length of time that shows what the system does.
-        reference: where it is described.
+        step: a suitable step size for a method with eight points.
+        span: a time span that shows the behaviour of the system.
+        reference: bibliographic reference.
     """
 
     name: str
@@ -123,7 +123,7 @@ def _entry(
 
 
 def _fput_problem(n: int = 8) -> Problem:
-    """The chain with its energy in the first mode, of amplitude 1."""
+    """Return the chain with its energy in the first mode, of amplitude 1."""
     system = fput_chain(n)
     amplitude = math.sqrt(2 / (n + 1))
     return Problem(
@@ -260,15 +260,15 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
         ]
     )
 )
-"""The catalogue: name on the command line -> function that builds the entry."""
+"""Catalogue: functions that build the entries, by command-line name."""
 
 
 @takes(name=TEXT)
 def problem(name: str) -> Problem:
-    """Build an entry of the catalogue; a chain takes a size, as in ``fput-chain:64``.
+    """Return an entry of the catalogue; a chain takes a size, as in ``fput-chain:64``.
 
     Raises:
-        SystemDefinitionError: if there is no such entry, or its size is unfit.
+        SystemDefinitionError: if there is no such entry, or its size is invalid.
     """
     base, colon, size = name.partition(":")
     if base not in PROBLEMS:

@@ -1,4 +1,4 @@
-"""Sections of model files, of every kind of system: laid over each other, keys checked, methods read."""
+"""Sections of model files of all kinds of systems: merging, validation of keys, and reading of methods."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ Section = Mapping[str, Any]
 Document = Mapping[str, Section]
 
 ALTERNATIVES = ({"lagrangian", "hamiltonian"}, {"p", "q_dot"}, {"step", "tolerance", "error"}, {"span", "steps"})
-"""One of each is given."""
+"""Groups of alternative keys, of which one is given."""
 INHERITED = ("degree", "quadrature", "nodes", "stages")
-"""Arguments that a method laid over another takes from it, if it has them."""
+"""Arguments of a method that are inherited when another method is merged over it, if that accepts them."""
 
 
 def chosen_method(document: Document, given: Document) -> Section:
-    """The method of a file, or the default one, with what is laid over it."""
+    """Return the method of a file, or the default one, with the given changes."""
     default: Section = DEFAULT_METHOD.specification()
     if document.get("system", {}).get("constraints"):
         default = {"method": "svi", "degree": 6}
@@ -48,7 +48,7 @@ def chosen_method(document: Document, given: Document) -> Section:
 
 
 def laid_over(below: Document, above: Document) -> dict[str, Section]:
-    """All sections; what one of them says above replaces what is below, and the alternatives of it."""
+    """Return all sections merged; keys in ``above`` replace those in ``below`` and their alternatives."""
     document = dict(below)
     for name, section in above.items():
         replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
@@ -58,7 +58,7 @@ def laid_over(below: Document, above: Document) -> dict[str, Section]:
 
 
 def _spelt_out(section: Section) -> Section:
-    """A method whose name has its degree, ``svi:6``, with both apart."""
+    """Return a method section with a name such as ``svi:6`` split into name and degree."""
     name = section.get("method")
     if not isinstance(name, str) or ":" not in name:
         return section
@@ -70,23 +70,23 @@ def _spelt_out(section: Section) -> Section:
 
 
 def _changed_method(base: Section, given: Section) -> Section:
-    """A method with some arguments changed; another method takes over what it has in common with it."""
+    """Return a method with some arguments changed; another method inherits common arguments."""
     if not given:
         return base
     kept = dict(base)
     if kept.get("quadrature") == f"gauss-legendre:{kept.get('degree')}":
-        del kept["quadrature"]  # the default for its degree: another degree has another default
+        del kept["quadrature"]  # the default for its degree; another degree has another default
     name = given.get("method", kept.get("method"))
     if name != kept.get("method"):
         accepted = ARGUMENTS.get(name, ())
         kept = {key: value for key, value in kept.items() if key in INHERITED and key in accepted}
     if {"abscissae", "space"} & given.keys():
-        kept.pop("nodes", None)  # they say in other words where the curve is given
+        kept.pop("nodes", None)  # alternatives to nodes
     return sized({**kept, **given}) if "method" in given else {**kept, **given}
 
 
 def read_method(section: Section) -> Method:
-    """The method of ``[method]``."""
+    """Return the method of the section ``[method]``."""
     name = text_of(section, "method", "[method]")
     if name in ARGUMENTS:
         check_keys(section, ("method", *ARGUMENTS[name]), "key", f"[method] for {name}")
@@ -98,7 +98,7 @@ def read_method(section: Section) -> Method:
 
 
 def names_of(section: Section, key: str) -> list[str]:
-    """A list of names in ``[system]``."""
+    """Return a list of names in ``[system]``."""
     names = required(section, key, "[system]")
     if not isinstance(names, list) or not all(isinstance(item, str) for item in names):
         raise ModelFileError(f"[system] {key} must be a list of names, not {names!r}")
@@ -106,20 +106,20 @@ def names_of(section: Section, key: str) -> list[str]:
 
 
 def check_one(section: Section, name: str, one: str, other: str) -> None:
-    """Refuse two keys of which one is to be given."""
+    """Raise an error if two alternative keys are both given."""
     if one in section and other in section:
         raise ModelFileError(f"[{name}] has both of {one} and {other}: give one of them")
 
 
 def required(section: Section, key: str, where: str) -> Any:
-    """What stands under a key."""
+    """Return the value of a key."""
     if key not in section:
         raise ModelFileError(f"{where} lacks '{key}'")
     return section[key]
 
 
 def text_of(section: Section, key: str, where: str) -> str:
-    """A text under a key."""
+    """Return the text value of a key."""
     value = required(section, key, where)
     if not isinstance(value, str):
         raise ModelFileError(f"{where} {key} must be text between quotes, not {value!r}")
@@ -127,14 +127,14 @@ def text_of(section: Section, key: str, where: str) -> str:
 
 
 def formula_of(section: Section, key: str, where: str) -> str:
-    """A formula under a key, as text or a number."""
+    """Return the formula value of a key, which is text or a number."""
     if not FORMULA.holds(required(section, key, where)):
         raise ModelFileError(f"{where} {key} must be a formula between quotes or a number, not {section[key]!r}")
     return str(section[key])
 
 
 def check_keys(section: Section, known: Iterable[str], what: str, where: str = "the file") -> None:
-    """Refuse keys that are not known."""
+    """Raise an error for unknown keys."""
     names = list(known)
     hint = meant_by if what in ("key", "section") else closest
     for key in section:
@@ -143,7 +143,7 @@ def check_keys(section: Section, known: Iterable[str], what: str, where: str = "
 
 
 def in_section(where: str, build: Callable[[], Built]) -> Built:
-    """What is built, with the place in the file before its errors."""
+    """Return ``build()``, with errors prefixed by the location in the file."""
     try:
         return build()
     except (ScviCodegenError, TypeError) as error:
@@ -151,7 +151,7 @@ def in_section(where: str, build: Callable[[], Built]) -> Built:
 
 
 def read_run(section: Section) -> dict[str, Any]:
-    """The fields of a model that ``[run]`` gives; without a step its steps choose their length."""
+    """Return the fields of a model in ``[run]``; adaptive steps without a step size."""
     section = {key: value for key, value in section.items() if value is not None}
     for one, other in (("step", "tolerance"), ("step", "error"), ("tolerance", "error")):
         check_one(section, "run", one, other)

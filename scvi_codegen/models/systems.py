@@ -187,7 +187,7 @@ def outer_solar_system() -> LagrangianSystem:
 
 
 def point_vortices(n: int = 4) -> HamiltonianSystem:
-    """Motion of n point vortices in the plane; x_k is the abscissa of vortex k, y_k its ordinate times its strength.
+    """Return the motion of n point vortices; x_k is the abscissa of vortex k, y_k its ordinate times its strength.
 
     H = -1/(4 pi) sum over pairs of strength_i strength_j log(distance_ij^2). There is no Lagrangian: a shift of all
     ordinates does not change H.

@@ -1,1 +1,1 @@
-"""The numbers a method is made from, in 60 digits: nodes, quadratures, cardinal functions, tableaux, spaces."""
+"""Tables of numbers in 60 digits: nodes, quadratures, cardinal functions, tableaux, spaces of curves, constants."""

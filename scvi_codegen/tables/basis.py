@@ -1,9 +1,9 @@
-"""Cardinal (Lagrange) functions on any distinct points: values, slopes, integrals, differentiation, extrapolation.
+"""Cardinal (Lagrange) functions on distinct points: values, derivatives, integrals, differentiation, extrapolation.
 
-l_j is the polynomial of least degree that is 1 at point j and 0 at the others. Nothing here knows the interval: points
-may lie in [-1, 1], [0, 1] or anywhere. A product of differences needs no division at a point and keeps every entry's
-relative accuracy (Higham, IMA J. Numer. Anal. 24 (2004) 547; Berrut & Trefethen, SIAM Review 46 (2004) 501); guard
-digits grow with the number of points, so equispaced points of high degree lose none of the 50 promised digits.
+l_j is the polynomial of least degree that is 1 at point j and 0 at the others. Points may lie in any interval. A
+product of differences needs no division at a point and preserves the relative accuracy of every entry
+(Higham, IMA J. Numer. Anal. 24 (2004) 547; Berrut & Trefethen, SIAM Review 46 (2004) 501); guard digits grow with the
+number of points, so that 50 digits are correct even for equispaced points of high degree.
 
 Points and results are numbers of 60 digits; arguments may be anything ``mpmath`` converts exactly.
 """
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 GUESS_DEGREE = 8
-"""Highest degree used to guess the next step: the row sums of the extrapolation grow 20-fold a degree."""
+"""Maximum degree of the predictor for the next step: row sums of the extrapolation grow 20-fold per degree."""
 
 
 def matrix_product(left: Matrix, right: Matrix) -> Matrix:
@@ -133,7 +133,7 @@ def differentiation_matrix(points: Iterable[Number]) -> Matrix:
 
 
 def cardinal_slopes(points: Iterable[Number], at: Iterable[Number]) -> Matrix:
-    """Return l_j'(at_i): l_j' is the polynomial through its values at the points, so this is values times D."""
+    """Return l_j'(at_i), computed as values times D, since l_j' is the polynomial through its values at the points."""
     numbers, targets = checked_points(points), tuple(map(to_number, at))
     weights = barycentric_weights(numbers)
     with mp.workdps(guard_digits(numbers)):
@@ -145,7 +145,7 @@ def cardinal_slopes(points: Iterable[Number], at: Iterable[Number]) -> Matrix:
 def cardinal_integrals(points: Iterable[Number], at: Iterable[Number], start: Number) -> Matrix:
     """Return the integral of l_j from ``start`` to at_i: rows are ``at``, columns are points.
 
-    By the Gauss-Legendre rule of half as many points on each interval, which is exact for these polynomials.
+    It uses the Gauss-Legendre rule of half as many points on each interval, which is exact for these polynomials.
     """
     numbers, targets, origin = checked_points(points), tuple(map(to_number, at)), to_number(start)
     weights = barycentric_weights(numbers)
@@ -160,9 +160,9 @@ def cardinal_integrals(points: Iterable[Number], at: Iterable[Number], start: Nu
 
 
 def legendre_functional(points: Vector, degree: int) -> Vector:
-    """From values at the points in [0, 1] to the coefficient of P_degree(2x - 1) of the polynomial through them.
+    """Return the map from values at points in [0, 1] to the coefficient of P_degree(2x - 1) of their interpolant.
 
-    Zeros for a degree below 0.
+    All entries are zero for a degree below 0.
     """
     if degree < 0:
         return (mp.zero,) * len(points)
@@ -216,7 +216,7 @@ def continuation(points: Iterable[Number], degree: int) -> tuple[Matrix, Matrix]
 
 
 def least_squares_shift(points: Vector, targets: Sequence[Number], degree: int) -> list[list[Number]]:
-    """Return the sum over orthogonal polynomials that ``extrapolation`` describes."""
+    """Return the least-squares matrix as a sum over orthogonal polynomials; see ``extrapolation``."""
     count = len(points)
     rows = [[mp.zero] * count for _ in targets]
     before, here = [mp.zero] * (count + len(targets)), [mp.one] * (count + len(targets))

@@ -1,8 +1,8 @@
-"""Nodes, quadratures and tableaux as SymPy rationals and radicals, where these are short.
+"""Closed forms: nodes, quadratures and tableaux as SymPy rationals and radicals, where these are short.
 
-Each function returns what :mod:`~scvi_codegen.tables.nodes`, :mod:`~scvi_codegen.tables.quadrature` and
-:mod:`~scvi_codegen.tables.tableau` hold in 60 digits, or ``None``. What a user made carries no closed form, whatever
-its name. SymPy is imported only where an expression is made.
+Each function returns the exact form of 60-digit numbers in :mod:`~scvi_codegen.tables.nodes`,
+:mod:`~scvi_codegen.tables.quadrature` and :mod:`~scvi_codegen.tables.tableau`, or ``None``. User-defined ones have no
+closed form, whatever their name. SymPy is imported only where an expression is made.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ def reflected(values: Expressions) -> Expressions:
 
 
 def exact_points(nodes: Nodes) -> Expressions | None:
-    """Return the nodes as SymPy rationals and radicals, or None where no short closed form is known.
+    """Return the nodes as SymPy rationals and radicals, or None if no short closed form is known.
 
     Closed forms: equispaced always; Chebyshev whenever SymPy knows the cosines as radicals (Lobatto degree 1 to 6, 8,
-    10, 12, ...); Legendre-Lobatto up to degree 5; Legendre-Gauss up to degree 4; Radau up to degree 2. Nodes that a
-    user made carry no closed form, whatever their name.
+    10, 12, ...); Legendre-Lobatto up to degree 5; Legendre-Gauss up to degree 4; Radau up to degree 2. User-defined
+    nodes
+    have no closed form, whatever their name.
     """
     family = NODE_FAMILIES.get(nodes.name)
     if family is None or family(nodes.degree) != nodes:
@@ -138,10 +139,10 @@ POINT_FAMILIES: Mapping[str, str] = {
 
 
 def exact_rule(quadrature: Quadrature) -> tuple[Expressions, Expressions] | None:
-    """Return (points, weights) as SymPy rationals and radicals, or None where no short closed form is known.
+    """Return (points, weights) as SymPy rationals and radicals, or None if no short closed form is known.
 
     Closed forms: Gauss-Legendre n <= 5, Lobatto n <= 6, Radau n <= 3; Clenshaw-Curtis and Fejer wherever SymPy knows
-    the cosines as radicals. A rule that a user made carries no closed form, whatever its name.
+    the cosines as radicals. A user-defined rule has no closed form, whatever its name.
     """
     family, count = quadrature.name.partition(":")[0], len(quadrature)
     if family not in POINT_FAMILIES:
@@ -224,10 +225,10 @@ EXACT_FAMILIES: Mapping[str, tuple[str, int]] = {
 
 
 def exact_tableau(tableau: Tableau) -> tuple[tuple[Expressions, ...], Expressions, Expressions] | None:
-    """Return (A, b, c) as SymPy rationals and radicals, or None where no short closed form is known.
+    """Return (A, b, c) as SymPy rationals and radicals, or None if no short closed form is known.
 
     Closed forms: Gauss s <= 4, Radau s <= 3, Lobatto s <= 5, Chebyshev-Gauss s <= 3, Chebyshev-Lobatto s <= 7, explicit
-    Euler. A tableau that a user made carries no closed form, whatever its name.
+    Euler. A user-defined tableau has no closed form, whatever its name.
     """
     family, s = tableau.name.partition(":")[0], tableau.stages
     if tableau == explicit_euler():

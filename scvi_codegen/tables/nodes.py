@@ -1,7 +1,7 @@
-"""Nodes on [-1, 1]: where a trial curve of degree s takes its s + 1 coefficients.
+"""Nodes on [-1, 1] that parametrise a trial curve of degree s by its s + 1 values.
 
 Chebyshev points are sines of rational multiples of pi. Legendre-Gauss, Lobatto and Radau points are the roots of Jacobi
-polynomials (Davis & Rabinowitz, *Methods of Numerical Integration*, 2nd ed. 1984, section 2.7), found by Newton's
+polynomials (Davis & Rabinowitz, *Methods of Numerical Integration*, 2nd ed. 1984, section 2.7), computed by Newton's
 method on the three-term recurrence with twenty guard digits: no eigenvalue problem, no monomials.
 """
 
@@ -45,20 +45,20 @@ __all__ = [
 
 GUARD = 20
 MOST_POINTS = 128
-"""Of a rule or a curve: a second of 60-digit arithmetic, and far beyond what double precision has a use for."""
+"""Maximum number of points of a rule or a curve: about a second of 60-digit arithmetic."""
 
 point_count = partial(checked_count, most=MOST_POINTS, error=MethodError)
-"""A number of points, or a degree."""
+"""Validation of a number of points, or a degree."""
 
 Expressions: TypeAlias = tuple[Any, ...]
-"""A tuple of SymPy expressions (SymPy is imported only where one is made)."""
+"""Tuple of SymPy expressions (SymPy is imported only where one is made)."""
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nodes:
-    """Distinct ascending points on [-1, 1] that carry a polynomial of degree ``degree``.
+    """Distinct ascending points on [-1, 1] that determine a polynomial of degree ``degree``.
 
     ``points`` has ``degree + 1`` entries; floats, integers, fractions, decimal strings and SymPy numbers are converted
     to numbers of 60 digits. Raises ``MethodError`` when they are not ascending, not in [-1, 1], or too few or many.
@@ -79,29 +79,29 @@ class Nodes:
 
     @property
     def abscissae(self) -> Vector:
-        """The points mapped to [0, 1]: c = (x + 1) / 2."""
+        """Points mapped to [0, 1]: c = (x + 1) / 2."""
         return to_unit(self.points)
 
     @property
     def contains_ends(self) -> bool:
-        """Whether the first node is -1 and the last is 1, exactly."""
+        """True if the first node is -1 and the last is 1, exactly."""
         return bool(self.points[0] == -1 and self.points[-1] == 1)
 
     @property
     def symmetric(self) -> bool:
-        """Whether x and -x are nodes together, to 50 digits."""
+        """True if the negative of each node is a node, to 50 digits."""
         return is_antisymmetric(self.points)
 
 
 def to_unit(points: Vector) -> Vector:
-    """Points of [-1, 1] mapped to [0, 1]: c = (x + 1) / 2."""
+    """Map points of [-1, 1] to [0, 1]: c = (x + 1) / 2."""
     return tuple((x + 1) / 2 for x in points)
 
 
 def to_number(value: Any) -> Number:
     """Round an int, float, fraction, decimal string, mpmath or SymPy number to 60 digits.
 
-    A float stands for its exact binary value. Raises ``MethodError`` for anything else, infinities and nan.
+    A float is converted exactly. Raises ``MethodError`` for anything else, infinities and nan.
     """
     try:
         number = mp.mpf(mp.convert(str(value.evalf(DIGITS + GUARD)) if hasattr(value, "evalf") else value))
@@ -126,7 +126,7 @@ def ascending_points(values: Iterable[Any], what: str) -> Vector:
 
 
 def is_antisymmetric(points: Vector) -> bool:
-    """Whether reversing the points changes their signs and nothing else, to 50 digits."""
+    """Return whether reversing the points equals changing their signs, to 50 digits."""
     tolerance = mp.mpf(10) ** (10 - DIGITS)
     return all(abs(left + right) <= tolerance for left, right in zip(points, reversed(points), strict=True))
 
@@ -174,7 +174,7 @@ def jacobi_root(count: int, alpha: int, beta: int, index: int) -> Number:
 def jacobi_roots(count: int, alpha: int, beta: int) -> Vector:
     """Return the ascending roots of the Jacobi polynomial of degree ``count >= 0`` and integer ``alpha, beta >= 0``.
 
-    The guard digits are kept: ``Nodes`` and ``Quadrature`` round, once.
+    They include guard digits, since ``Nodes`` and ``Quadrature`` round them.
     """
     with mp.workdps(DIGITS + GUARD):
         roots = [jacobi_root(count, alpha, beta, index) for index in range(count)]

@@ -1,9 +1,8 @@
-"""The arithmetic in which every table is computed: 60 significant digits, in a context of its own.
+"""Multiprecision arithmetic of all tables: 60 significant digits, in a private context.
 
 Nodes, weights and cardinal functions are computed once, at generation time, and rounded once, when they are printed;
-60 digits leave ten to spare over the 50 that are promised. The context is private: a user's ``mpmath.mp.dps`` neither
-disturbs the tables nor is disturbed by them. Its precision is that of each thread: where one rounds to the 53 bits of a
-double, tables that another computes keep their digits.
+50 digits are guaranteed, ten are reserve. The context is independent of a user's ``mpmath.mp.dps``. Its precision is
+thread-local: a thread that rounds to the 53 bits of a double does not affect tables computed by others.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ DIGITS = 60
 
 
 class _OfThread(threading.local):
-    """A pair, bits and rounding, as mpmath's numbers ask for it; of 60 digits where a thread begins."""
+    """Thread-local pair of precision in bits and rounding mode, as mpmath's numbers access it; initially 60 digits."""
 
     def __init__(self) -> None:
         self.pair = [dps_to_prec(DIGITS), "n"]
@@ -37,7 +36,7 @@ class _OfThread(threading.local):
 
 
 class _ThreadedContext(MPContext):  # type: ignore[misc]
-    """mpmath's arithmetic; where it keeps one precision for all threads, each has its own."""
+    """Context of mpmath whose precision is thread-local instead of global."""
 
     _own = _OfThread()
     _prec_rounding = property(lambda self: self._own, lambda self, given: None)
@@ -47,19 +46,19 @@ class _ThreadedContext(MPContext):  # type: ignore[misc]
 
 mp = _ThreadedContext()
 mp.dps = DIGITS
-for constant in (mp.pi, mp.e, mp.ln2, mp.ln10):  # mpmath keeps their digits, but not safely while threads extend them
+for constant in (mp.pi, mp.e, mp.ln2, mp.ln10):  # cached by mpmath, but extended in a way that is not thread-safe
     constant(dps=10 * DIGITS)
 
 ZERO = mp.mpf(10) ** -40
-"""Entries of tables on a step of length 1 that are smaller are 0 but for the 60th digit of what they came from."""
+"""Bound below which table entries on a step of length 1 are set to 0: round-off in the 60th digit of their terms."""
 
 Number: TypeAlias = Any
-"""An ``mp.mpf`` of this context (mpmath ships no types)."""
+"""An ``mp.mpf`` of this context (mpmath has no type annotations)."""
 
 Vector: TypeAlias = tuple[Number, ...]
 Matrix: TypeAlias = tuple[Vector, ...]
 
 
 def settled(value: Number) -> Number:
-    """An entry of a table, rounded to the current precision; exactly 0 where it is 0 but for rounding."""
+    """Return a table entry rounded to the current precision; exactly 0 if it is round-off."""
     return +value if abs(value) > ZERO else mp.zero

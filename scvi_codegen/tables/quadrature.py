@@ -51,7 +51,7 @@ CLAIMED_TOLERANCE = mp.mpf("1e-8")
 
 MOST_ORDER = 10**6
 MOST_CONDITIONS = 64
-"""Of a rule with derivatives, whose weights solve as many equations."""
+"""Maximum number of conditions of a rule with derivatives, whose weights solve as many equations."""
 
 MOST_DIGITS = 9
 
@@ -60,13 +60,13 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quadrature:
-    """A rule sum_n w_n f(x_n) for the integral of f over [-1, 1], or with derivatives sum_n sum_k w_kn f^(k)(x_n).
+    """Quadrature rule sum_n w_n f(x_n) for the integral of f over [-1, 1], or sum_n sum_k w_kn f^(k)(x_n).
 
     ``points`` are ascending in [-1, 1], ``weights`` as many, of any sign, with sum 2; floats, integers, fractions,
     decimal strings and SymPy numbers are converted to 60 digits. ``derivative_weights`` has one row for f', one for f''
-    and so on. ``order`` is the p such that polynomials of degree below p are integrated exactly; left out (or 0) it is
-    computed from the Legendre moments, which must then vanish to 12 digits; given, it is checked to 8 digits. Raises
-    ``MethodError`` when any of this fails.
+    and so on. ``order`` is the p such that polynomials of degree below p are integrated exactly; by default (0) it is
+    computed from the Legendre moments, which must then be zero to 12 digits; otherwise it is verified to 8 digits.
+    ``MethodError`` is raised when any of this fails.
     """
 
     name: str
@@ -105,7 +105,7 @@ class Quadrature:
 
     @property
     def symmetric(self) -> bool:
-        """Whether points and weights are symmetric about 0, to 50 digits."""
+        """True if points and weights are symmetric about 0, to 50 digits."""
         tolerance = mp.mpf(10) ** (10 - DIGITS)
         pairs = [
             (left, (-1) ** k * right)
@@ -116,29 +116,29 @@ class Quadrature:
 
     @property
     def conditions(self) -> int:
-        """The number of values that the rule uses: points, times 1 and the derivatives."""
+        """Number of values that the rule uses: points, times 1 plus the number of derivatives."""
         return len(self.points) * (1 + len(self.derivative_weights))
 
     @property
     def abscissae(self) -> Vector:
-        """The points mapped to [0, 1]: c = (x + 1) / 2."""
+        """Points mapped to [0, 1]: c = (x + 1) / 2."""
         return to_unit(self.points)
 
     @property
     def unit_weights(self) -> Vector:
-        """The weights for [0, 1], with sum 1: b = w / 2."""
+        """Weights for [0, 1], with sum 1: b = w / 2."""
         return tuple(weight / 2 for weight in self.weights)
 
     @property
     def unit_derivative_weights(self) -> Matrix:
-        """The same of the derivatives by c in [0, 1]: the k-th divided by 2^(k+1)."""
+        """Weights of the derivatives for [0, 1]: the k-th divided by 2^(k+1)."""
         return tuple(tuple(w / 2 ** (k + 1) for w in line) for k, line in enumerate(self.derivative_weights, 1))
 
 
 def moment_order(points: Vector, weights: Matrix, tolerance: Number) -> int:
-    """Return the first degree whose Legendre polynomial is not integrated to ``tolerance``, at most 2 n a derivative.
+    """Return the degree of the first Legendre polynomial with an error above ``tolerance``, at most 2 n per derivative.
 
-    Legendre polynomials are the well-conditioned test: for a Gauss rule the moment of degree 2n is of size 1, while
+    Legendre polynomials make the test well conditioned: for a Gauss rule the moment of degree 2n is of size 1, while
     that of x^(2n) is below 4^-n.
     """
     most = 2 * len(points) * len(weights)
@@ -153,7 +153,7 @@ def moment_order(points: Vector, weights: Matrix, tolerance: Number) -> int:
 
 
 def next_legendre(degree: int, points: Vector, values: Matrix, before: Matrix) -> Matrix:
-    """Return P_(degree + 1) and its derivatives at the points, one row a derivative, from those of the two below."""
+    """Return P_(degree + 1) and its derivatives at the points, one row per derivative, from the two degrees below."""
     lines = []
     for k, (line, last) in enumerate(zip(values, before, strict=True)):
         lower = values[k - 1] if k else line
@@ -327,7 +327,7 @@ def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item
 
 
 def is_made_by(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
-    """Whether ``item`` is what its name stands for, not something a user made under that name."""
+    """Return whether ``item`` equals the built-in object of that name, rather than a user's object of the same name."""
     try:
         return by_name(name) == item
     except MethodError:
@@ -335,7 +335,7 @@ def is_made_by(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
 
 
 def quadrature_by_name(name: str) -> Quadrature:
-    """Return the rule of a name such as ``"gauss-legendre:8"``; every rule's ``name`` reads back to itself.
+    """Return the rule of a name such as ``"gauss-legendre:8"``, the inverse of ``name``.
 
     Raises ``MethodError`` for an unknown family (with the known ones and the closest) or a missing or too small count.
     """

@@ -1,4 +1,4 @@
-"""Numbers of 60 digits recognised as short combinations of radicals, by PSLQ."""
+"""Recognition of 60-digit numbers as short combinations of radicals, by PSLQ."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["radical_basis", "recognised"]
 LARGEST_BASIS = 8
 LARGEST_COEFFICIENT = 10**5
 SLACK = 6
-"""Digits left out of the comparison: 54 agree."""
+"""Number of digits excluded from the comparison, so that 54 must agree."""
 
 
 def radical_basis(expressions: Iterable[sympy.Expr]) -> tuple[sympy.Expr, ...]:
-    """1, the square roots in the expressions and their pairwise products; () where these are not short."""
+    """Return 1, the square roots in the expressions and their pairwise products; () if these are too many."""
     roots: set[sympy.Expr] = set()
     for expression in expressions:
         roots |= {atom for atom in expression.atoms(sympy.Pow) if atom.exp in (sympy.S.Half, -sympy.S.Half)}
@@ -30,7 +30,7 @@ def radical_basis(expressions: Iterable[sympy.Expr]) -> tuple[sympy.Expr, ...]:
 
 
 def recognised(value: Number, basis: tuple[sympy.Expr, ...]) -> sympy.Expr | None:
-    """The combination of basis elements with small rational coefficients that equals ``value``, or ``None``."""
+    """Return the combination of basis elements with small rational coefficients that equals ``value``, or ``None``."""
     if value == 0:
         return sympy.S.Zero
     if not basis:
@@ -45,11 +45,11 @@ def recognised(value: Number, basis: tuple[sympy.Expr, ...]) -> sympy.Expr | Non
 
 @lru_cache(maxsize=64)
 def in_digits(basis: tuple[sympy.Expr, ...]) -> Vector:
-    """The elements in 60 digits."""
+    """Return the elements in 60 digits."""
     return tuple(mp.mpf(str(sympy.N(element, DIGITS + 5))) for element in basis)
 
 
 def square_free(root: sympy.Expr) -> sympy.Expr:
-    """The square root of n, without its rational factor."""
+    """Return the square root of n without its rational factor."""
     coefficient, rest = sympy.sqrt(root.base).as_coeff_Mul()
     return rest if coefficient.is_Rational else root

@@ -1,11 +1,11 @@
-"""Spaces of trial curves (paper, 4.2.3): polynomials, trigonometric polynomials, splines with a continuous slope.
+"""Spaces of trial curves (paper, 4.2.3): polynomials, trigonometric polynomials, splines with continuous velocity.
 
-A space of degree s is given by the velocities of its curves, on [0, 1]: s functions with cardinal combinations l_b on s
-points, l_b(point_a) = 1 if a = b else 0. A curve is q(c) = q0 + h sum_b V_b int_0^c l_b, its velocity sum_b V_b l_b(c).
-A method needs tables of the l_b, of their integrals, and for quadratures with derivatives of their slopes; no more.
+A space of degree s is defined by the velocities of its curves on [0, 1]: s functions with cardinal combinations l_b on
+s points, l_b(point_a) = 1 if a = b else 0. A curve is q(c) = q0 + h sum_b V_b int_0^c l_b, its velocity
+sum_b V_b l_b(c). A method needs tables of the l_b, of their integrals, and for quadratures with derivatives of their
+derivatives.
 
-Splines stand for the wavelets that the paper names beside them: what a step gains from a basis of many scales is where
-it may bend, which breakpoints say; a step is a basis of few functions and has nothing to compress.
+Splines replace the wavelets that the paper mentions: with few basis functions per step there is nothing to compress.
 """
 
 from __future__ import annotations
@@ -27,63 +27,63 @@ __all__ = ["CurveSpace", "Polynomials", "Splines", "Trigonometric", "space_by_na
 
 MOST_POINTS = 64
 BETTER = 4
-"""By how many points the rule is better that tells whether one is good enough."""
+"""Number of additional points of the reference rule by which the accuracy of a rule is judged."""
 GUARD_DIGITS = 200
-"""Trigonometric functions of a small frequency are nearly polynomials: their cardinal combinations cancel."""
+"""Guard digits: trigonometric functions of low frequency are nearly polynomials, and cardinal combinations cancel."""
 
 
 class CurveSpace(ABC):
-    """A family of spaces, one for each degree."""
+    """Family of spaces of curves, one for each degree."""
 
     __slots__ = ()
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """What :func:`space_by_name` reads back."""
+        """Name that :func:`space_by_name` accepts."""
 
     @property
     def symmetric(self) -> bool:
-        """Whether a curve run backward is one of the space."""
+        """True if the time reversal of a curve belongs to the space."""
         return True
 
     @property
     def nodal(self) -> bool:
-        """Whether values at nodes give a curve, as they do a polynomial."""
+        """True if values at nodes determine a curve, as for polynomials."""
         return False
 
     @property
     def fitted(self) -> float | None:
-        """The frequency, in radians a step, that its curves are made for; ``None`` where there is none."""
+        """Fitted frequency of the curves, in radians per step, or ``None``."""
         return None
 
     @abstractmethod
     def dimension(self, degree: int) -> int:
-        """The number s of velocities that give a curve."""
+        """Return the number s of velocities that determine a curve."""
 
     @abstractmethod
     def points(self, degree: int, rule: Quadrature) -> Vector:
-        """(s,) where the velocities are those of the curve."""
+        """Return the (s,) points at which the velocities of the curve are unknowns."""
 
     def default_rule(self, degree: int) -> Quadrature:
-        """The rule to take where none is given: as many Gauss points as the degree."""
+        """Return the default quadrature: as many Gauss points as the degree."""
         return gauss_legendre(degree)
 
     def along(self, rule: Quadrature) -> Quadrature:
-        """The rule along the step: the one given, unless the step has pieces."""
+        """Return the rule along the step: ``rule`` itself, unless the step has pieces."""
         return rule
 
     @abstractmethod
     def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
-        """(len(at), s) values of the l_b, or of a derivative by c."""
+        """Return the (len(at), s) values of the l_b, or of a derivative with respect to c."""
 
     @abstractmethod
     def positions(self, points: Vector, at: Vector) -> Matrix:
-        """(len(at), s) integrals of the l_b from 0."""
+        """Return the (len(at), s) integrals of the l_b from 0."""
 
     @abstractmethod
     def order(self, degree: int) -> int | None:
-        """Order of an SVI with a good enough quadrature, or ``None`` where none is claimed."""
+        """Return the order of an SVI with a sufficiently accurate quadrature, or ``None`` if none is claimed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,20 +92,20 @@ class Polynomials(CurveSpace):
 
     @property
     def name(self) -> str:
-        """``polynomials``."""
+        """Name ``polynomials``."""
         return "polynomials"
 
     @property
     def nodal(self) -> bool:
-        """Yes."""
+        """Always true."""
         return True
 
     def dimension(self, degree: int) -> int:
-        """The degree."""
+        """Return the degree."""
         return degree
 
     def points(self, degree: int, rule: Quadrature) -> Vector:
-        """The quadrature points if there are as many, else Gauss's."""
+        """Return the quadrature points if there are as many as the degree, else Gauss points."""
         plain = len(rule) == degree and not rule.derivative_weights
         return rule.abscissae if plain else gauss_legendre(degree).abscissae
 
@@ -121,24 +121,25 @@ class Polynomials(CurveSpace):
         return cardinal_integrals(points, at, 0)
 
     def order(self, degree: int) -> int | None:
-        """Twice the degree."""
+        """Return twice the degree."""
         return 2 * degree
 
 
 @dataclass(frozen=True, slots=True)
 class Trigonometric(CurveSpace):
-    """1, cos(k f c), sin(k f c) for k = 1 .. K, and powers of c for what is left of the degree: s = 2 K + powers.
+    """Span of 1, cos(k f c), sin(k f c) for k = 1 .. K, and powers of c for the rest of the degree: s = 2 K + powers.
 
-    An even degree with all its harmonics leaves no power: straight lines are then not among the curves, and for a fixed
-    f the method does not converge as h goes to 0. Let f shrink with the step, or take an odd degree or fewer harmonics.
+    An even degree with all its harmonics contains no powers: straight lines are then not in the space, and for a fixed
+    f
+    the method does not converge as h goes to 0. Let f shrink with the step, or use an odd degree or fewer harmonics.
 
-    With the frequency f of an oscillator times the step the method is exact on the oscillator, whatever the step, as
-    soon as the quadrature is: by default it has enough Gauss points. Vanden Berghe et al., J. Comput. Appl. Math. 125
-    (2000) 107, survey such methods.
+    If f is the frequency of an oscillator times the step size, the method is exact for the oscillator at any step size,
+    provided that the quadrature is; the default has enough Gauss points. Survey: Vanden Berghe et al., J. Comput. Appl.
+    Math. 125 (2000) 107.
 
     Args:
-        frequency: f > 0, in radians a step.
-        harmonics: K; by default as many as fit the degree.
+        frequency: f > 0, in radians per step.
+        harmonics: K; by default the largest for the degree.
     """
 
     frequency: float
@@ -155,31 +156,31 @@ class Trigonometric(CurveSpace):
 
     @property
     def fitted(self) -> float | None:
-        """Its frequency."""
+        """Frequency f."""
         return self.frequency
 
     @property
     def name(self) -> str:
-        """``trigonometric:<frequency>[:<harmonics>]``."""
+        """Name ``trigonometric:<frequency>[:<harmonics>]``."""
         tail = "" if self.harmonics is None else f":{self.harmonics}"
         return f"trigonometric:{self.frequency!r}{tail}"
 
     def dimension(self, degree: int) -> int:
-        """The degree."""
+        """Return the degree."""
         return degree
 
     def points(self, degree: int, rule: Quadrature) -> Vector:
-        """Gauss points."""
+        """Return Gauss points."""
         self._count(degree)
         return gauss_legendre(degree).abscissae
 
     def default_rule(self, degree: int) -> Quadrature:
-        """So many Gauss points that products of two curves are integrated to round-off."""
+        """Return the Gauss rule that integrates products of two curves to round-off."""
         count = self._count(degree)
         powers = 2 * (degree - 2 * count)
 
         def product(x: Number) -> Number:
-            """The steepest of the products; the point 1 makes it uneven."""
+            """Return the product of highest frequency; 1 + x makes it asymmetric."""
             return (1 + x) ** powers * mp.cos(count * mp.mpf(self.frequency) * (1 + x))
 
         sums: list[Number] = []
@@ -201,7 +202,7 @@ class Trigonometric(CurveSpace):
         return tuple(tuple(x - y for x, y in zip(line, start, strict=True)) for line in self._cardinal(points, at, -1))
 
     def order(self, degree: int) -> int | None:
-        """None is claimed for a fixed frequency a step; 2 degree where it shrinks with the step."""
+        """Return ``None``; the order would be twice the degree if the frequency per step decreased with h."""
         return None
 
     def _count(self, degree: int) -> int:
@@ -214,7 +215,7 @@ class Trigonometric(CurveSpace):
         return harmonics
 
     def _cardinal(self, points: Vector, at: Vector, derivative: int) -> Matrix:
-        """Combinations that are cardinal on the points: functions there times their inverse at the points."""
+        """Return cardinal combinations: the functions at ``at`` times their inverse at the points."""
         degree = len(points)
         with mp.workdps(DIGITS + GUARD_DIGITS):
             own = mp.matrix([self._functions(degree, c, 0) for c in points])
@@ -228,7 +229,7 @@ class Trigonometric(CurveSpace):
         return tuple(tuple(+solved[i, j] for j in range(degree)) for i in range(len(at)))
 
     def _functions(self, degree: int, c: Number, derivative: int) -> list[Number]:
-        """The s velocity functions, centred; ``derivative`` -1 for an integral of each."""
+        """Return the s velocity functions, centred at 1/2; ``derivative`` -1 for an integral of each."""
         count, x = self._count(degree), c - mp.mpf(1) / 2
         values = [_power_derivative(x, j, derivative) for j in range(degree - 2 * count)]
         for k in range(1, count + 1):
@@ -238,7 +239,7 @@ class Trigonometric(CurveSpace):
 
 
 def _power_derivative(x: Number, j: int, derivative: int) -> Number:
-    """The derivative of x^j, or its integral for -1."""
+    """Return the derivative of x^j, or its integral for -1."""
     if derivative == -1:
         return x ** (j + 1) / (j + 1)
     return mp.ff(j, derivative) * x ** (j - derivative) if derivative <= j else mp.zero
@@ -246,13 +247,13 @@ def _power_derivative(x: Number, j: int, derivative: int) -> Number:
 
 @dataclass(frozen=True, slots=True)
 class Splines(CurveSpace):
-    """Polynomials of the degree on pieces of the step, with continuous velocity; one quadrature on every piece.
+    """Piecewise polynomials of the degree with continuous velocity; the same quadrature on every piece.
 
-    With the breakpoints where a force has a kink the order is that of smooth forces.
+    If breakpoints coincide with the kinks of a force, the order is that for smooth forces.
 
     Args:
-        pieces: how many pieces of equal length, 2 by default.
-        breakpoints: in (0, 1), ascending, in place of equal pieces.
+        pieces: number of pieces of equal length, 2 by default.
+        breakpoints: in (0, 1), ascending, instead of equal pieces.
     """
 
     pieces: int = 2
@@ -269,12 +270,12 @@ class Splines(CurveSpace):
 
     @property
     def name(self) -> str:
-        """``splines:<pieces>``, or ``splines:<breakpoint>,..``."""
+        """Name ``splines:<pieces>``, or ``splines:<breakpoint>,..``."""
         return f"splines:{','.join(map(repr, self.breakpoints)) or self.pieces}"
 
     @property
     def symmetric(self) -> bool:
-        """For symmetric breakpoints."""
+        """True if the breakpoints are symmetric."""
         return all(a + b == 1.0 for a, b in zip(self.breakpoints, reversed(self.breakpoints), strict=True))
 
     @property
@@ -284,7 +285,7 @@ class Splines(CurveSpace):
         return list(pairwise((mp.zero, *map(mp.mpf, inner), mp.one)))
 
     def dimension(self, degree: int) -> int:
-        """Of the velocities: continuous, of one degree less."""
+        """Return the dimension of the velocities, which are continuous and of one degree less."""
         if degree < 2:
             raise MethodError("splines with a continuous slope have degree 2 at least")
         velocities = self.pieces * (degree - 1) + 1
@@ -296,20 +297,20 @@ class Splines(CurveSpace):
         return velocities
 
     def points(self, degree: int, rule: Quadrature) -> Vector:
-        """Equispaced on each piece, its ends included."""
+        """Return equispaced points on each piece, including its ends."""
         self.dimension(degree)
         inner = [a + (b - a) * k / (degree - 1) for a, b in self.ends for k in range(degree - 1)]
         return (*inner, mp.one)
 
     def along(self, rule: Quadrature) -> Quadrature:
-        """The rule on every piece."""
+        """Return the composite rule."""
         if rule.derivative_weights:
             raise MethodError(f"{rule.name} uses derivatives along the curve: at breakpoints of {self.name} they jump")
         return _composite(rule, tuple(self.ends))
 
     def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
-        """See :meth:`CurveSpace.velocities`; derivatives, which jump, are not given."""
-        assert derivative == 0  # :meth:`along` sees to it
+        """See :meth:`CurveSpace.velocities`; derivatives are not supported, since they jump."""
+        assert derivative == 0  # ensured by :meth:`along`
         per_piece = (len(points) - 1) // self.pieces
         lines = []
         for c in at:
@@ -335,7 +336,7 @@ class Splines(CurveSpace):
         return tuple(lines)
 
     def order(self, degree: int) -> int | None:
-        """Twice the degree."""
+        """Return twice the degree."""
         return 2 * degree
 
     def _piece(self, c: Number) -> int:
@@ -343,13 +344,13 @@ class Splines(CurveSpace):
 
 
 def _placed(own: Vector, first: int, size: int) -> Vector:
-    """Entries of one piece among zeros."""
+    """Return the entries of one piece, padded with zeros."""
     return (*(mp.zero,) * first, *own, *(mp.zero,) * (size - first - len(own)))
 
 
 @lru_cache(maxsize=64)
 def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Quadrature:
-    """The rule on every piece, as one rule on [-1, 1]."""
+    """Return the composite rule as one rule on [-1, 1]."""
     points = [2 * (a + (b - a) * c) - 1 for a, b in ends for c in rule.abscissae]
     weights = [2 * (b - a) * w for a, b in ends for w in rule.unit_weights]
     merged: dict[Number, Number] = {}
@@ -361,7 +362,7 @@ def _composite(rule: Quadrature, ends: tuple[tuple[Number, Number], ...]) -> Qua
 
 
 def space_by_name(name: str) -> CurveSpace:
-    """The space of ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"``, ``"splines:2"`` or
+    """Return the space ``"polynomials"``, ``"trigonometric:0.5"``, ``"trigonometric:0.5:1"``, ``"splines:2"`` or
     ``"splines:0.25,0.5"``.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Polynomials with 60-digit coefficients, and what A-stability asks of them: roots to the right, no sign change.
+"""A-stability tests on polynomials with 60-digit coefficients: Routh's criterion and Sturm's theorem.
 
-Coefficients below 1e-30 of their scale count as zero, so that quantities that vanish are recognised as such.
+Coefficients below 1e-30 of their scale count as zero, so that exact zeros are recognised as such.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def trimmed(coefficients: Iterable[Number], scales: Iterable[Number]) -> Polynom
 
 
 def divided(dividend: Polynomial, divisor: Polynomial) -> tuple[Polynomial, Polynomial]:
-    """Return quotient and remainder; what is below 1e-30 of it, or of what it came from, is zero."""
+    """Return quotient and remainder; coefficients below 1e-30 of their scale are zero."""
     rest, quotient = list(dividend), [mp.zero] * max(0, len(dividend) - len(divisor) + 1)
     for k in reversed(range(len(quotient))):
         quotient[k] = rest.pop() / divisor[-1]
@@ -90,7 +90,7 @@ def reduced(P: Sequence[Number], Q: Sequence[Number]) -> tuple[Polynomial, Polyn
 
 
 def has_roots_right(polynomial: Polynomial) -> bool:
-    """Whether all roots have positive real parts: Routh's criterion on the polynomial of -z."""
+    """Return whether all roots have positive real parts: Routh's criterion on the polynomial of -z."""
     mirrored = [value if k % 2 == 0 else -value for k, value in enumerate(polynomial)]
     descending = [value / mirrored[-1] for value in reversed(mirrored)]
     upper, lower = descending[0::2], descending[1::2]
@@ -115,7 +115,7 @@ def squared_modulus(polynomial: Sequence[Number]) -> list[Number]:
 
 
 def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
-    """Return |Q(iy)|^2 - |P(iy)|^2 in ascending powers of y^2, vanishing coefficients set to zero."""
+    """Return |Q(iy)|^2 - |P(iy)|^2 in ascending powers of y^2, with round-off coefficients set to zero."""
     length = max(len(P), len(Q))
     padded = [[*polynomial, *[mp.zero] * (length - len(polynomial))] for polynomial in (Q, P)]
     gap = [left - right for left, right in zip(*map(squared_modulus, padded), strict=True)]
@@ -128,7 +128,7 @@ def modulus_gap(Q: Polynomial, P: Polynomial) -> Polynomial:
 
 
 def is_nonnegative(polynomial: Polynomial) -> bool:
-    """Whether the polynomial is never negative for x >= 0: no positive root of odd multiplicity, then its sign at 0."""
+    """Return whether the polynomial is nonnegative for x >= 0: positive at 0 and no root of odd multiplicity."""
     if all(value >= 0 for value in polynomial):
         return True
     lowest = next(k for k, value in enumerate(polynomial) if value != 0)
@@ -164,5 +164,5 @@ def positive_roots(polynomial: Polynomial) -> int:
 
 
 def sign_changes(values: Iterable[Number]) -> int:
-    """Return the number of sign changes, zeros left out."""
+    """Return the number of sign changes, ignoring zeros."""
     return sum(1 for left, right in pairwise([value for value in values if value != 0]) if left * right < 0)

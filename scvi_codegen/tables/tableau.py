@@ -1,9 +1,9 @@
-"""Runge-Kutta tableaux by collocation and duality, and their properties computed from the numbers.
+"""Runge-Kutta tableaux by collocation and duality, and their properties computed from the coefficients.
 
 The collocation tableau on abscissae c is equation (23) of Li, Wu & Leok, "Spectral-collocation variational
-integrators". Order, symplecticity, symmetry and A-stability are not attributes of a name: each is decided from A, b, c
-(Hairer, Lubich & Wanner, *Geometric Numerical Integration*, 2nd ed. 2006, here GNI; Hairer & Wanner, *Solving Ordinary
-Differential Equations II*, 2nd ed. 1996, here HW).
+integrators". Order, symplecticity, symmetry and A-stability are computed from A, b, c (Hairer, Lubich & Wanner,
+*Geometric Numerical Integration*, 2nd ed. 2006, here GNI; Hairer & Wanner, *Solving Ordinary Differential Equations
+II*, 2nd ed. 1996, here HW).
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ __all__ = [
 
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 SMALL_DENOMINATOR, ROUNDINGS = 1000, 2
-"""Of a rational that a float is taken for, and how many roundings it may be off."""
+"""Largest denominator of a rational that replaces a float, and the largest deviation in roundings."""
 MOST_STAGES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tableau:
-    """A Runge-Kutta method: ``A`` of s x s, weights ``b`` and abscissae ``c`` of s numbers, on the step [0, 1].
+    """Runge-Kutta method: s x s matrix ``A``, weights ``b`` and abscissae ``c`` of s numbers, on the step [0, 1].
 
     Integers, fractions, decimal strings and SymPy numbers are converted to 60 digits. The properties are tested to 45
     digits: give exact or 50-digit numbers, not floats. Raises ``MethodError`` when the shapes do not agree.
@@ -77,39 +77,41 @@ class Tableau:
 
     @property
     def stages(self) -> int:
-        """The number of stages s."""
+        """Number of stages s."""
         return len(self.b)
 
     @property
     def order(self) -> int:
-        """The order that the simplifying conditions guarantee: min(B, C + D + 1, 2 C + 2).
+        """Order guaranteed by the simplifying conditions: min(B, C + D + 1, 2 C + 2).
 
-        B(p), C(q), D(r) are Butcher's conditions and this is his theorem (HW, theorem IV.5.1). It is sharp for
-        every family of this module; for other tableaux, explicit ones above all, it is a lower bound.
+        B(p), C(q), D(r) are Butcher's conditions and this is his theorem (HW, theorem IV.5.1). It is sharp for every
+        family
+        of this module; for other tableaux, especially explicit ones, it is a lower bound.
         """
         B, C, D = simplifying_conditions(self)
         return min(B, C + D + 1, 2 * C + 2)
 
     @property
     def is_symplectic(self) -> bool:
-        """Whether b_i a_ij + b_j a_ji = b_i b_j for all i, j (GNI, theorem VI.4.3)."""
+        """True if b_i a_ij + b_j a_ji = b_i b_j for all i, j (GNI, theorem VI.4.3)."""
         A, b, span = self.A, self.b, range(self.stages)
         return all(is_zero(b[i] * A[i][j] + b[j] * A[j][i] - b[i] * b[j]) for i in span for j in span)
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether a_ij + a_{s+1-i,s+1-j} = b_j for all i, j (GNI, theorem V.2.3): the step of -h undoes that of h."""
+        """True if a_ij + a_{s+1-i,s+1-j} = b_j for all i, j: steps of h and -h are inverse (GNI, theorem V.2.3)."""
         A, b, span = self.A, self.b, range(self.stages)
         return all(is_zero(A[i][j] + A[-1 - i][-1 - j] - b[j]) for i in span for j in span)
 
     @property
     def is_a_stable(self) -> bool:
-        """Whether |R(z)| <= 1 for every z in the left half plane.
+        """True if |R(z)| <= 1 for every z in the left half plane.
 
         By the maximum principle this holds when, common factors cancelled, R = P / Q has its poles in the open right
         half plane (Routh's criterion) and |Q(iy)|^2 - |P(iy)|^2, a polynomial in y^2, is never negative (Sturm's
-        theorem; HW, section IV.3). Coefficients below 1e-30 of their scale count as zero, so that |R(iy)| = 1, where
-        the polynomial vanishes and samples would decide by round-off, is recognised.
+        theorem; HW, section IV.3). Coefficients below 1e-30 of their scale count as zero, so that |R(iy)| = 1 is
+        recognised,
+        where the polynomial is zero and sampled values would be round-off.
         """
         P, Q = reduced(*self.stability_function())
         return has_roots_right(Q) and is_nonnegative(modulus_gap(Q, P))
@@ -117,14 +119,14 @@ class Tableau:
     def stability_function(self) -> tuple[Vector, Vector]:
         """Return numerator and denominator of R(z) in ascending powers of z, trailing zeros dropped.
 
-        R(z) = det(I - z A + z 1 b^T) / det(I - z A) (HW, proposition IV.3.2); common factors are kept.
+        R(z) = det(I - z A + z 1 b^T) / det(I - z A) (HW, proposition IV.3.2); common factors are not cancelled.
         """
         shifted = tuple(tuple(a - weight for a, weight in zip(row, self.b, strict=True)) for row in self.A)
         return tuple(determinant_polynomial(shifted)), tuple(determinant_polynomial(self.A))
 
 
 def is_zero(value: Number) -> bool:
-    """Whether a residual of conditions on A, b, c vanishes to 45 digits."""
+    """Return whether a residual of conditions on A, b, c is zero to 45 digits."""
     return bool(abs(value) < CONDITION_TOLERANCE)
 
 
@@ -164,8 +166,8 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
     """Return the collocation method on ascending distinct abscissae c_1 .. c_s (usually in [0, 1]).
 
     a_ij is the integral of l_j from 0 to c_i, b_j that from 0 to 1: equation (23); GNI, theorem II.1.4. Raises
-    ``MethodError`` when the abscissae are not ascending. Floats stand for the rational, or the symmetric pair, of which
-    they are roundings: order and symmetry of [0.1, 0.5, 0.9] are those of 1/10, 1/2, 9/10.
+    ``MethodError`` when the abscissae are not ascending. Floats are replaced by the rational, or the symmetric pair, of
+    which they are roundings: order and symmetry of [0.1, 0.5, 0.9] are those of 1/10, 1/2, 9/10.
     """
     c = _intended(tuple(abscissae))
     if len(c) > MOST_STAGES:
@@ -179,7 +181,7 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
 
 
 def _intended(abscissae: Sequence[Any]) -> Vector:
-    """Numbers, floats within some roundings of a rational of small denominator or of 1 - c of another being these."""
+    """Convert to numbers; floats within a few roundings of a simple rational, or of 1 - c, are replaced by it."""
     c, slack = list(map(to_number, abscissae)), ROUNDINGS * mp.mpf(2) ** -53
     floats = [isinstance(value, float) for value in abscissae]
     for i, number in enumerate(c):
@@ -197,7 +199,7 @@ def _intended(abscissae: Sequence[Any]) -> Vector:
 
 @lru_cache(maxsize=256)
 def tableau_on(c: Vector, name: str) -> Tableau:
-    """Return the same for numbers known to ascend."""
+    """Return the collocation method on numbers that are known to ascend."""
     *A, b = cardinal_integrals(c, (*c, mp.one), 0)
     return Tableau(name=name, A=tuple(A), b=b, c=c)
 
@@ -213,13 +215,13 @@ def symplectic_partner(tableau: Tableau, name: str) -> Tableau:
 
 
 def partner_matrix(A: Sequence[Sequence[Any]], b: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-    """Return b_j - b_j a_ji / b_i, numerical or exact as the entries are."""
+    """Return b_j - b_j a_ji / b_i in the arithmetic of the entries, numerical or exact."""
     span = range(len(b))
     return tuple(tuple(b[j] - b[j] * A[j][i] / b[i] for j in span) for i in span)
 
 
 def _stages(s: Any) -> int:
-    """Refuse more stages than there may be before their points are computed."""
+    """Check the number of stages before points are computed."""
     return point_count(s, "the number of stages", least=0, most=MOST_STAGES)
 
 
@@ -302,7 +304,7 @@ TABLEAU_FAMILIES: Mapping[str, Callable[[int], Tableau]] = {
 
 
 def tableau_by_name(name: str) -> Tableau:
-    """Return the tableau of a name such as ``"radau-iia:3"`` or ``"explicit-euler"``; each ``name`` reads back.
+    """Return the tableau of a name such as ``"radau-iia:3"`` or ``"explicit-euler"``, the inverse of ``name``.
 
     Raises ``MethodError`` for an unknown family (with the known ones and the closest) or a missing or too small count.
     """

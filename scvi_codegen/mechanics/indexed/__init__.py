@@ -1,1 +1,1 @@
-"""Systems of any number of coordinates: sums of few kinds of terms over indices."""
+"""Indexed systems: Lagrangians and Hamiltonians that are sums over indices, with any number of coordinates."""

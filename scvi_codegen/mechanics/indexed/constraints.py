@@ -1,10 +1,10 @@
-"""Constraints of sums over indices: g(entries of arrays at e, parameters, t) = 0 at every element e of loops.
+"""Constraints of indexed systems: g(array entries at e, parameters, t) = 0 for every element e of loops.
 
-    m q'' = F + G^T lambda,        g(q, t) = 0,        G = g_q,        hidden in it G v + g_t = 0
+    m q'' = F + G^T lambda,        g(q, t) = 0,        G = g_q,        hidden constraint G v + g_t = 0
 
-with a multiplier lambda for every element. Rods between the places ``bonds[b, 0]`` and ``bonds[b, 1]`` of a net are
-``sum(k in 3, (r[bonds[b, 0], k] - r[bonds[b, 1], k])**2) = l[b]**2 for b in B``. Each is of few entries, so that
-G M^-1 G^T is a sparse matrix, whose pattern is that of the net: known when a run begins.
+with a multiplier lambda for every element. Rods between nodes ``bonds[b, 0]`` and ``bonds[b, 1]`` of a net are
+``sum(k in 3, (r[bonds[b, 0], k] - r[bonds[b, 1], k])**2) = l[b]**2 for b in B``. Each constraint contains few entries,
+so G M^-1 G^T is sparse; its pattern is that of the net and is known when a run begins.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["bend_of", "check_constraint", "constraint_text", "held_slots", "push
 
 
 def constraint_text(term: IndexedTerm) -> str:
-    """As it is written."""
+    """Return the constraint as text."""
     return f"{term.formula} = 0" + (f" for {', '.join(map(str, _named(term)))}" if term.loops else "")
 
 
@@ -34,12 +34,12 @@ def _named(term: IndexedTerm) -> Iterator[object]:
 
 
 def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
-    """Raise :class:`SystemDefinitionError` for a constraint of nothing, of velocities, of inputs.
+    """Raise :class:`SystemDefinitionError` unless a constraint contains coordinates, and neither velocities nor inputs.
 
     Args:
         term: the constraint.
-        coordinates, fields: arrays that it may name.
-        inputs: a pattern of the symbols that are parts of inputs.
+        coordinates, fields: arrays that it may contain.
+        inputs: regular expression that matches the symbols of inputs.
     """
     shown = constraint_text(term)
     if problem := unsupported_part(term.formula):
@@ -58,25 +58,25 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
 
 
 def held_slots(term: IndexedTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
-    """The coordinates in a constraint."""
+    """Return the coordinate accesses of a constraint, with their symbols."""
     return tuple(pair for pair in term.slots if pair[1].array in coordinates)
 
 
 def slopes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
-    """G of one element, by its coordinates, and g_t behind."""
+    """Return the row of G of one element, by its coordinates, followed by g_t."""
     variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
     slopes = gradient(term.formula, variables)
     return tuple(slopes.get(k, S.Zero) for k in range(len(variables)))
 
 
 def pushes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[tuple[Access, Expr], ...]:
-    """On what a multiplier of 1 pushes, and how much."""
+    """Return G^T of one element: each coordinate access with its factor of the multiplier."""
     slopes = slopes_of(term, coordinates, time)
     return tuple((access, slopes[k]) for k, (_, access) in enumerate(held_slots(term, coordinates)))
 
 
 def bend_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]) -> Expr:
-    """d^2 g / dt^2 along a straight motion with these velocities, one a coordinate: v^T g_qq v + 2 g_qt v + g_tt."""
+    """Return d^2 g / dt^2 at zero acceleration: v^T g_qq v + 2 g_qt v + g_tt."""
     variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
     rates = [*velocities, S.One]
     rate = Add(*(slope * rates[k] for k, slope in gradient(term.formula, variables).items()))

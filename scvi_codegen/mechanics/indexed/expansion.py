@@ -1,8 +1,7 @@
-"""Sums over indices written out, for sizes that are known: a system of so many named coordinates.
+"""Unrolling of indexed systems: for known sizes, the equivalent system of named coordinates.
 
-What small systems have, and sums over indices do not have yet (Newton's iteration, certificates, the derivation page,
-ensembles, derivatives), is there for the expanded system; and an integrator of the sums can be held against that of
-the expanded system, which was derived on another way.
+The unrolled system supports what indexed systems do not (Newton's iteration, verification reports, the derivation
+page, ensembles, derivatives), and its integrator is derived independently, so the two can be compared.
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ def expand_sums(
     tables: Mapping[str, ArrayLike] | None = None,
     parameters: Mapping[str, ArrayLike] | None = None,
 ) -> MechanicalSystem:
-    """The system of the coordinates q_0, q_1, .. (r_0_0, r_0_1, ..), an array's last axis running fastest.
+    """Return the system of the coordinates q_0, q_1, .. (r_0_0, r_0_1, ..), the last axis of an array running fastest.
 
     Args:
-        system: what is written out.
+        system: the indexed system to unroll.
         sizes: value of every size.
-        tables: (rows, columns) places by name.
+        tables: index tables of shape (rows, columns) by name.
         parameters: numbers and arrays by name, others keep their defaults; entries of arrays become parameters k_0, ..
 
     Raises:
-        SystemDefinitionError: for names and shapes that do not fit, and for an index that leaves its array.
+        SystemDefinitionError: for unknown names, wrong shapes, and an index outside its array.
 
     >>> chain = IndexedSystem.from_text(
     ...     name="chain", coordinates=["q[N]"],
@@ -102,7 +101,7 @@ def expand_sums(
 
 
 def _columns(table: ArrayLike) -> NDArray[np.int64]:
-    """A table of one axis has one column."""
+    """Return an index table as a two-dimensional array; one axis becomes one column."""
     found = np.asarray(table)
     return found[:, None] if found.ndim == 1 else found
 
@@ -120,7 +119,7 @@ def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray
 
 
 def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
-    """The values of all indices."""
+    """Yield the values of all indices."""
     if not loops:
         yield {}
         return
@@ -133,11 +132,11 @@ def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Eleme
 
 @dataclass(frozen=True, slots=True)
 class _Elements:
-    """What an access is at given values of the indices.
+    """Substitution of array accesses by symbols, at given values of the indices.
 
     Attributes:
-        sizes, tables: as given.
-        names: of the entries of each array.
+        sizes, tables: value of every size; index tables.
+        names: names of the entries of each array.
     """
 
     sizes: Mapping[str, int]
@@ -145,12 +144,12 @@ class _Elements:
     names: Mapping[str, NDArray[np.str_]]
 
     def rules(self, of: IndexedTerm | IndexedForce) -> Iterator[tuple[Elements, dict[Symbol, Symbol]]]:
-        """What stands for the slots, for all values of the indices."""
+        """Yield the values of the indices with the symbol that replaces each access."""
         for at in _elements(of.loops, self.sizes):
             yield at, {slot: self.entry(access, at, of.loops) for slot, access in of.slots}
 
     def forces(self, forces: Sequence[IndexedForce]) -> dict[Symbol, list[Expr]]:
-        """The parts of each by the coordinate that they act on."""
+        """Return the contributions to the force on each coordinate."""
         found: dict[Symbol, list[Expr]] = {}
         for force in forces:
             for at, rule in self.rules(force):
@@ -159,7 +158,7 @@ class _Elements:
         return found
 
     def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Symbol:
-        """The symbol of an entry."""
+        """Return the symbol of an array entry."""
         periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
         try:
             places = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)

@@ -1,7 +1,7 @@
-"""Written-out systems of many like terms as sums over indices: what is written n times is compiled once.
+"""Rolling of repeated terms into loops: a system of many similar terms becomes an indexed system, compiled once.
 
-Terms that differ in their coordinates, parameters and numbers alone are of one family: sum(b in B, f(q[places[b, 0]],
-q[places[b, 1]], c[b])), with a table of places and arrays of numbers.
+Terms that differ only in their coordinates, parameters and numbers form one group, sum(b in B, f(q[at[b, 0]],
+q[at[b, 1]], c[b])), with an index table and arrays of numbers.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 __all__ = ["GatheredSums", "gather_sums"]
 
 MOST_FAMILIES = 64
-"""More are no few kinds of terms."""
+"""Maximum number of term groups; systems with more are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class GatheredSums:
-    """A system as sums over indices, and the data with which it is the system that was written out.
+    """Indexed system with the data that make it equal to the original system.
 
     Attributes:
-        system: of one array q[N], the coordinates in their order; named qg[Ng] or the like, with the other names,
-            where a parameter or an input of the system has one of these names.
-        tables: places by name; parameters: numbers, one an element, by name; both as runs take them.
+        system: with one array q[N], the coordinates in their order; named qg[Ng] or the like, as are other names, if
+            a parameter or an input of the system has one of these names.
+        tables: index tables by name.
+        parameters: arrays of numbers, one per element, by name; both in the form that runs accept.
     """
 
     system: IndexedSystem
@@ -45,13 +46,13 @@ class GatheredSums:
 
 @takes(SystemDefinitionError, system=SYSTEM)
 def gather_sums(system: MechanicalSystem) -> GatheredSums:
-    """Recognise the families of terms of a Lagrangian or a Hamiltonian, and of the forces beside it.
+    """Return the indexed system of a Lagrangian or Hamiltonian with many similar terms, and of its forces.
 
-    Parameters that differ from term to term become data with the values that they have as defaults; others stay.
+    Parameters that differ from term to term become arrays of their default values; the others remain parameters.
 
     Raises:
-        SystemDefinitionError: where constraints or damping stand beside it, or time is transformed; where its terms are
-            of many kinds; and for velocities in a Lagrangian in other forms than m*v**2/2.
+        SystemDefinitionError: if the system has constraints, damping or a time transformation, has more than
+            ``MOST_FAMILIES`` kinds of terms, or if a Lagrangian contains velocities other than as m*v**2/2.
 
     >>> from scvi_codegen.mechanics.lagrangian import LagrangianSystem
     >>> chain = LagrangianSystem.from_text(
@@ -97,7 +98,7 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
 
 
 def _mark(names: set[str]) -> str:
-    """Return letters behind the names of arrays, indices, sizes and tables, so that none of them is a parameter's."""
+    """Return a suffix that keeps names of arrays, indices, sizes and tables apart from those of parameters."""
     mark = ""
     while any(re.fullmatch(rf"(q|p|b|N|p_q){mark}|q{mark}{DOT}|(at|B|c){mark}\d+(_\d+)?", name) for name in names):
         mark += "g"
@@ -115,7 +116,7 @@ def _check_what_stands_beside(system: MechanicalSystem) -> None:
 
 
 def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol, float]:
-    """Of the parameters that are no parts of inputs, in whose place their names stand."""
+    """Return the default values of the parameters, components of inputs excluded."""
     parts = {symbol(f"{name}_{part}") for name in system.inputs for part in "0123t"}
     if any(parts & formula.free_symbols for formula in formulas):
         raise SystemDefinitionError(
@@ -126,7 +127,7 @@ def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol
 
 @dataclass(frozen=True, slots=True)
 class _Family:
-    """Terms of one kind: the formula of an element, its places, its numbers, and those that all have in common."""
+    """Group of similar terms: formula of an element, index table, arrays of numbers, and numbers common to all."""
 
     text: str
     table: NDArray[np.int32]
@@ -146,7 +147,7 @@ def _family(name: str, index: str, kind: LikeTerms, defaults: dict[Symbol, float
             numbers |= {column[0].name: defaults[column[0]]} if column[0] in defaults else {}
             constants.append(str(column[0]) if _is_plain(column[0]) else f"({column[0]})")
     text = kind.written(lambda k: f"[at{name}[{index}, {k}]]", constants.__getitem__)
-    width = max(1, *map(len, kind.places))  # of terms without coordinates one column, which nothing reads
+    width = max(1, *map(len, kind.places))  # terms without coordinates have one column, which is never read
     table = np.zeros((len(kind.places), width), dtype=np.int32)
     table[:, : len(kind.places[0])] = kind.places
     return _Family(text, table, fields, numbers)

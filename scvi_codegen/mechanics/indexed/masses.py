@@ -1,4 +1,4 @@
-"""Masses of sums over indices: velocities occur as m v**2/2, m constant but possibly different from place to place."""
+"""Masses of indexed systems: velocities occur as m v**2/2 with a constant m that may differ between elements."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["MassTerm", "check_form", "masses_of", "terms_at_rest", "velocity_slo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MassTerm:
-    """A mass, added up over loops: m of ``formula * v**2/2`` at the coordinate ``access``."""
+    """Contribution to a mass, summed over loops: the m of ``m*v**2/2`` at the coordinate ``access``."""
 
     loops: tuple[Loop, ...]
     access: Access
@@ -27,7 +27,7 @@ class MassTerm:
 
 
 def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
-    """Those of the velocities of a term."""
+    """Return the mass contributions of a term, one per velocity."""
     known, found = dict(term.slots), []
     for v in velocity_slots(term, velocities):
         mass = term.formula.diff(v, 2)
@@ -38,7 +38,7 @@ def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassT
 
 
 def velocity_slots(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
-    """The slots of a term that hold velocities."""
+    """Return the symbols of a term that denote velocities."""
     return tuple(slot for slot, access in term.slots if access.array.name in velocities)
 
 
@@ -66,14 +66,14 @@ def terms_at_rest(
     negative: bool,
     moving: bool,
 ) -> tuple[IndexedTerm, ...]:
-    """Terms at velocities of 0, without those that are 0: those that depend on the state, or those that do not.
+    """Return the non-zero terms at zero velocity that depend on the state, or those that do not.
 
     Args:
         terms: of a Lagrangian or a Hamiltonian.
         velocities: the array of coordinates by the name of its velocities.
         state: coordinates and momenta.
         negative: whether to change the signs, as for -H.
-        moving: which terms.
+        moving: whether to return the terms that depend on the state.
     """
     found = []
     for term in terms:

@@ -1,7 +1,8 @@
-"""Momentum maps of sums over indices: shifts and turns of whole arrays, each proved by one identity of every kernel.
+"""Momentum maps of indexed systems: translations and rotations of whole arrays, proved by one identity per kernel.
 
-A shift of all entries of ``q`` leaves sum_e l(q at e) alone if the derivatives of l by its slots of ``q`` add up to 0,
-whatever stands in the slots; so the cost of the proof does not depend on how many coordinates there are (Noether).
+sum_e l(q at e) is invariant under a translation of all entries of ``q`` if the derivatives of l with respect to its
+entries of ``q`` add up to 0 identically (Noether); so the cost of the proof does not depend on the number of
+coordinates.
 """
 
 from __future__ import annotations
@@ -24,21 +25,21 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["momentum_maps"]
 
 SAMPLES = 4
-"""Points where an identity is tried in 60 digits; one that fails at random points would have to vanish at each."""
+"""Number of random points at which an identity is tested in 60 digits."""
 VANISHES = 1e-40
-"""Beside the sum of the sizes of the terms."""
+"""Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
 MOST_TURNED = 3
-"""Components of places in space."""
+"""Largest number of components for which rotations are tested (points in space)."""
 
 
 def momentum_maps(system: IndexedSystem) -> tuple[IndexedMap, ...]:
-    """All of these that a system has."""
+    """Return all momentum maps of these kinds that a system has."""
     return tuple(found for array in system.coordinates for found in _maps(system, array))
 
 
 @dataclass(frozen=True, slots=True)
 class _Pushes:
-    """What one element of a sum, or of forces, adds to the rates of momenta (-H_p to those of positions)."""
+    """Contributions of one element of a sum, or of forces, to the rates of momenta (-H_p: to those of positions)."""
 
     entries: tuple[tuple[Access, Expr], ...]
     slots: tuple[Symbol, ...]
@@ -52,7 +53,7 @@ def _pushes(system: IndexedSystem) -> Iterator[_Pushes]:
         yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
     for force in system.forces:
         yield _Pushes(force.targets, tuple(slot for slot, _ in force.slots))
-    for term in system.constraints:  # G^T lambda, with any lambda
+    for term in system.constraints:  # G^T lambda, for any lambda
         entries = pushes_of(term, system.coordinates, system.time)
         yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
 
@@ -94,7 +95,7 @@ def _shift(
 def _turn(
     system: IndexedSystem, pushes: _Pushes, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
-    """Parts of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
+    """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
     pairs = [
         ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
@@ -103,7 +104,7 @@ def _turn(
 
 
 def _phase(system: IndexedSystem, pushes: _Pushes, array: Array) -> tuple[list[Expr], list[Symbol]]:
-    """Parts of sum p dl/dq - q dl/dp."""
+    """Return the terms of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
     return _moved(system, pushes, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
 
@@ -113,13 +114,13 @@ def _conjugate(system: IndexedSystem, array: Array) -> tuple[Array, ...]:
 
 
 Entry: TypeAlias = tuple[Array, Place | None]
-"""Of an array those with a last place, or all."""
+"""Array with a last index, or without one for all of its entries."""
 
 
 def _moved(
     system: IndexedSystem, pushes: _Pushes, pairs: Sequence[tuple[Entry, Entry, int]]
 ) -> tuple[list[Expr], list[Symbol]]:
-    """Parts of what changes where entries of the first kind move by those of the second at the same places."""
+    """Return the terms of the derivative along the motion of entries of the first kind by those of the second."""
     parts: list[Expr] = []
     known = _symbols(system, pushes)
     for (array, last), (other, by), sign in pairs:
@@ -138,7 +139,7 @@ def _symbols(system: IndexedSystem, pushes: _Pushes) -> list[Symbol]:
 
 
 def _vanishes(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
-    """Whether the sum of the parts is 0 wherever it is tried, and is tried somewhere."""
+    """Return whether the sum of the parts is 0 at all sampled points, of which at least ``SAMPLES`` are required."""
     if Add(*parts) == 0:
         return True
     tape, chosen, tried = Tape(parts, symbols), random.Random(1), 0
@@ -154,7 +155,7 @@ def _vanishes(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
 
 
 def _same_masses(system: IndexedSystem, array: Array, a: int, b: int) -> bool:
-    """Whether two components have the same mass everywhere."""
+    """Return whether two components have equal masses in all elements."""
     masses: tuple[dict[object, Expr], ...] = ({}, {})
     for mass in system.masses:
         for found, component in zip(masses, (a, b), strict=True):

@@ -1,10 +1,10 @@
-"""A Lagrangian that is a sum over indices of few kinds of terms: lattices, fields, molecules, cloth, N bodies.
+"""Indexed systems: Lagrangians that are sums over indices of few kinds of terms (lattices, fields, N bodies).
 
-    L = sum_f sum_(e in loops of f) l_f(entries of arrays at e, parameters, t)
+    L = sum_f sum_(e in loops of f) l_f(array entries at e, parameters, t)
 
-What is derived of it is derived of the kernels l_f, so neither the time to compile nor the length of the code depends
-on how many coordinates there are; how many is said by the arrays that a run starts from. Kinetic energy is a sum of
-m v**2/2, m constant but possibly different from place to place.
+Only the kernels l_f are differentiated, so neither compile time nor code size depends on the number of coordinates,
+which is determined by the arrays that a run starts from. Kinetic energy is a sum of m v**2/2 with constant m that may
+differ between elements.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ __all__ = ["INDEXED", "IndexedSystem"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedSystem:
-    """A Lagrangian of sums over indices, checked on construction: :meth:`from_text`, :meth:`from_sympy`.
+    """Lagrangian or Hamiltonian as sums over indices, validated on construction: :meth:`from_text`, :meth:`from_sympy`.
 
     Attributes:
-        name: what the system is called.
-        coordinates: arrays of coordinates; that of the velocities of ``q`` is called ``q_dot``.
-        momenta: of a Hamiltonian, arrays parallel to these; of a Lagrangian none.
+        name: name of the system.
+        coordinates: arrays of coordinates; the array of the velocities of ``q`` is called ``q_dot``.
+        momenta: of a Hamiltonian, arrays parallel to ``coordinates``; empty for a Lagrangian.
         time: the symbol ``t``.
-        parameters, defaults: numbers that stay adjustable, and their default values.
-        fields: arrays of parameters, whose values, one an element, are given with each run.
-        field_defaults: the value of all their elements where none are given.
-        tables: arrays of places, ``bonds[B, 2]``, given with each run.
+        parameters, defaults: adjustable numbers and their default values.
+        fields: arrays of parameters, whose values, one per element, are passed to each run.
+        field_defaults: default value of all elements of each field.
+        tables: index tables, ``bonds[B, 2]``, passed to each run.
         terms: of the Lagrangian or the Hamiltonian.
-        forces: beside it, of coordinates, velocities (momenta of a Hamiltonian) and time.
-        inputs: names of functions of time given as data with each run, each five of the parameters.
+        forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
+        inputs: names of functions of time passed to each run, each represented by five of the parameters.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.indexed.constraints`).
     """
 
@@ -126,23 +126,23 @@ class IndexedSystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
         Args:
-            name: what the system is called.
+            name: name of the system.
             coordinates: declarations, as ``["q[N]"]`` or ``["r[N, 3]"]``; sizes are names or whole numbers.
             lagrangian: the formula; the velocity of ``q[i]`` is written ``q_dot[i]``, time ``t``.
-            hamiltonian: in its place H, in coordinates and momenta, of any form.
-            momenta: of H, declarations as of the coordinates; by default ``["p_q[N]"]``.
+            hamiltonian: in place of ``lagrangian``, H in coordinates and momenta, of any form.
+            momenta: of H, declarations like those of the coordinates; by default ``["p_q[N]"]``.
             parameters: default value by name, or by declaration of an array, as ``{"k": 1, "m[N]": 1}``; the values of
-                an array, one an element, are given with each run.
-            tables: declarations of arrays of places with so many columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
-            forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` at every place, ``{"q[0]": "cos(t)"}`` at one.
+                an array, one per element, are passed to each run.
+            tables: declarations of index tables with their columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
+            forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` for every index, ``{"q[0]": "cos(t)"}`` for one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
-            inputs: names of functions of time that are given as data with each run
+            inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
-            constraints: formulas in coordinates and time that stay 0, or equations, and behind them the loops for which
-                they do, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
+            constraints: formulas in coordinates and time that are 0, or equations, followed by the loops over which
+                they hold, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
 
         Raises:
-            SystemDefinitionError: for what is no formula of the grammar, and for a kinetic energy of another form.
+            SystemDefinitionError: for text outside the grammar, and for a kinetic energy of another form.
 
         >>> chain = IndexedSystem.from_text(
         ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
@@ -194,9 +194,9 @@ class IndexedSystem:
         parameters: Mapping[str, float] | None = None,
         tables: Sequence[str] = (),
     ) -> IndexedSystem:
-        """Take L from a SymPy expression of ``Sum`` and ``Indexed``; the rest as of :meth:`from_text`.
+        """Create the system from a SymPy expression of ``Sum`` and ``Indexed``; see also :meth:`from_text`.
 
-        A place on a ring is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, an entry of a table is
+        A periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, a table entry is
         ``q[bonds[b, 0]]``, the velocity of ``q[i]`` is that of ``IndexedBase("q_dot")``.
 
         >>> from sympy import IndexedBase, Sum, symbols
@@ -228,14 +228,14 @@ class IndexedSystem:
 
     @property
     def velocities(self) -> tuple[Array, ...]:
-        """Arrays of velocities that forces depend on: of all coordinates, if any; none of a Hamiltonian."""
+        """Arrays of velocities that forces depend on: all of them if any occurs, else none; none for a Hamiltonian."""
         names = {access.array.name for force in self.forces for _, access in force.slots}
         own = tuple(Array(name, array.axes) for name, array in self._velocities.items())
         return own if any(array.name in names for array in own) else ()
 
     @property
     def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
-        """Every access of an array, with the loops around it."""
+        """Array accesses, each with its enclosing loops."""
         slots = [(access, term.loops) for term in self.terms for _, access in term.slots]
         slots += [(access, force.loops) for force in self.forces for _, access in force.slots]
         slots += [(access, term.loops) for term in self.constraints for _, access in term.slots]
@@ -243,7 +243,7 @@ class IndexedSystem:
 
     @property
     def changes_energy(self) -> str:
-        """Why energy is not conserved; nothing where it is."""
+        """Reason why energy is not conserved; empty if it is."""
         if self.forces:
             return "forces act"
         if any(self.time in term.formula.free_symbols for term in self.constraints):
@@ -252,22 +252,22 @@ class IndexedSystem:
 
     @property
     def masses(self) -> tuple[MassTerm, ...]:
-        """Second derivatives of L by velocities; none of a Hamiltonian."""
+        """Masses (second derivatives of L with respect to velocities); empty for a Hamiltonian."""
         return tuple(chain(*(masses_of(term, self._velocities) for term in self.terms)))
 
     @property
     def potentials(self) -> tuple[IndexedTerm, ...]:
-        """Terms of L without velocities, -V; those of -H. They depend on coordinates or momenta."""
+        """Terms of -V or -H that depend on coordinates or momenta, at zero velocity."""
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
 
     @property
     def energy_offsets(self) -> tuple[IndexedTerm, ...]:
-        """Terms of -V or -H without coordinates and momenta: they change the energy, not the motion."""
+        """Terms of -V or -H without coordinates and momenta, which change the energy but not the trajectory."""
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
     def kernels(self) -> tuple[tuple[IndexedTerm, dict[str, Expr]], ...]:
-        """What is derived: the terms of -V or -H, with the slopes of each by its slots."""
+        """Terms of -V or -H, each with its derivatives by the symbols of its accesses of the state."""
         found = []
         for term in self.potentials:
             slots = [slot for slot, access in term.slots if access.array in self.state]
@@ -287,7 +287,7 @@ class IndexedSystem:
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether time occurs: energy is then not conserved."""
+        """True if time occurs explicitly, so that energy is not conserved."""
         formulas = [term.formula for term in self.terms] + [f for force in self.forces for _, f in force.targets]
         return any(self.time in formula.free_symbols for formula in formulas)
 
@@ -305,17 +305,17 @@ class IndexedSystem:
 
     @property
     def _by_name(self) -> dict[Expr, Expr]:
-        """What is shown for the parts of inputs."""
+        """Names of inputs by the formulas that represent them, for display."""
         return {formula: name for name, formula in input_formulas(self.inputs, self.time).items()}
 
     @property
     def function(self) -> str:
-        """What it is given by, in a word."""
+        """Kind of the defining function: "Hamiltonian" or "Lagrangian"."""
         return "Hamiltonian" if self.momenta else "Lagrangian"
 
     @property
     def _velocities(self) -> dict[str, Array]:
-        """The array of coordinates by the name of its velocities."""
+        """Arrays of coordinates by the names of their velocities."""
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
     def _warn_of_mistakes(self) -> None:
@@ -353,7 +353,7 @@ class IndexedSystem:
 
 
 def _with_formulas(term: IndexedTerm, rule: Mapping[Any, Expr]) -> IndexedTerm:
-    """The term with other expressions for some."""
+    """Return the term with expressions substituted by ``rule``."""
     return replace(term, formula=term.formula.xreplace(rule)) if rule else term
 
 
@@ -363,7 +363,7 @@ def _with_forces(force: IndexedForce, rule: Mapping[Any, Expr]) -> IndexedForce:
 
 
 def _table(text: str) -> Array:
-    """Of one axis it has one column."""
+    """Parse the declaration of an index table; one with a single axis gets one column."""
     array = parse_array(text)
     return array if len(array.axes) > 1 else replace(array, axes=(*array.axes, Size("", 1)))
 
@@ -371,7 +371,7 @@ def _table(text: str) -> Array:
 def _momenta(
     coordinates: Sequence[Array], names: Sequence[str] | None, lagrangian: str | None, hamiltonian: str | None
 ) -> tuple[Array, ...]:
-    """The arrays of momenta of a Hamiltonian."""
+    """Return the arrays of momenta of a Hamiltonian; none for a Lagrangian."""
     if (lagrangian is None) == (hamiltonian is None):
         raise SystemDefinitionError("give a lagrangian or a hamiltonian, one of them")
     if hamiltonian is None:
@@ -392,7 +392,7 @@ def _momenta(
 def _friction(
     terms: Sequence[IndexedTerm], velocities: Sequence[Array], coordinates: Sequence[Array]
 ) -> tuple[IndexedForce, ...]:
-    """The forces -dD/dv of Rayleigh's function."""
+    """Return the forces -dD/dv of Rayleigh's dissipation function."""
     arrays = dict(zip(velocities, coordinates, strict=False))
     found = []
     for term in terms:
@@ -412,4 +412,4 @@ def _friction(
 
 
 INDEXED = of("an IndexedSystem", IndexedSystem)
-"""For :func:`~scvi_codegen.given.kinds.takes`."""
+"""Type check of indexed systems, for :func:`~scvi_codegen.given.kinds.takes`."""

@@ -1,1 +1,1 @@
-"""From ``sympy.physics.mechanics``: bodies, joints and loads become a Lagrangian, forces and constraints."""
+"""Import from ``sympy.physics.mechanics``: bodies, joints and loads become a Lagrangian, forces and constraints."""

@@ -1,4 +1,4 @@
-"""Bodies as Kane's method and SymPy's ``System`` describe them, and their Lagrangian, forces and constraints."""
+"""Multibody systems of Kane's method or SymPy's ``System``, converted to Lagrangian, forces, constraints."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ __all__ = ["Multibody"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Multibody:
-    """Bodies and what acts on them, in SymPy's own terms.
+    """Multibody system in SymPy's terms: bodies, loads and constraints.
 
     Attributes:
-        frame: the inertial one.
-        time: the symbol for it.
+        frame: the inertial frame.
+        time: its symbol.
         coordinates, speeds: q(t), and generalised speeds u(t) or dq/dt.
         kinematics: linear expressions in dq/dt and u that are 0.
-        auxiliary: speeds that are 0, of forces that do no work.
+        auxiliary: auxiliary speeds, which are 0.
         bodies: particles and rigid bodies.
         loads: in groups that act together, each of pairs of a point and a force or of a frame and a torque.
-        potential: what bodies have as potential energy.
-        configuration: expressions in q and t that stay 0.
-        velocity: expressions in q, dq/dt, u and t that stay 0, the rates of the former among them or not.
+        potential: total potential energy of the bodies.
+        configuration: expressions in q and t that are 0.
+        velocity: expressions in q, dq/dt, u and t that are 0, with or without the rates of ``configuration``.
     """
 
     frame: ReferenceFrame
@@ -51,11 +51,11 @@ class Multibody:
     velocity: tuple[Expr, ...]
 
     def formulas(self) -> Mapping[str, Any]:
-        """What :meth:`LagrangianSystem.from_sympy` takes: lagrangian, coordinates, forces and constraints.
+        """Return arguments of :meth:`LagrangianSystem.from_sympy`: lagrangian, coordinates, forces and constraints.
 
         Raises:
-            SystemDefinitionError: where SymPy does not know a velocity, speeds are no combination of the rates of the
-                coordinates, or masses depend on them.
+            SystemDefinitionError: if SymPy does not know a velocity, speeds are not a combination of the rates of the
+                coordinates, or masses depend on coordinates.
         """
         variables = Variables(self.coordinates, self.time, self.speeds, self.auxiliary)
         equations = (
@@ -81,7 +81,7 @@ class Multibody:
         }
 
     def _beyond_configuration(self, variables: Variables) -> list[Expr]:
-        """The constraints on velocities, in plain symbols, that kinematics and configuration do not imply."""
+        """Return the velocity constraints, in plain symbols, that kinematics and configuration do not imply."""
         velocity = list(map(variables.read, self.velocity))
         known = [*map(variables.read, self.kinematics)]
         known += [variables.rate(variables.read(g)) for g in self.configuration]
@@ -89,13 +89,13 @@ class Multibody:
         return [velocity[k] for k in found]
 
     def _with_ignored(self, speeds: Sequence[Expr]) -> Multibody:
-        """With a coordinate for each speed that has none, as nothing depends on it: its integral over time."""
+        """Return the system with a coordinate, its time integral, added for each speed that nothing depends on."""
         new = tuple(sympy.Function(f"integral_{u.func}")(self.time) for u in speeds)
         equations = tuple(q.diff(self.time) - u for q, u in zip(new, speeds, strict=True))
         return replace(self, coordinates=(*self.coordinates, *new), kinematics=(*self.kinematics, *equations))
 
     def _dynamics(self, variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
-        """T - V with the potential of the loads, and all other forces."""
+        """Return T - V, with the potential of conservative loads, and all other forces."""
         try:
             motions = motions_of(self.bodies, self.frame, variables)
             groups = [load_forces(group, self.frame, variables) for group in self.loads]
@@ -110,7 +110,7 @@ class Multibody:
 
 
 def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
-    """The potential of loads that have one, all together or group by group, and the sum of the other forces."""
+    """Return the potential of the conservative loads, all together or by group, and the other forces."""
     changing = (*variables.v, variables.time, *variables.given)
     parts = [[sympy.expand_mul(f).as_independent(*changing, as_Add=True) for f in group] for group in groups]
     still = [[part[0] for part in group] for group in parts]
@@ -125,6 +125,6 @@ def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr
 
 
 def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:
-    """Forces added up, coordinate by coordinate."""
+    """Return the sum of force vectors."""
     rows = list(rows)
     return tuple(sympy.Add(*(row[i] for row in rows)) for i in range(size))

@@ -1,4 +1,4 @@
-"""Whether expressions are zero whatever their symbols are: at random points, in 60 digits."""
+"""Probabilistic test of identities: expressions are evaluated at random points in 60 digits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEED = 20250101
 
 
 def vanish(expressions: Iterable[Expr]) -> bool:
-    """Whether all are zero at two points at which they exist; not if no such points are found."""
+    """Return whether all expressions are zero at two random points; false if fewer points of definition are found."""
     unlike = [expression for expression in expressions if expression != 0]
     if any(map(unsupported_part, unlike)):
         return False

@@ -1,12 +1,12 @@
-r"""Kinetic energy of bodies, their equations of motion beyond Lagrange's, and loads, from components of velocities.
+"""Kinetic energy of bodies, generalised forces of loads, and the terms of Kane's equations beyond Lagrange's.
 
-Kane's equations are those of d'Alembert, sum (m a - F) . dv/dq_dot_i = 0 over points (and the like for rotations). With
-v(q, q_dot, t) linear in the rates and T = sum m v.v/2 that is
+Kane's equations are d'Alembert's principle, sum (m a - F) . dv/dq_dot_i = 0 over points (likewise for rotations). With
+v(q, q_dot, t) linear in the rates and T = sum m v.v/2 they are
 
     d/dt T_v - T_q = f + N,        N_i = sum m v . (d/dt dv/dq_dot_i - dv/dq_i).
 
-Where velocities are the rates of positions N vanishes. Where constraints on velocities are built into them, as for a
-wheel that rolls, it does not: these are the gyroscopic forces of Chaplygin's equations, which do no work.
+N is zero if velocities are the rates of positions. If velocity constraints are built into them, as for a rolling
+wheel, it is not: N then contains the gyroscopic forces of Chaplygin's equations, which do no work.
 
 Sources: T. R. Kane, D. A. Levinson, *Dynamics* (1985), chapters 2 to 6; Ju. I. Neimark, N. A. Fufaev, *Dynamics of
 Nonholonomic Systems* (1972), chapter III.
@@ -34,12 +34,12 @@ __all__ = ["gyroscopic_forces", "kinetic_energy", "load_forces", "motions_of"]
 
 @dataclass(frozen=True, slots=True)
 class BodyMotion:
-    """How a body moves, or turns.
+    """Translation or rotation of a body.
 
     Attributes:
-        rates: (3,) its velocity in the inertial frame, or its angular velocity in the frame of its inertia.
-        inertia: (3, 3) mass, or central inertia.
-        axes: (3,) the angular velocity of that frame, there.
+        rates: (3,) velocity in the inertial frame, or angular velocity in the frame of the inertia.
+        inertia: (3, 3) mass times identity, or central inertia.
+        axes: (3,) angular velocity of the frame in which these are expressed; 0 for translations.
     """
 
     rates: tuple[Expr, ...]
@@ -48,14 +48,14 @@ class BodyMotion:
 
     @property
     def momentum(self) -> tuple[Expr, ...]:
-        """(3,) inertia times rates."""
+        """Linear or angular momentum, inertia times rates, of shape (3,)."""
         return tuple(self.inertia * Matrix(self.rates))
 
 
 def motions_of(
     bodies: Iterable[Particle | RigidBody], frame: ReferenceFrame, variables: Variables
 ) -> tuple[BodyMotion, ...]:
-    """The motions of all bodies that have any."""
+    """Return the translations and rotations of all bodies, without those that are at rest."""
     found = [motion for body in bodies for motion in _motions(body, frame, variables)]
     return tuple(motion for motion in found if any(motion.rates))
 
@@ -71,13 +71,13 @@ def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator
 
 
 def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
-    """Where an inertia is written, which for round bodies need not turn with them; else the frame given."""
+    """Return the frame in which an inertia is written (it may differ from ``frame`` for round bodies)."""
     frames = {own for _, *vectors in inertia.args for vector in vectors for _, own in vector.args}
     return frames.pop() if len(frames) == 1 else frame
 
 
 def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
-    """Of a velocity, (3,)."""
+    """Return the components of a velocity, of shape (3,)."""
     found = tuple(variables.read(component) for component in vector.to_matrix(frame))
     for symbol in variables.given:
         if any(component.has(symbol) for component in found):
@@ -89,13 +89,13 @@ def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Varia
 
 
 def kinetic_energy(motions: Iterable[BodyMotion]) -> Expr:
-    """T, the sum of w . I w / 2."""
+    """Return the kinetic energy T, the sum of w . I w / 2."""
     terms = (w * p / 2 for motion in motions for w, p in zip(motion.rates, motion.momentum, strict=True))
     return sympy.Add(*terms)
 
 
 def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tuple[Expr, ...]:
-    """N, m expressions; exact zeros where it vanishes, as it does unless constraints are built into velocities."""
+    """Return N, m expressions; exact zeros where it is zero, that is, unless constraints are built into velocities."""
     terms: list[list[Expr]] = [[] for _ in variables.x]
     for motion in motions:
         for i, excess in _excess(motion, variables).items():
@@ -105,7 +105,7 @@ def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tu
 
 
 def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:
-    """d/dt dw/dq_dot_i - dw/dq_i by coordinate, less dw/dq_dot_i x W where axes turn with W."""
+    """Return d/dt dw/dq_dot_i - dw/dq_i by coordinate, minus dw/dq_dot_i x W if the axes rotate with W."""
     partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
     found = {}
     for i in {column for _, column in (*partial, *pulls)}:
@@ -117,12 +117,12 @@ def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, .
 
 
 def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
-    """The generalised forces of loads, m expressions: f_i = sum F . dv/dq_dot_i over points, of torques over frames.
+    """Return the generalised forces of loads, f_i = sum F . dv/dq_dot_i over points; of torques over frames.
 
     Args:
         loads: pairs of a point and a force, or of a frame and a torque.
-        frame: the inertial one.
-        variables: to read them with.
+        frame: the inertial frame.
+        variables: converts expressions to plain symbols.
     """
     terms: list[list[Expr]] = [[] for _ in variables.x]
     for place, vector in loads:

@@ -1,8 +1,9 @@
-"""The potential energy of forces, where they have one: f = -V_q.
+"""Potential energy of forces, if they have one: f = -V_q.
 
-One coordinate after the other is integrated: what V so far leaves of its force, term by term. Terms c s**e with a root
-or a denominator are taken by the chain rule, c/s_q being constant, which weights, springs and gravitation are; products
-of powers, sines and exponentials by SymPy. What is found counts if -V_q is f at random points, in 60 digits.
+One coordinate after the other is integrated: the part of its force that V does not yet account for, term by term.
+Terms c s**e with roots or denominators are integrated by the chain rule if c/s_q is constant (weights, springs,
+gravitation); products of powers, sines and exponentials by SymPy. The result is accepted if -V_q equals f at random
+points in 60 digits.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = ["potential_of"]
 
 
 def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr | None:
-    """V(q), or ``None`` if there is none, or none was found.
+    """Return V(q), or ``None`` if there is none, or none was found.
 
     >>> x, y, k = sympy.symbols("x y k")
     >>> potential_of([-k*x*y**2 - x/sympy.sqrt(x**2 + y**2), -k*x**2*y - y/sympy.sqrt(x**2 + y**2)], [x, y])
@@ -36,7 +37,7 @@ def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr 
 
 
 def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
-    """By ``q``; ``None`` where it is none of the simple ones."""
+    """Return the antiderivative with respect to ``q``, or ``None`` if no rule applies."""
     powers = [power for power in expression.atoms(Pow) if _is_steep(power, q)]
     bases = {power.base: Dummy(positive=True) for power in powers}
     hidden = expression.xreplace({power: bases[power.base] ** power.exp for power in powers})
@@ -54,12 +55,12 @@ def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:
 
 
 def _is_steep(power: Expr, q: Symbol) -> bool:
-    """Whether it is a root of ``q``, or one over it."""
+    """Return whether ``power`` of a function of ``q`` has an exponent other than a positive integer."""
     return bool(power.base.has(q) and not (power.exp.is_Integer and power.exp.is_positive))
 
 
 def _by_chain_rule(factor: Expr, power: Expr, behind: dict[Symbol, Expr], q: Symbol) -> Expr | None:
-    """The integral of c s**e where c/s_q does not depend on ``q``."""
+    """Return the integral of c s**e if c/s_q does not depend on ``q``, else ``None``."""
     symbol, exponent = power.as_base_exp()
     if symbol not in behind or exponent.has(*behind, q):
         return None

@@ -1,4 +1,4 @@
-"""What ``LagrangesMethod``, ``KanesMethod`` and ``System`` of ``sympy.physics.mechanics`` hold."""
+"""Conversion of ``LagrangesMethod``, ``KanesMethod`` and ``System`` of ``sympy.physics.mechanics``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["forces_of_lagranges_method", "of_kanes_method", "of_system"]
 
 
 def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
-    """The forces of its ``forcelist`` by coordinate; its bodies are in its Lagrangian, and are not asked.
+    """Return the generalised forces of its ``forcelist`` by coordinate; its bodies are part of its Lagrangian.
 
     Raises:
         SystemDefinitionError: if there are loads, but no inertial frame.
@@ -35,7 +35,7 @@ def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
 
 
 def of_kanes_method(method: KanesMethod) -> Multibody:
-    """The bodies and loads of Kane's method, whether its equations were formed or not.
+    """Return the bodies and loads of a ``KanesMethod``, whether or not its equations were formed.
 
     Raises:
         SystemDefinitionError: if it has no bodies or no kinematic equations.
@@ -46,11 +46,11 @@ def of_kanes_method(method: KanesMethod) -> Multibody:
             "kanes_equations(bodies, loads) first"
         )
     implicit = copy.copy(method)
-    implicit.explicit_kinematics = False  # as written, not solved for the rates
+    implicit.explicit_kinematics = False  # kinematic equations in implicit form, not solved for the rates
     if not implicit.mass_matrix_kin:
         raise SystemDefinitionError("this KanesMethod has no kinematic equations between speeds and rates: kd_eqs=...")
     rates = method.q.diff(dynamicsymbols._t)
-    constraints = method._k_nh * method.u + method._f_nh if method._k_nh else ()  # no public names; nor below
+    constraints = method._k_nh * method.u + method._f_nh if method._k_nh else ()  # private; so below
     return Multibody(
         frame=method._inertial,
         time=dynamicsymbols._t,
@@ -66,9 +66,9 @@ def of_kanes_method(method: KanesMethod) -> Multibody:
 
 
 def of_system(system: System) -> Multibody:
-    """The bodies, joints, loads and actuators of a system, whether its equations were formed or not.
+    """Return the bodies, joints, loads and actuators of a ``System``, whether or not its equations were formed.
 
-    Potential energies of bodies count as in the equations: not in Kane's.
+    Potential energies of bodies are included unless its equations were formed by Kane's method, which omits them.
     """
     groups = [tuple(actuator.to_loads()) for actuator in system.actuators]
     return Multibody(

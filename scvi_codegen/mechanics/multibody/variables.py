@@ -1,4 +1,4 @@
-"""The variables of a system of bodies: SymPy's functions of time and generalised speeds as plain symbols, and back."""
+"""Variables of a multibody system: conversion of SymPy's functions of time and speeds to plain symbols, and back."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ __all__ = ["Variables", "solved_for_speeds"]
 
 
 class Variables:
-    """Symbols for q(t), dq/dt and generalised speeds u(t); other functions of time get theirs as they are read.
+    """Plain symbols for q(t), dq/dt and generalised speeds u(t); other functions of time get symbols when first read.
 
     Args:
         coordinates: functions of time.
         time: their argument.
-        speeds: generalised speeds; one that is a dq/dt is none of its own.
-        auxiliary: speeds that are 0.
+        speeds: generalised speeds; one that equals a dq/dt gets no symbol of its own.
+        auxiliary: auxiliary speeds, which are 0.
 
     Attributes:
-        x, v: of coordinates and velocities, m each.
-        u: of the speeds.
-        time: as given.
+        x, v: symbols of coordinates and velocities, m each.
+        u: symbols of the generalised speeds.
+        time: symbol of time.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class Variables:
 
     @property
     def given(self) -> tuple[Symbol, ...]:
-        """The symbols of what was read and is neither coordinate nor speed, but a function of time."""
+        """Symbols of the functions of time that are neither coordinates nor speeds."""
         return tuple(self._written)[self._own :]
 
     def settle(self, speeds: Mapping[Symbol, Expr]) -> None:
-        """From now on read speeds as what they are in coordinates and velocities."""
+        """Replace the generalised speeds by their expressions in coordinates and velocities in all later reads."""
         self._plain |= {self._written[u]: value for u, value in speeds.items()}
 
     def read(self, expression: Any) -> Expr:
-        """In plain symbols, its numbers exact."""
+        """Return an expression in plain symbols, with exact numbers."""
         expression = sympy.sympify(expression)
         others = expression.atoms(sympy.Derivative, AppliedUndef) - self._plain.keys()
         for function in sorted(others, key=str):
@@ -65,11 +65,11 @@ class Variables:
         return evaluated(expression, self._plain)
 
     def write(self, expression: Expr) -> Expr:
-        """In the user's functions of time."""
+        """Return an expression in the user's functions of time."""
         return expression.xreplace(self._written)
 
     def rate(self, function: Expr) -> Expr:
-        """d/dt of a function of coordinates and time."""
+        """Return d/dt of a function of coordinates and time."""
         flow = dict(zip(self.x, self.v, strict=True)) | {self.time: sympy.S.One}
         along = tuple(flow)
         return sympy.Add(*(slope * flow[along[j]] for j, slope in gradient(function, along).items()))
@@ -80,10 +80,10 @@ def _symbol(function: Expr) -> Symbol:
 
 
 def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[Symbol, Expr]:
-    """The generalised speeds in coordinates and velocities, from as many linear equations in plain symbols.
+    """Return the generalised speeds in terms of coordinates and velocities, solved from linear equations.
 
     Raises:
-        SystemDefinitionError: where they do not say them.
+        SystemDefinitionError: if the equations are singular or nonlinear in the speeds.
     """
     if not variables.u:
         return {}

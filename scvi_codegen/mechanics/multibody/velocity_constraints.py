@@ -1,4 +1,4 @@
-"""Constraints on velocities that say more than other equations between velocities do."""
+"""Selection of velocity constraints that are independent of other linear equations between velocities."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ SEED = 20250101
 
 
 def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence[Symbol]) -> tuple[int, ...]:
-    """Which of the expressions asked for can be other than 0 where the known ones are, at a random point.
+    """Return the indices of ``asked`` expressions that are independent of earlier ones, by ranks at a point.
 
     Args:
         known, asked: linear in the rates.
         rates: velocities and speeds.
 
     Raises:
-        SystemDefinitionError: where they have no value at any of the points tried.
+        SystemDefinitionError: if they have no value at any of the sampled points.
     """
     rows = _values((*known, *asked), rates)
     basis, found = rows[: len(known)], []
@@ -43,7 +43,7 @@ def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence
 
 
 def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.float64]:
-    """Coefficients of the rates and what is left without them, row by row."""
+    """Return the coefficients of the rates and the remainder without rates, row by row, at a random point."""
     entries = dict(jacobian(expressions, rates))
     resting = dict.fromkeys(rates, 0)
     entries |= {(k, len(rates)): expression.xreplace(resting) for k, expression in enumerate(expressions)}

@@ -1,1 +1,1 @@
-"""Symmetries and what they conserve, by Noether's theorem: found, named, checked."""
+"""Symmetries and conserved quantities by Noether's theorem: detection, naming and verification."""

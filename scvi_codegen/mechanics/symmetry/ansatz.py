@@ -1,6 +1,6 @@
-"""Which polynomials in q, p and t are tried as momentum maps, and arithmetic on them.
+"""Ansatz for momentum maps: the polynomials in q, p and t that are tried, and arithmetic on them.
 
-In index notation: the state is q_0 .. q_(m-1), p_0 .. p_(m-1), entries 0 .. 2 m - 1.
+The state is q_0 .. q_(m-1), p_0 .. p_(m-1), with indices 0 .. 2 m - 1.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ __all__ = [
 ]
 
 Terms: TypeAlias = Mapping[Monomial, Expr]
-"""A polynomial whose coefficients depend on parameters."""
+"""Polynomial whose coefficients depend on parameters."""
 
 MOST_CYCLIC = 12
 
 
 def monomial_columns(m: int, *, curved: bool) -> Iterator[dict[Monomial, int]]:
-    """All monomials of the ansatz, those first that are to occur in few momentum maps."""
+    """Yield all monomials of the ansatz, beginning with those that are to occur in few momentum maps."""
     q, p = range(m), range(m, 2 * m)
     planes = sorted(combinations(q, 2), reverse=True)
     turns = [*planes, *((i, i) for i in q), *((j, i) for i, j in planes)]
@@ -57,7 +57,7 @@ def monomial_columns(m: int, *, curved: bool) -> Iterator[dict[Monomial, int]]:
 
 
 def gauge_columns(m: int, *, quadratic: bool) -> Iterator[dict[Monomial, int]]:
-    """Monomials of f: of degree 2 in q (1 in t), 1 in q (3 in t), 0 in q (4 in t)."""
+    """Yield the monomials of the gauge f: of degree 2 in q (1 in t), 1 in q (3 in t), 0 in q (4 in t)."""
     q = range(m)
     yield from ({Monomial(k, (i,)): 1} for k in range(4) for i in q)
     pairs = (*combinations(q, 2), *((i, i) for i in q)) if quadratic else ()
@@ -66,7 +66,7 @@ def gauge_columns(m: int, *, quadratic: bool) -> Iterator[dict[Monomial, int]]:
 
 
 def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
-    """Momenta of cyclic coordinates, translations and rotations of everything, and t."""
+    """Yield momenta of cyclic coordinates, translations and rotations of all bodies together, and t."""
     m, free = system.dimension, system.formula.free_symbols
     cyclic = [i for i, q in enumerate(system.coordinates) if q not in free][:MOST_CYCLIC]
     yield from ({Monomial(0, (m + i,)): 1} for i in cyclic)
@@ -78,12 +78,12 @@ def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
 
 
 def is_shift(column: Polynomial) -> bool:
-    """Whether it is a sum of single momenta."""
+    """Return whether a polynomial is a sum of single momenta (a translation)."""
     return all(len(monomial.factors) == 1 for monomial in column)
 
 
 def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list[Polynomial]:
-    """The translations among the columns times t, less positions times the masses that they move, and t^2."""
+    """Return Galilean boosts: translations times t minus the masses that they move times their positions, and t^2."""
     m, constants = system.dimension, set(system.parameters)
     masses = {place: x for place, x in forms_of(system).mass.items() if x.free_symbols <= constants}
     boosts: list[Polynomial] = []
@@ -98,26 +98,26 @@ def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list
 
 
 def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:
-    """Bodies by names such as jupiter_x, x_jupiter or x1; two or three coordinates with other names are one body."""
+    """Return bodies by names such as jupiter_x, x_jupiter, x1; 2 or 3 coordinates with other names are one body."""
     names = [q.name for q in system.coordinates]
     alone = (Body(name="", columns=tuple(range(len(names)))),) if 2 <= len(names) <= 3 else ()
     return bodies(names) or alone
 
 
 def planes_of(found: Sequence[Body]) -> list[tuple[int, int]]:
-    """Pairs of axes, in the sense of a right-handed rotation: about x, y, z; or the one of the plane."""
+    """Return pairs of axes of right-handed rotations: about x, y, z, or the one of the plane."""
     size = len(found[0].columns) if found else 0
     return [(1, 2), (2, 0), (0, 1)] if size == 3 else [(0, 1)] if size == 2 else []
 
 
 def turn(m: int, found: Sequence[Body], plane: tuple[int, int]) -> dict[Monomial, int]:
-    """The angular momentum of all bodies."""
+    """Return the angular momentum of all bodies in a plane of rotation."""
     pairs = [(body.columns[plane[0]], body.columns[plane[1]]) for body in found]
     return {Monomial(0, (i, m + j)): 1 for i, j in pairs} | {Monomial(0, (j, m + i)): -1 for i, j in pairs}
 
 
 def combined(row: Mapping[int, Expr], columns: Sequence[Column]) -> Terms:
-    """A combination of polynomials."""
+    """Return the linear combination of polynomial columns with these coefficients."""
     terms: dict[Monomial, Expr] = {}
     for c, coefficient in row.items():
         column = columns[c]
@@ -128,7 +128,7 @@ def combined(row: Mapping[int, Expr], columns: Sequence[Column]) -> Terms:
 
 
 def polynomial_in(system: MechanicalSystem, terms: Terms) -> Expr:
-    """The polynomial in the symbols of the system."""
+    """Return the polynomial as an expression in the symbols of the system."""
     state = (*system.coordinates, *system.momentum_symbols)
     return sympy.Add(
         *(
@@ -139,7 +139,7 @@ def polynomial_in(system: MechanicalSystem, terms: Terms) -> Expr:
 
 
 def independent(found: Sequence[Terms], first: Sequence[Terms] = (), trivial: Sequence[Terms] = ()) -> list[Terms]:
-    """Those ``first``, and those found that are no sums of these, of products of linear ones and of ``trivial`` ones.
+    """Return ``first`` and those found that are no combinations of them, of products of linear ones and of ``trivial``.
 
     ``found`` and ``first`` span the products that they have; where some are ``first``, the linear ones are among them.
     """
@@ -166,7 +166,7 @@ def _product(a: Terms, b: Terms) -> Terms:
 
 
 def _rank(found: Sequence[Terms]) -> int:
-    """Of polynomials, with numbers in place of the parameters, of which roots may be complex."""
+    """Return the rank of polynomials, with numbers in place of the parameters; roots of these may be complex."""
     places = {monomial: k for k, monomial in enumerate({monomial: None for terms in found for monomial in terms})}
     constants = sorted(set().union(*(x.free_symbols for terms in found for x in terms.values())), key=str)
     numbers = {constant: sympy.Rational(prime(k + 5), 7) for k, constant in enumerate(constants)}
@@ -174,4 +174,4 @@ def _rank(found: Sequence[Terms]) -> int:
     for k, terms in enumerate(found):
         for monomial, coefficient in terms.items():
             matrix[k, places[monomial]] = complex(coefficient.xreplace(numbers))
-    return int(np.linalg.matrix_rank(matrix)) if matrix.size else 0  # NumPy 1.26 knows no rank of an empty one
+    return int(np.linalg.matrix_rank(matrix)) if matrix.size else 0  # NumPy 1.26 has no rank of empty ones

@@ -1,4 +1,4 @@
-"""Which coordinates, by their names, are the Cartesian position of one body."""
+"""Grouping of coordinates into Cartesian positions of bodies, by their names."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def bodies(coordinates: Sequence[str]) -> tuple[Body, ...]:
 
 
 def _grouped(coordinates: Sequence[str]) -> tuple[Body, ...]:
-    """Those of names with the axis last."""
+    """Group names that end in the axis."""
     groups: dict[str, dict[str, int]] = {}
     for index, name in enumerate(coordinates):
         stem, axis = (name[:-2], name[-1]) if name[-2:-1] == "_" else ("", name)

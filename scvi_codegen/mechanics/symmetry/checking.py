@@ -1,4 +1,4 @@
-"""Whether a direction or a generator that a user knows is a symmetry, and the change of L or the rate that says no."""
+"""Verification of a user's symmetry, given by its direction or its generator, with a proof of failure if it is none."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["check_symmetry"]
 
 LONGEST_SHOWN = 300
 DECIDED_AT = 3
-"""Points at which the change of L is looked at."""
+"""Number of points at which the change of L is tested."""
 
 
 @takes(system=SYSTEM, direction=FORMULAS, name=TEXT)
@@ -38,19 +38,19 @@ def check_symmetry(
     generator: Expr | str | None = None,
     name: str = "given symmetry",
 ) -> Symmetry:
-    """The symmetry with a direction or a generator of the user's, whatever its form, if it is one.
+    """Return the symmetry with the user's direction or generator, of any form, after verifying it.
 
     Args:
-        system: what moves.
+        system: the mechanical system.
         direction: xi, m expressions in coordinates, time and parameters, as SymPy or as text.
-        generator: in place of a direction G(q, p, t), which moves q by G_p and p by -G_q, if {G, H} + G_t = 0: G is
-            conserved. Momenta of a Lagrangian are ``p_`` and the coordinate.
-        gauge: f with L_q . xi + L_v . dxi/dt = df/dt; left out, it is searched among those quadratic in q and, of a
+        generator: in place of a direction G(q, p, t), which moves q by G_p and p by -G_q; it is conserved if
+            {G, H} + G_t = 0. Momenta of a Lagrangian are ``p_`` and the coordinate.
+        gauge: f with L_q . xi + L_v . dxi/dt = df/dt; by default it is searched among those quadratic in q and, for a
             Lagrangian, integrated.
-        name: what the conserved quantity is called.
+        name: name of the conserved quantity.
 
     Raises:
-        SystemDefinitionError: with the change of L, if it is not the time derivative of f, or if that is not decided;
+        SystemDefinitionError: with the change of L, if it is not the time derivative of f, or if that is undecided;
             with the rate of a generator that is not conserved; naming the symbol, if one is unknown.
 
     >>> from scvi_codegen.models.systems import kepler
@@ -92,7 +92,7 @@ def check_symmetry(
 
 
 def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
-    """The symmetry of phase space that G generates."""
+    """Return the symmetry of phase space that G generates."""
     motion = rates_of(system)
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):
@@ -111,7 +111,7 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
 
 
 def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
-    """The f of a direction whose f is not quadratic."""
+    """Return the gauge f of a direction, for f that are not quadratic."""
     change, motion = _change(system, xi), rates_of(system)
     f = integrated(system, change)
     if f is not None:
@@ -128,7 +128,7 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
 
 
 def _expression(system: MechanicalSystem, given: Expr | str, what: str = "component of a direction") -> Expr:
-    """A function of coordinates, time and parameters, of a generator momenta too, from text or SymPy."""
+    """Return a function of coordinates, time and parameters (generators: also momenta) from text or SymPy."""
     generates = what == "generator"
     momenta = system.momentum_symbols if generates else ()
     known = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
@@ -152,7 +152,7 @@ def _expression(system: MechanicalSystem, given: Expr | str, what: str = "compon
 
 
 def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str:
-    """What L changes by along a direction that is no symmetry."""
+    """Return the message with the change of L along a direction that is no symmetry."""
     change, what = _change(system, xi), "along it L changes by"
     if f is None:
         searched = "a polynomial f quadratic in q; any other f can be given as gauge"
@@ -169,7 +169,7 @@ def _cut(change: Expr) -> str:
 
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
-    """L_q . xi + L_v . dxi/dt, and the work of forces and multipliers; of a Hamiltonian the rate of p . xi."""
+    """Return L_q . xi + L_v . dxi/dt plus the work of forces and multipliers; for a Hamiltonian the rate of p . xi."""
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
@@ -180,7 +180,7 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
 
 
 def _rate(system: MechanicalSystem, f: Expr) -> Expr:
-    """f_t + f_q . v, with v = H_p of a Hamiltonian."""
+    """Return f_t + f_q . v, where v = H_p for a Hamiltonian."""
     v = forms_of(system).legendre if system.auxiliaries else system.velocities
     slopes = gradient(f, (*system.coordinates, system.time))
     return sympy.Add(*(slope * (*v, sympy.S.One)[i] for i, slope in slopes.items()))

@@ -1,8 +1,8 @@
-"""The function f(q, t) of which the change of a Lagrangian along a direction is the time derivative.
+"""Gauge functions f(q, t): the change of a Lagrangian along a symmetry is the time derivative df/dt.
 
-A function of (q, v, t) is a total derivative f_t + f_q . v exactly where it is affine in v and the Euler-Lagrange
-expression of it vanishes (Olver, *Applications of Lie Groups to Differential Equations*, 2nd ed. 1993, theorem 4.7); f
-is then its integral along straight lines from q = 0.
+A function of (q, v, t) is a total derivative f_t + f_q . v if and only if it is affine in v and its Euler-Lagrange
+expression is zero (Olver, *Applications of Lie Groups to Differential Equations*, 2nd ed. 1993, theorem 4.7); f is
+then its integral along straight lines from q = 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NEGLIGIBLE = mp.mpf(10) ** -40
 
 
 def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
-    """A candidate for f, to be checked; ``None`` where SymPy does not find the integrals."""
+    """Return a candidate for f, to be verified; ``None`` if SymPy does not find the integrals."""
     rest = dict.fromkeys(system.velocities, sympy.S.Zero)
     slopes = [change.diff(v).xreplace(rest) for v in system.velocities]
     s = Symbol("s", positive=True)
@@ -38,13 +38,13 @@ def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
 
 
 def _definite(expression: Expr, s: Symbol) -> Expr:
-    """The integral for s from 0 to 1."""
+    """Return the integral over s from 0 to 1."""
     primitive = manualintegrate(sympy.expand(expression), s)
     return primitive.subs(s, 1) - primitive.subs(s, 0)
 
 
 def is_total_derivative(system: MechanicalSystem, change: Expr, points: Iterable[Sample]) -> bool | None:
-    """Whether there is such an f at all, from 60 digits at these points; ``None`` if there is no point."""
+    """Return whether such an f exists, tested in 60 digits at these points; ``None`` if there is no point."""
     q, v, t = system.coordinates, system.velocities, system.time
     slopes = [change.diff(velocity) for velocity in v]
     conditions = [slope.diff(velocity) for slope in slopes for velocity in v]

@@ -1,10 +1,10 @@
-"""Polynomials in q, p and t that every motion conserves, found by linear algebra.
+"""Conserved polynomials in q, p and t, found by linear algebra.
 
-A polynomial J = sum_c x_c phi_c(q, p, t) is conserved if sum_c x_c dphi_c/dt vanishes along all motions, that is, at
+A polynomial J = sum_c x_c phi_c(q, p, t) is conserved if sum_c x_c dphi_c/dt is zero on all trajectories, that is, at
 all points (:mod:`scvi_codegen.mechanics.symmetry.sampling`): x spans the null space of the matrix of rates at enough
-random points, in binary64. Its reduced row echelon form is sparse. The entries depend on the parameters; they are
+random points, in binary64. Its reduced row echelon form is sparse. Its entries depend on the parameters; they are
 recognised as rational numbers times powers of parameters, and of sums of parameters that occur in the system, from
-their values at random parameters. What is found is believed if its rate vanishes to 40 digits at random points and
+their values at random parameters. A result is accepted if its rate is zero to 40 digits at random points and
 parameters.
 """
 
@@ -34,33 +34,33 @@ __all__ = ["Column", "Monomial", "Polynomial", "confirmed", "conserved"]
 Array = NDArray[np.float64]
 
 NULL = 1e-9
-"""Singular values below, of a matrix with entries of size 1, are 0."""
+"""Singular values below this bound are 0, for a matrix with entries of size 1."""
 ROUNDING = 1e-11
-"""Rates that are smaller, beside the largest, are 0."""
+"""Rates below this bound, relative to the largest, are 0."""
 PIVOT = 1e-6
 ZERO = 1e-8
 RECOGNISED = 1e-7
 LARGEST_INTEGER = 1000
 HIGHEST_POWER = 16
-"""Of a parameter in a coefficient; beyond, a fit of logarithms has recognised nothing."""
+"""Highest power of a parameter in a coefficient; larger exponents of the logarithmic fit are rejected."""
 AT_ONCE = 4096
-"""Points of one evaluation: so many numbers are kept for every part of the formulas."""
+"""Number of points evaluated together, which bounds memory: so many numbers are stored per subexpression."""
 MORE_POINTS = 12
-"""Points beyond as many as columns."""
+"""Number of sampled points in excess of the number of columns."""
 MORE_PARAMETERS = 4
-"""Values of the parameters beyond as many as are needed to recognise a coefficient."""
+"""Number of sampled parameter values in excess of the number of factors of a coefficient."""
 NEGLIGIBLE = mp.mpf(10) ** -40
 
 
 @dataclass(frozen=True, slots=True)
 class Monomial:
-    """t^power times the product of entries of the state (q, p), by index."""
+    """Monomial t^power times the product of entries of the state (q, p), by index."""
 
     power: int
     factors: tuple[int, ...]
 
     def rate(self, sample: Sample) -> Any:
-        """Its time derivative."""
+        """Return the time derivative of the monomial at sampled points."""
         t, total = sample.t, 0.0 * sample.t
         if self.power:
             total = total + self.power * t ** (self.power - 1) * math.prod(sample.state[i] for i in self.factors)
@@ -72,16 +72,16 @@ class Monomial:
 
 Polynomial: TypeAlias = Mapping[Monomial, Expr | int]
 Column: TypeAlias = Polynomial | Expr
-"""A function phi_c: a polynomial, or any expression in q, p, t and parameters."""
+"""Ansatz function phi_c: a polynomial, or any expression in q, p, t and parameters."""
 
 
 def conserved(
     system: MechanicalSystem, motion: Rates, columns: Sequence[Column], *, fractions: bool = False
 ) -> list[dict[int, Expr]]:
-    """A basis of the conserved combinations of ``columns``: the coefficient of each column that occurs, by its index.
+    """Return a basis of the conserved combinations of ``columns``, each as coefficients by column index.
 
     Columns that come first occur in as few of them as possible. Coefficients have denominators if ``fractions`` are
-    allowed and make them shorter. A combination with a coefficient that is not recognised is left out.
+    allowed and make them shorter. A combination with an unrecognised coefficient is omitted.
     """
     search = _Search(motion, columns)
     (rows,) = search.null_spaces(range(len(columns)), 1)
@@ -103,7 +103,7 @@ def conserved(
 
 
 def confirmed(motion: Rates, columns: Sequence[Column], row: Mapping[int, Expr]) -> bool:
-    """Whether a combination of columns is conserved by a motion to 40 digits where that is defined."""
+    """Return whether a combination of columns is conserved to 40 digits at the sampled points where it is defined."""
     return _Search(motion, columns).verified(row)
 
 
@@ -116,10 +116,11 @@ class _Search:
         self.drawn: dict[Symbol, Array] = {}
 
     def null_spaces(self, chosen: Sequence[int], count: int) -> list[Array | None]:
-        """The null space of the chosen columns for ``count`` values of the parameters, (d, columns) each.
+        """Return null spaces of the chosen columns for ``count`` values of the parameters, of shape (d, columns) each.
 
-        ``None`` where the system is not defined at enough points. Parameters have the signs of their default values and
-        are of size 1, or are near the default values where the system is not defined there.
+        ``None`` where the system is undefined at too many points. Parameters have the signs of their default values and
+        are
+        of size 1, or are near the default values where the system is undefined there.
         """
         for near in (False, True):
             self.drawn = drawn_parameters(self.motion.constants, count, near=near)
@@ -134,9 +135,9 @@ class _Search:
         return found
 
     def _null_spaces(self, chosen: Sequence[int], part: slice) -> Iterator[Array | None]:
-        """Those for some of the values drawn."""
+        """Yield null spaces for a part of the drawn parameter values."""
         size = len(chosen) + MORE_POINTS
-        points = 2 * size  # some may lie where the system is not defined
+        points = 2 * size  # more than needed, since the system may be undefined at some of them
         parameters = {given: np.repeat(values[part], points) for given, values in self.drawn.items()}
         count = max([len(values) // points for values in parameters.values()], default=1)
         with np.errstate(all="ignore"):
@@ -149,7 +150,7 @@ class _Search:
             yield _null_space(own_rates[good], own_sizes[good]) if len(good) == size else None
 
     def terms(self, c: int, sample: Sample) -> list[Any]:
-        """What the time derivative of a column is the sum of."""
+        """Return the terms whose sum is the time derivative of a column."""
         column = self.columns[c]
         if not isinstance(column, Expr):
             return [
@@ -163,14 +164,14 @@ class _Search:
         return [sample.value(slope) * rates[i] for i, slope in self.slopes[c].items()] or [0.0 * sample.t]
 
     def with_values(self, factors: Sequence[Expr]) -> list[tuple[Expr, Array]]:
-        """Functions of the parameters for the values drawn last, without those that are 0 or not defined there."""
+        """Return factors with their values at the drawn parameters, without those that are 0 or undefined there."""
         known: dict[Any, Any] = dict(self.drawn)
         with np.errstate(all="ignore"):
             found = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
         return [(factor, values) for factor, values in found if np.isfinite(values).all() and values.all()]
 
     def verified(self, row: Mapping[int, Expr]) -> bool:
-        """Whether the combination is conserved to 40 digits at all these points."""
+        """Return whether a combination is conserved to 40 digits at all verification points."""
         for sample in self.motion.verifying:
             try:
                 terms = [sample.value(x) * term for c, x in row.items() for term in self.terms(c, sample)]
@@ -182,9 +183,10 @@ class _Search:
 
 
 def _null_space(matrix: Array, sizes: Array) -> Array:
-    """The null space in reduced row echelon form, (d, columns).
+    """Return the null space in reduced row echelon form, of shape (d, columns).
 
-    Rows and columns are scaled by ``sizes`` of the terms that entries are sums of: what is small beside those is 0.
+    Rows and columns are scaled by ``sizes`` of the terms that entries are sums of, so entries are judged relative to
+    these.
     """
     heights = sizes.max(axis=1, keepdims=True)
     heights = np.where(heights > 0.0, heights, 1.0)
@@ -200,9 +202,9 @@ def _null_space(matrix: Array, sizes: Array) -> Array:
 
 
 def _all_larger(matrix: Array, small: float) -> bool:
-    """Whether all singular values surely are: the smallest of M = Q R is no less than 1 / |R^-1|, the Frobenius norm.
+    """Return whether all singular values exceed ``small``, by the bound 1 / |R^-1| (Frobenius norm) with M = Q R.
 
-    A twentieth of their work.
+    It costs a twentieth of a singular value decomposition.
     """
     try:
         return bool(np.linalg.norm(np.linalg.inv(np.linalg.qr(matrix, mode="r"))) < 1.0 / small)
@@ -211,7 +213,7 @@ def _all_larger(matrix: Array, small: float) -> bool:
 
 
 def _reduced(rows: Array) -> tuple[Array, list[int]]:
-    """Reduced row echelon form of orthonormal rows, and the columns of its leading ones."""
+    """Return the reduced row echelon form of orthonormal rows, and its pivot columns."""
     pivots: list[int] = []
     for c in range(rows.shape[1]):
         done = len(pivots)
@@ -230,7 +232,7 @@ def _reduced(rows: Array) -> tuple[Array, list[int]]:
 
 
 def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
-    """What coefficients may be products of: parameters, and sums of parameters that occur in the system."""
+    """Return candidate factors of coefficients: parameters, and sums of parameters that occur in the system."""
     constants = set(motion.constants)
     found: list[Expr] = list(motion.constants)
     masses = forms_of(system).mass
@@ -247,7 +249,7 @@ def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
 def _recognised_row(
     entries: Array, support: Sequence[int], factors: Sequence[tuple[Expr, Array]], fractions: bool
 ) -> dict[int, Expr] | None:
-    """Coefficients by column; ``entries`` are (values of the parameters, columns)."""
+    """Return coefficients by column; ``entries`` have the shape (values of the parameters, columns)."""
     powers: dict[int, dict[Expr, Fraction]] = {}
     numbers: dict[int, Expr] = {}
     for k, c in enumerate(support):
@@ -268,9 +270,10 @@ def _recognised_row(
 
 
 def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[Expr, dict[Expr, Fraction]] | None:
-    """The number and the powers of the factors whose product has these values."""
+    """Return the number and the powers of the factors whose product has these values."""
     if not entries.all():
         return None
+    # Least squares: log|entry| = log|number| + sum of power * log|factor|; powers are rounded to halves.
     logs = [np.ones(len(entries)), *(np.zeros(len(entries)) + np.log(np.abs(values)) for _, values in factors)]
     solution = np.linalg.lstsq(np.array(logs).T, np.log(np.abs(entries)), rcond=None)[0]
     halves = np.rint(2.0 * solution[1:])
@@ -286,7 +289,7 @@ def _recognised(entries: Array, factors: Sequence[tuple[Expr, Array]]) -> tuple[
 
 
 def _number(value: float) -> Expr | None:
-    """The rational number of small integers near ``value``, or the root of one."""
+    """Return the rational number of small integers near ``value``, or the square root of one."""
     for exact in (Fraction(value), Fraction(value) ** 2):
         simple = exact.limit_denominator(LARGEST_INTEGER)
         if simple and abs(float(exact / simple) - 1.0) < RECOGNISED:

@@ -1,4 +1,4 @@
-"""What momentum maps are called: ``angular momentum z``, ``momentum of phi``, ``boost x``."""
+"""Names of momentum maps: ``angular momentum z``, ``momentum of phi``, ``boost x``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAMED_TERMS = 4
 
 
 def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, int]:
-    """What the momentum map is called, and with which sign."""
+    """Return the name of a momentum map, and the sign with which it has this name."""
     m = system.dimension
     turning = {a: x for a, x in terms.items() if len(a.factors) == 2 and a.factors[0] < m <= a.factors[1]}
     shifting = {
@@ -48,7 +48,7 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
 
 
 def _shifting_name(system: MechanicalSystem, kind: str, shifts: Mapping[int, Expr]) -> str:
-    """``momentum of x``, ``linear momentum x`` of all bodies, ``momentum of q1 + q3``; the same for boosts."""
+    """Return ``momentum of x``, ``linear momentum x`` of all bodies, ``momentum of q1 + q3``; likewise for boosts."""
     found, equal = bodies_of(system), set(shifts.values()) == {sympy.S.One}
     if len(found) > 1 and equal:
         for k, axis in enumerate(AXES[: len(found[0].columns)]):

@@ -1,4 +1,4 @@
-"""Values of formulas at many points, and the forces of families of terms there or at one point in 60 digits."""
+"""Vectorised values of formulas, and the forces of term groups at many points or at one point in 60 digits."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from scvi_codegen.tables.precision import Number, mp
 __all__ = ["LARGEST", "among_few", "array_pulls", "array_value", "exact_pulls"]
 
 LARGEST = 10**300
-"""A number beyond is none of binary64."""
+"""Bound below which numbers can be converted to binary64."""
 FEW = 12
-"""Bodies of a family."""
+"""Number of bodies per term group that :func:`among_few` selects."""
 
 
 def among_few(families: Sequence[RolledTerms], bodies: Sequence[Body]) -> tuple[RolledTerms, ...]:
-    """The terms among a few bodies, the first that occur: with whatever these have, as a system of so many bodies."""
+    """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
     own = {place: number for number, body in enumerate(bodies) for place in body.columns}
     chosen = dict[int, None]()
     for family in families:
@@ -38,7 +38,7 @@ def among_few(families: Sequence[RolledTerms], bodies: Sequence[Body]) -> tuple[
 def array_pulls(
     families: Sequence[RolledTerms], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
 ) -> Sequence[Any]:
-    """The force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
+    """Return the force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
     if not families:
         return [0.0] * len(coordinates)
     q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
@@ -55,7 +55,7 @@ def array_pulls(
 def exact_pulls(
     families: Sequence[RolledTerms], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
 ) -> list[Number]:
-    """The same at one point in 60 digits."""
+    """Return the force on each coordinate at one point, in 60 digits."""
     force: list[Number] = [mp.zero] * len(coordinates)
     for family in families:
         beside = [symbol for symbol in known if symbol not in coordinates]
@@ -71,7 +71,7 @@ def exact_pulls(
 
 
 def array_value(expression: Any, known: dict[Any, Any]) -> Any:
-    """Value of an expression at many points, NaN where it has none; ``known`` has its symbols and gets its parts."""
+    """Return the values of an expression, NaN where undefined; ``known`` has its symbols and caches subexpressions."""
     if expression not in known:
         known[expression] = _array_node(expression, known)
     return known[expression]

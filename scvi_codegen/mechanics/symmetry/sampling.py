@@ -1,8 +1,8 @@
-"""A system at random points: positions, momenta and their rates of change, as arrays of binary64 or in 60 digits.
+"""Systems at random points: positions, momenta and their rates of change, as arrays of binary64 or in 60 digits.
 
-Time derivatives of functions of (q, p, t) follow from these without solving for accelerations: along every motion
-dq/dt = v and dp/dt = L_q with p = L_v for a Lagrangian, dq/dt = H_p and dp/dt = -H_q for a Hamiltonian. With v (or p)
-at random, what vanishes at all points vanishes identically.
+Time derivatives of functions of (q, p, t) follow from these without solving for accelerations: along every trajectory
+dq/dt = v and dp/dt = L_q with p = L_v for a Lagrangian, dq/dt = H_p and dp/dt = -H_q for a Hamiltonian. With random
+v (or p), an analytic function that is zero at all points is identically zero.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ Array = NDArray[np.float64]
 
 SEED = 20250101
 SPREADS = (1.0, 0.3, 0.1)
-"""Sizes of velocities or momenta: some Lagrangians exist for small ones only."""
+"""Scales of velocities or momenta; some Lagrangians are defined for small ones only."""
 ATTEMPTS = 24
 VERIFIED_AT = 3
 LONGEST_NUMBER = 1000
-"""Numerators and denominators of numbers in a formula that are as good as parameters: measured, not derived."""
+"""Longest numerator or denominator of exact numbers; longer ones are treated as parameters (measured values)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Numbers, or arrays of them, at one point or many.
+    """Values at one point (numbers) or at many points (arrays).
 
     Attributes:
         t: time.
         state: q, then p, 2 m entries.
         rates: their time derivatives.
-        value: of an expression in q, p, time and parameters.
+        value: evaluates an expression in q, p, time and parameters.
     """
 
     t: Any
@@ -60,19 +60,20 @@ class Sample:
 
 @dataclass(frozen=True)
 class Rates:
-    """How a system moves: v and L_q, or H_p and -H_q, as expressions of ``arguments``, time and ``constants``.
+    """Rates of a system: v and L_q, or H_p and -H_q, as expressions in ``arguments``, time and ``constants``.
 
     Attributes:
-        arguments: (q, v) of a Lagrangian, (q, p) of a Hamiltonian, then multipliers of constraints, which are as if
-            anything: what is conserved is so whatever they are.
+        arguments: (q, v) for a Lagrangian, (q, p) for a Hamiltonian, then the constraint multipliers, which are treated
+        as
+            arbitrary: a quantity conserved for arbitrary multipliers is conserved.
         momenta: symbols of p.
-        transformed: p of a Lagrangian, v of a Hamiltonian.
-        forces: dp/dt, g_q^T lambda of constraints included.
-        hamiltonian: which of both.
+        transformed: p for a Lagrangian, v for a Hamiltonian.
+        forces: dp/dt, including g_q^T lambda of constraints.
+        hamiltonian: whether the system is a Hamiltonian.
         time: t.
         constants: default value by parameter; long numbers of the formula are parameters here.
-        numbers: what stands for a long number, with that number.
-        families: what adds to the forces, of a system of many like terms.
+        numbers: long numbers by the symbols that replace them.
+        families: term groups that contribute to the forces.
     """
 
     arguments: tuple[Symbol, ...]
@@ -87,12 +88,12 @@ class Rates:
 
     @property
     def closed(self) -> bool:
-        """Whether all that occurs in the rates is among the arguments, so that they have values at a point."""
+        """True if the rates contain only arguments, time and constants, so that they have values at a point."""
         known = {*self.arguments, self.time, *self.constants}
         return all(formula.free_symbols <= known for formula in (*self.transformed, *self.forces))
 
     def arrays(self, parameters: Mapping[Symbol, Array], count: int) -> Sample:
-        """``count`` points; NaN where the system is not defined. Parameters: one number, or one a point."""
+        """Sample ``count`` points; NaN where the system is undefined. Parameters: one number, or one per point."""
         generator = np.random.default_rng(SEED)
         m = len(self.momenta)
         values: dict[Any, Any] = {**parameters, self.time: generator.uniform(-1.5, 1.5, count)}
@@ -104,7 +105,7 @@ class Rates:
             return self._sample(values, lambda expression: array_value(expression, values) + np.zeros(count), pulls)
 
     def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
-        """At most ``count`` points at which the system is defined, one by one in 60 digits."""
+        """Yield at most ``count`` points at which the system is defined, in 60 digits."""
         generator = random.Random(SEED)
         moved = (*self.transformed, *self.forces)
         tape = Tape(moved, (*self.arguments, self.time, *parameters))
@@ -126,7 +127,7 @@ class Rates:
 
     @functools.cached_property
     def verifying(self) -> list[Sample]:
-        """Points in 60 digits, none if the system is defined nowhere; one where each of many terms is a test."""
+        """Points in 60 digits, empty if the system is defined nowhere; one suffices for term groups."""
         count = 1 if self.families else VERIFIED_AT
         for near in (False, True):
             drawn = drawn_parameters(self.constants, 1, near=near)
@@ -147,7 +148,7 @@ class Rates:
 
 
 def drawn_parameters(constants: Mapping[Symbol, float], count: int, *, near: bool) -> dict[Symbol, Array]:
-    """``count`` random values of each parameter, of size 1 with the sign of its default value, or near that."""
+    """Draw ``count`` values of each parameter: near its default, or of size 1 with the sign of the default."""
     generator = np.random.default_rng(len(constants))
     if near:
         return {x: value + (abs(value) or 1.0) * generator.uniform(-0.1, 0.1, count) for x, value in constants.items()}
@@ -161,7 +162,7 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
 
 
 def rates_of(system: MechanicalSystem, families: tuple[RolledTerms, ...] = ()) -> Rates:
-    """The motion of a system, long numbers replaced by parameters; with ``families`` of terms beside it."""
+    """Return the rates of a system with term groups ``families``; long numbers are replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     forces = with_reactions(system, forms_of(system).thrust)
     numbers = _long_numbers((*transformed, *forces))
@@ -182,7 +183,7 @@ def rates_of(system: MechanicalSystem, families: tuple[RolledTerms, ...] = ()) -
 
 
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
-    """A symbol for the absolute value of each."""
+    """Return a symbol for each absolute value of a long number."""
     found = (part for part in parts(*expressions) if part.is_Rational)
     sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}
