@@ -19,6 +19,7 @@ def format_expression(expression: Expr) -> str:
     Raises:
         SystemDefinitionError: for an expression outside the grammar.
 
+    >>> import sympy
     >>> x, y = sympy.symbols("x y", real=True)
     >>> format_expression(sympy.sqrt(x) / (3 * y) - sympy.exp(-y))
     'sqrt(x)/(3*y) - exp(-y)'
