@@ -76,8 +76,7 @@ def exact_discrete_lagrangian(
     """Solve the Euler-Lagrange boundary-value problem from q0 at t to q1 at t + h; paper (6).
 
     The solution need not be unique (a pendulum can rotate); Newton's iteration starts from the straight line, or from
-    the
-    trajectory with the initial velocity ``guess``.
+    the trajectory with the initial velocity ``guess``.
 
     Args:
         system: any regular Lagrangian without forces and constraints.
@@ -136,8 +135,7 @@ def exact_map(
 
     Raises:
         StateError: for invalid numbers, wrong shapes or names, inputs without values, and systems with constraints; if
-        the
-            trajectory does not exist up to t + h, or is not smooth enough for 16 pieces.
+            the trajectory does not exist up to t + h, or is not smooth enough for 16 pieces.
     """
     problem = _Problem(system, h, t, parameters, digits)
     start, momenta = problem.vector(q0, "q0"), problem.vector(p0, "p0")

@@ -36,8 +36,7 @@ def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path on the same disk for a new file or folder, which then replaces ``path``.
 
     If that fails, nothing has changed. A file is replaced atomically; an existing folder is moved aside just before,
-    and
-    removed afterwards.
+    and removed afterwards.
     """
     target = Path(path)
     with tempfile.TemporaryDirectory(

@@ -123,8 +123,7 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
 
     Raises:
         StateError, MissingLibraryError: as :func:`check_format`; StateError also if ``path`` is an unrelated folder,
-        and
-            for units in a format that does not support them.
+            and for units in a format that does not support them.
         OSError: if it cannot be written.
     """
     check_format(path)

@@ -31,8 +31,7 @@ def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
 
     With SVI and collocation methods they are the exact directional derivatives of the computed trajectory, equal to
     :meth:`Trajectory.tangent` at about a third of a step per vector: they are solved by the same fixed-point iteration
-    as
-    the trajectory. Initial q is followed by the directions of q, one vector after another; likewise p.
+    as the trajectory. Initial q is followed by the directions of q, one vector after another; likewise p.
 
     Args:
         system: with constant masses, one per coordinate, and forces of position and time only.

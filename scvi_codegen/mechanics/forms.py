@@ -136,8 +136,7 @@ class Forms:
         """Scalar lambda . E whose derivatives with respect to the multipliers lambda are the collocation residuals.
 
         For a Hamiltonian it includes the product of ``constitutive`` with its multipliers. Forces are not part of E
-        here; see
-        :attr:`multiplied_forces`.
+        here; see :attr:`multiplied_forces`.
         """
         terms: list[Expr] = []
         factors = (*multipliers(self.system), *auxiliary_multipliers(self.system))

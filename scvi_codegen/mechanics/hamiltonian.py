@@ -39,8 +39,7 @@ class HamiltonianSystem(MechanicalSystem):
     """Hamiltonian H(q, p, t; parameters) in m coordinates and momenta, validated on construction.
 
     Build one with ``from_text`` or ``from_sympy``, or from a Lagrangian with :func:`hamiltonian_of`. Every method
-    accepts
-    it in place of a Lagrangian; variational methods then discretise Hamilton's principle in phase space, (35).
+    accepts it in place of a Lagrangian; variational methods then discretise Hamilton's principle in phase space, (35).
 
     Attributes:
         name, coordinates, time, parameters, defaults: see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
@@ -163,8 +162,7 @@ class HamiltonianSystem(MechanicalSystem):
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 
         Floating-point numbers become the rationals of their shortest decimal form; symbols become canonical as
-        described in
-        :mod:`scvi_codegen.formulas.symbols`.
+        described in :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
             name: name of the system.
@@ -283,8 +281,7 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
     Args:
         system: the Hamiltonian.
         constraints: as of :meth:`LagrangianSystem.from_text`; they add G^T lambda to p' = -H_q. Momenta are those of
-        the
-            Hamiltonian.
+            the Hamiltonian.
 
     Raises:
         SystemDefinitionError: if d2H/dp2 is singular, or SymPy finds no closed-form solution of v = dH/dp.

@@ -177,8 +177,7 @@ class LagrangianSystem(MechanicalSystem):
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 
         Floating-point numbers become the rationals of their shortest decimal form (``0.1`` is 1/10); symbols become
-        canonical
-        as described in :mod:`scvi_codegen.formulas.symbols`.
+        canonical as described in :mod:`scvi_codegen.formulas.symbols`.
 
         Args:
             name: name of the system.
@@ -243,10 +242,8 @@ class LagrangianSystem(MechanicalSystem):
         """Create the system from a ``sympy.physics.mechanics.LagrangesMethod``, with its forces and constraints.
 
         Forces and torques of its ``forcelist`` are projected on the coordinates by the velocities of their points and
-        the
-        angular velocities of their frames: f_i = sum F . dv/dq_dot_i. As in SymPy its ``bodies`` are not used: their
-        energies
-        are part of its Lagrangian.
+        the angular velocities of their frames: f_i = sum F . dv/dq_dot_i. As in SymPy its ``bodies`` are not used:
+        their energies are part of its Lagrangian.
         """
         from scvi_codegen.mechanics.multibody.readers import forces_of_lagranges_method
 
@@ -276,16 +273,11 @@ class LagrangianSystem(MechanicalSystem):
         """Create the system from a ``sympy.physics.mechanics.KanesMethod``, by its bodies and loads.
 
         Generalised speeds are expressed by the rates of the coordinates. Loads that depend only on coordinates and have
-        a
-        potential become a potential energy; all others are generalised forces, as are the terms of Kane's equations
-        beyond
-        Lagrange's if constraints are built into velocities (a rolling disc). Potential energies of bodies are not used,
-        as in
-        Kane's equations; accelerations follow from velocities, and those set by hand are ignored. Holonomic
-        constraints, and
-        velocity constraints that they do not imply, become constraints. A speed without a coordinate, which nothing
-        depends
-        on, gets one, ``integral_u``.
+        a potential become a potential energy; all others are generalised forces, as are the terms of Kane's equations
+        beyond Lagrange's if constraints are built into velocities (a rolling disc). Potential energies of bodies are
+        not used, as in Kane's equations; accelerations follow from velocities, and those set by hand are ignored.
+        Holonomic constraints, and velocity constraints that they do not imply, become constraints. A speed without a
+        coordinate, which nothing depends on, gets one, ``integral_u``.
 
         Args:
             method: with bodies and kinematic equations; its equations need not have been formed.
@@ -295,8 +287,7 @@ class LagrangianSystem(MechanicalSystem):
 
         Raises:
             SystemDefinitionError: if generalised speeds are not an invertible combination of the rates of the
-            coordinates,
-                bodies are missing, or a symbol has no value.
+                coordinates, bodies are missing, or a symbol has no value.
         """
         from scvi_codegen.mechanics.multibody.readers import of_kanes_method
 
@@ -315,8 +306,7 @@ class LagrangianSystem(MechanicalSystem):
         """Create the system from a ``System`` of ``sympy.physics.mechanics``: bodies, joints, loads, constraints.
 
         Like :meth:`from_kanes_method`, but with the potential energies of its bodies, unless its equations were formed
-        by
-        Kane's method, which does not use them.
+        by Kane's method, which does not use them.
 
         Args:
             system: its equations need not have been formed.

@@ -73,8 +73,7 @@ class MechanicalSystem(ABC):
         defaults: their default values, parallel to ``parameters``.
         clock: time transformation, if any.
         forces: m generalised forces in addition to the function (:mod:`scvi_codegen.mechanics.forms`), in (q, v, t) for
-        a
-            Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
+            a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
         damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
             (:mod:`scvi_codegen.mechanics.damping`).
         inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).

@@ -59,8 +59,7 @@ class SVI(Method):
 
     Raises:
         MethodError: for a degree below 1, for nodes without the end points or of another degree, and for nodes of
-        curves
-            that are not polynomials.
+            curves that are not polynomials.
 
     Warns:
         MethodWarning: with fewer quadrature points than the degree, for which the stage equations are singular.

@@ -55,8 +55,7 @@ class SCVI(Method):
             points: ``"gauss"``, ``"radau-iia"``, ``"lobatto-iiia"``, ``"chebyshev-gauss"`` or ``"chebyshev-lobatto"``.
             With symmetric ones the step is reversible; Gauss with s Gauss points is, for constant mass, the SVI.
         variational: ``True`` uses total derivatives of the discrete Lagrangian: symplectic and momentum-preserving,
-        order
-            min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which omits the
+            order min(2s, order of the quadrature). ``False`` is the paper's printed form (34a)-(34e), which omits the
             chain-rule term: for degree >= 2 it is neither symplectic nor momentum-preserving.
 
     Raises:
@@ -194,8 +193,7 @@ class SCVI(Method):
         """Return (34a)-(34e), with the multiplier terms unless they are zero (degree 1) or omitted (printed form).
 
         With abscissae, and for quadratures with derivatives, which the paper does not write out: the compiled equations
-        with
-        unknowns v0, h a_i and h^-2 lambda_i, with all digits.
+        with unknowns v0, h a_i and h^-2 lambda_i, with all digits.
         """
         if self.abscissae is not None or self.rule.derivative_weights:
             if self.degree == 1:

@@ -110,8 +110,7 @@ class Block:
         momentum: coefficient of p0 in that guess.
         moves: whether h^power times the block has the unit of a position; false for momenta and their multipliers.
         size: number of components; ``None``: m. Blocks of other sizes have the initial guess 0, and q1 does not depend
-        on
-            them.
+            on them.
     """
 
     name: str

@@ -39,8 +39,7 @@ class StoermerVerlet(Method):
 
     Args:
         sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: for separable systems only, with forces at the
-        middle
-            of steps.
+            middle of steps.
     """
 
     sequence: str = KICK_DRIFT_KICK

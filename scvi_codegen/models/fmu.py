@@ -60,10 +60,8 @@ def generate_fmu(
     """Write a model as an FMU 3.0 for co-simulation: a library for this machine, and the sources for others.
 
     Positions, velocities, momenta and the energy are outputs; parameters are tunable; inputs of the system are
-    continuous
-    inputs with zero-order hold between communication points. The step size is the model's if it divides the
-    communication
-    step, else the largest smaller one that does.
+    continuous inputs with zero-order hold between communication points. The step size is the model's if it divides the
+    communication step, else the largest smaller one that does.
 
     Args:
         model: system, method, initial state, and the step size.

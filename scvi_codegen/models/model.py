@@ -69,8 +69,7 @@ class Model:
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
-        and
-            exactly one of span and steps is given, each vector has m entries, and every number is finite and valid.
+            and exactly one of span and steps is given, each vector has m entries, and every number is finite and valid.
     """
 
     system: MechanicalSystem

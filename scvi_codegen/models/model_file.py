@@ -42,7 +42,7 @@
                                                         # or tolerance = 1e-9 for adaptive steps (without both:
                                                         # errors at round-off level); then negative spans go backward
     # controller = "reversible"                         # of a monitor: physical time, integrated step density
-    save_every = 1                                           # stride of saved states; default: 1
+    save_every = 1                                      # stride of saved states; default: 1
 
 A Hamiltonian is given in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
 the names ``p_q``; with constraints the model is that of its Lagrangian.

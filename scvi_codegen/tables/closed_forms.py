@@ -33,8 +33,7 @@ def exact_points(nodes: Nodes) -> Expressions | None:
 
     Closed forms: equispaced always; Chebyshev whenever SymPy knows the cosines as radicals (Lobatto degree 1 to 6, 8,
     10, 12, ...); Legendre-Lobatto up to degree 5; Legendre-Gauss up to degree 4; Radau up to degree 2. User-defined
-    nodes
-    have no closed form, whatever their name.
+    nodes have no closed form, whatever their name.
     """
     family = NODE_FAMILIES.get(nodes.name)
     if family is None or family(nodes.degree) != nodes:

@@ -130,8 +130,7 @@ class Trigonometric(CurveSpace):
     """Span of 1, cos(k f c), sin(k f c) for k = 1 .. K, and powers of c for the rest of the degree: s = 2 K + powers.
 
     An even degree with all its harmonics contains no powers: straight lines are then not in the space, and for a fixed
-    f
-    the method does not converge as h goes to 0. Let f shrink with the step, or use an odd degree or fewer harmonics.
+    f the method does not converge as h goes to 0. Let f shrink with the step, or use an odd degree or fewer harmonics.
 
     If f is the frequency of an oscillator times the step size, the method is exact for the oscillator at any step size,
     provided that the quadrature is; the default has enough Gauss points. Survey: Vanden Berghe et al., J. Comput. Appl.

@@ -85,8 +85,7 @@ class Tableau:
         """Order guaranteed by the simplifying conditions: min(B, C + D + 1, 2 C + 2).
 
         B(p), C(q), D(r) are Butcher's conditions and this is his theorem (HW, theorem IV.5.1). It is sharp for every
-        family
-        of this module; for other tableaux, especially explicit ones, it is a lower bound.
+        family of this module; for other tableaux, especially explicit ones, it is a lower bound.
         """
         B, C, D = simplifying_conditions(self)
         return min(B, C + D + 1, 2 * C + 2)
@@ -110,8 +109,7 @@ class Tableau:
         By the maximum principle this holds when, common factors cancelled, R = P / Q has its poles in the open right
         half plane (Routh's criterion) and |Q(iy)|^2 - |P(iy)|^2, a polynomial in y^2, is never negative (Sturm's
         theorem; HW, section IV.3). Coefficients below 1e-30 of their scale count as zero, so that |R(iy)| = 1 is
-        recognised,
-        where the polynomial is zero and sampled values would be round-off.
+        recognised, where the polynomial is zero and sampled values would be round-off.
         """
         P, Q = reduced(*self.stability_function())
         return has_roots_right(Q) and is_nonnegative(modulus_gap(Q, P))

@@ -119,8 +119,7 @@ class _Search:
         """Return null spaces of the chosen columns for ``count`` values of the parameters, of shape (d, columns) each.
 
         ``None`` where the system is undefined at too many points. Parameters have the signs of their default values and
-        are
-        of size 1, or are near the default values where the system is undefined there.
+        are of size 1, or are near the default values where the system is undefined there.
         """
         for near in (False, True):
             self.drawn = drawn_parameters(self.motion.constants, count, near=near)
