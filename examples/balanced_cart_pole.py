@@ -1,9 +1,8 @@
-"""A cart balances its pole: a controller looks at the state every 20 ms and holds a force until it looks again.
+"""Feedback control with zero-order hold: a linear-quadratic regulator balances a pole on a cart, sampled every 20 ms.
 
-The linear part of the motion about the upright pole is found from the compiled system itself by differences, SciPy's
-Riccati solver gives the gain, and the run goes on between samples with the force held: each stretch is what a single
-run would do, to the last bit, and no sample costs a compilation. Then the force that was applied, as data, drives the
-cart once more.
+The linearisation about the upright pole is computed by finite differences of the compiled steps, SciPy's Riccati solver
+returns the gain. The run continues between samples with a constant input, bit for bit as a single run would, and no
+sample compiles anything. Finally the forces that were applied are used as a tabulated input.
 """
 
 import numpy as np
@@ -24,7 +23,7 @@ stepper = compile_stepper(cart, SVI(4))
 
 
 def after_a_sample(state: np.ndarray, force: float) -> np.ndarray:
-    """(x, a, p_x, p_a) a sample later."""
+    """Return (x, a, p_x, p_a) one sampling interval later."""
     run = stepper.start(state[:2], state[2:], h=SAMPLE / STEPS)
     run.set_inputs(u=force)
     run.advance(STEPS)

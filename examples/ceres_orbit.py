@@ -1,9 +1,9 @@
-"""The orbit of Ceres, and the mass of Jupiter, from elements of Ceres that were published over sixteen years.
+"""Parameter estimation: orbit of Ceres and mass of Jupiter from orbital elements published over sixteen years.
 
-Eleven sets of osculating elements of (1) Ceres (ceres.csv), as the Minor Planet Center and JPL published them from 2006
-to 2022, say where it was. Its initial state and the mass of Jupiter are found by least squares, the orbits of Jupiter
-and Saturn being data. What remains, a few thousand kilometres, is due to what is left out: their elements are
-approximate, and there are inner planets and relativity.
+Eleven sets of osculating elements of (1) Ceres (ceres.csv), published by the Minor Planet Center and JPL from 2006 to
+2022, determine its positions. Its initial state and the mass of Jupiter are estimated by least squares; the orbits of
+Jupiter and Saturn are tabulated inputs. The residuals, a few thousand kilometres, are due to their approximate elements
+and to what is omitted: inner planets and relativity.
 """
 
 from pathlib import Path
@@ -24,11 +24,12 @@ PLANETS = {  # a (au), e, inclination, mean longitude, longitude of perihelion, 
     "s": (9.53667594, 0.05386179, 2.48599187, 49.95424423, 92.59887831, 113.66242448),
     "s_rates": (-0.00125060, -0.00050991, 0.00193609, 1222.49362201, -0.41897216, -0.28867794),
 }
-"""E. M. Standish, Keplerian elements for approximate positions of the major planets, 1800 to 2050; rates a century."""
+"""E. M. Standish, Keplerian elements for approximate positions of the major planets, 1800 to 2050; rates per
+century."""
 
 
 def places(a, e, inclination, node, perihelion, anomaly):
-    """(n, 3) heliocentric positions from elements, angles in degrees."""
+    """Return (n, 3) heliocentric positions from elements, angles in degrees."""
     inclination, node, perihelion, mean = np.radians([inclination, node, perihelion, anomaly])
     eccentric = mean + e * np.sin(mean)
     for _ in range(8):
@@ -47,7 +48,7 @@ def places(a, e, inclination, node, perihelion, anomaly):
 
 
 def planet(name, days):
-    """(n, 3) positions of a planet."""
+    """Return (n, 3) positions of a planet."""
     a, e, i, longitude, perihelion, node = (
         value + rate * days / 36525 for value, rate in zip(PLANETS[name], PLANETS[f"{name}_rates"], strict=True)
     )

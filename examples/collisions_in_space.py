@@ -1,11 +1,12 @@
-"""Kustaanheimo and Stiefel's coordinates: a comet in space that all but hits the sun, as four harmonic oscillators.
+"""Kustaanheimo-Stiefel regularisation: a comet in space that almost hits the sun, as four harmonic oscillators.
 
-A point of space is x = K(u) for a circle of points u of R^4, with |x| = |u|^2. Of the motion in u,
+A point of space is x = K(u) for a circle of points u of R^4, with |x| = |u|^2. The Lagrangian in u is
 
     L = 2 |u|^2 |u'|^2 + 1 / |u|^2,      dt = |u|^2 ds,
 
-which is regular in s where |x| = 0, the turn along these circles conserves a fourth momentum; where that is 0, K(u) is
-the comet. Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971), chapters 9 and 11.
+whose solutions are regular in s at |x| = 0. Rotation along these circles is a symmetry with a fourth momentum; if that
+is 0, K(u) is the orbit of the comet. Source: Stiefel & Scheifele, Linear and Regular Celestial Mechanics (1971),
+chapters 9 and 11.
 """
 
 import math
@@ -27,13 +28,13 @@ oscillators = sc.reparametrise(
 
 
 def matrix(u: np.ndarray) -> np.ndarray:
-    """A(u), of which the first three rows give K(u) = A(u) u and K' = 2 A(u) u'."""
+    """Return A(u), whose first three rows give K(u) = A(u) u and K' = 2 A(u) u'."""
     a, b, c, d = u
     return np.array([[a, -b, -c, d], [b, a, -d, -c], [c, d, a, b], [d, -c, b, -a]])
 
 
 def lifted(x: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One u with K(u) = x, and the momenta p = 4 |u|^2 u' there, whose part along the circle is 0."""
+    """Return one u with K(u) = x, and the momenta p = 4 |u|^2 u', whose component along the circle is 0."""
     r = np.linalg.norm(x)
     u1 = math.sqrt((r + x[0]) / 2)
     u = np.array([u1, x[1] / (2 * u1), x[2] / (2 * u1), 0.0])

@@ -1,4 +1,4 @@
-"""Where other curves than polynomials, and other quadratures than Gauss's, win (paper, 4.2.3)."""
+"""Trial curves other than polynomials, and quadratures other than Gauss's, for which they are better (paper, 4.2.3)."""
 
 import math
 import warnings
@@ -7,11 +7,11 @@ import numpy as np
 
 import scvi_codegen as sc
 
-warnings.simplefilter("ignore", sc.AccuracyWarning)  # the steps are long on purpose
+warnings.simplefilter("ignore", sc.AccuracyWarning)  # the steps are large on purpose
 
 
 def compare(what, system, start, *, h, steps, methods):
-    """Errors of the final position against SVI(10) with a sixteenth of the step."""
+    """Print errors of the final position relative to SVI(10) with a sixteenth of the step size."""
     reference = sc.compile_stepper(system, sc.SVI(10)).integrate(*start, h=h / 16, steps=16 * steps).q[-1]
     print(what)
     for label, method in methods.items():

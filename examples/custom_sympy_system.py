@@ -1,4 +1,4 @@
-"""Systems made with sympy.physics.mechanics: a Lagrangian in dynamicsymbols, and a LagrangesMethod."""
+"""Systems from sympy.physics.mechanics: a Lagrangian in dynamicsymbols, and a LagrangesMethod."""
 
 import sympy
 from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols

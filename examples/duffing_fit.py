@@ -1,8 +1,8 @@
-"""Parameters of a driven, damped Duffing oscillator from a noisy recording of its motion.
+"""Parameter estimation for a driven, damped Duffing oscillator from a noisy time series.
 
-The recording is made by SciPy's DOP853, at uneven times, with gaps, and with noise of 2 per cent. The steps of an SVI,
-whose derivatives are exact, find stiffness, nonlinearity, damping and the initial state; the errors that the fit claims
-are held against those it made.
+The data are computed by SciPy's DOP853, at irregular times, with gaps, and with noise of 2 per cent. A least-squares
+fit with the exact derivatives of an SVI estimates stiffness, nonlinearity, damping and the initial state; its standard
+errors are compared with the actual errors.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ NOISE = 0.02
 
 
 def rates(t, y):
-    """Of x'' = -delta x' - alpha x - beta x^3 + gamma cos(omega t)."""
+    """Return the rates of x'' = -delta x' - alpha x - beta x^3 + gamma cos(omega t)."""
     x, v = y
     force = TRUE["gamma"] * np.cos(TRUE["omega"] * t) - TRUE["delta"] * v
     return [v, force - TRUE["alpha"] * x - TRUE["beta"] * x**3]
@@ -26,7 +26,7 @@ random = np.random.default_rng(3)
 times = np.sort(random.uniform(0.0, 40.0, 400))
 exact = solve_ivp(rates, (0.0, 40.0), START, method="DOP853", t_eval=times, rtol=1e-12, atol=1e-12).y[0]
 recorded = exact + NOISE * random.normal(size=len(times))
-recorded[random.random(len(times)) < 0.1] = np.nan  # not recorded
+recorded[random.random(len(times)) < 0.1] = np.nan  # gaps in the recording
 
 duffing = sc.LagrangianSystem.from_text(
     name="Duffing oscillator",

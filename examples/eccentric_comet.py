@@ -1,7 +1,7 @@
-"""A comet on an ellipse of eccentricity 0.999: equal steps of a time tau, dt = g dtau, that are variable steps of t.
+"""Time transformation dt = g dtau for a comet of eccentricity 0.999: fixed steps of tau, variable steps of t.
 
-Both ways are symplectic. With the rate g = r^(3/2) steps are the shorter the nearer the sun; with g = r and the
-coordinates of Levi-Civita, x + i y = (u + i w)^2, the comet is a harmonic oscillator, which no collision disturbs.
+Both variants are symplectic. With g = r^(3/2) steps are smaller near the sun; with g = r and Levi-Civita coordinates,
+x + i y = (u + i w)^2, the comet is a harmonic oscillator, regular at collisions.
 """
 
 import math

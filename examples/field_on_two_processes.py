@@ -1,9 +1,9 @@
-"""A field cut in two: each process has its places, and asks the other for their neighbours and for one sum a sweep.
+"""Domain decomposition of a field on two processes: halo exchange and one reduction per fixed-point iteration.
 
-What a decomposition over MPI would do (docs/decomposition.md), by shared memory of two processes: points of a step of
-Gauss' method with four stages, by sweeps over positions. Both processes have the bits of one, whose states are those of
-the compiled integrator; the time of a sweep is held against the model  c n / P + halo + reduction, which is one of
-processes with a core each: each is a session of its own, for Linux may give those of one session what it gives one.
+It models a decomposition over MPI (docs/decomposition.md) with the shared memory of two processes: a Gauss method with
+four stages and fixed-point iteration on the positions. Two processes compute the same bits as one, whose states are
+those of the compiled integrator. The time of an iteration is compared with the model  c n / P + halo + reduction  for
+processes with a core each. Each process has a session of its own, since Linux may schedule by session.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ import scvi_codegen as sc
 
 STAGES, MOST, H, STEPS = 4, 50, 0.1, 5
 EDGES, BLOCKS = 2, 16
-"""Of a part; and in how many blocks changes are summed up, so that any number of processes gets the same bits."""
+"""Edges of a part; number of blocks in which changes are summed, so that the result does not depend on the number of
+processes."""
 
 
 def tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, b, c of Gauss' method: integrals of Lagrange's polynomials."""
+    """Return A, b, c of the Gauss method: integrals of Lagrange's polynomials."""
     x, w = np.polynomial.legendre.leggauss(STAGES)
     c, powers = (x + 1) / 2, np.arange(STAGES)
     a = (c[:, None] ** (powers + 1) / (powers + 1)) @ np.linalg.inv(c[:, None] ** powers)
@@ -40,13 +41,13 @@ def forces(x: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 @dataclass
 class Part:
-    """The places of a process, and the memory that all have in common.
+    """Sites of a process, and the memory shared by all.
 
     Attributes:
-        rank, count: which process of how many.
-        edges: (2, processes, 2, stages) points at the ends of all parts, in turn.
-        sums: (2, blocks) of the squares of changes, in turn.
-        arrived: (processes,) how often each was at a meeting.
+        rank, count: index of the process, and number of processes.
+        edges: (2, processes, 2, stages) values at the ends of all parts, double-buffered.
+        sums: (2, blocks) sums of the squares of changes, double-buffered.
+        arrived: (processes,) barrier counters.
     """
 
     rank: int
@@ -56,20 +57,20 @@ class Part:
     arrived: np.ndarray
 
     def meet(self) -> None:
-        """Waits for all others."""
+        """Wait at a barrier for all processes."""
         self.arrived[self.rank] += 1
         while (self.arrived < self.arrived[self.rank]).any():
             os.sched_yield()
 
     def neighbours(self, x: np.ndarray, turn: int) -> tuple[np.ndarray, np.ndarray]:
-        """The halo: a message of so many stages to either side, one from either side."""
+        """Exchange the halo: send the stages at both ends, return those of both neighbours."""
         self.edges[turn, self.rank] = x[:, 0], x[:, -1]
         self.meet()
         left, right = (self.rank - 1) % self.count, (self.rank + 1) % self.count
         return self.edges[turn, left, 1][:, None], self.edges[turn, right, 0][:, None]
 
     def total(self, moved: np.ndarray, turn: int) -> float:
-        """The reduction: the sum of squares over all places, the same everywhere."""
+        """Return the sum of squares over all sites (reduction), the same in all processes."""
         own = BLOCKS // self.count
         for k, block in enumerate(np.split(moved, own, axis=1)):
             self.sums[turn, self.rank * own + k] = np.sum(block * block)
@@ -78,7 +79,7 @@ class Part:
 
 
 def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
-    """The positions after all steps, and the number of sweeps."""
+    """Return the positions after all steps, and the number of iterations."""
     (a, b, c), sweeps, turn = tables(), 0, 0
     for _ in range(STEPS):
         straight = q + H * c[:, None] * v
@@ -97,7 +98,7 @@ def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.ndarray) -> None:
-    """What a process does."""
+    """Run a process."""
     os.setsid()
     places = slice(part.rank * len(q) // part.count, (part.rank + 1) * len(q) // part.count)
     part.meet()
@@ -108,7 +109,7 @@ def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.
 
 
 def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Positions after all steps on so many processes, seconds a sweep, and the part of these without a core."""
+    """Return positions after all steps on ``count`` processes, seconds per iteration, and the share without a core."""
     sizes = {"edges": (2, count, EDGES, STAGES), "sums": (2, BLOCKS), "end": q.shape, "numbers": (count, 3)}
     shared = {name: SharedMemory(create=True, size=8 * int(np.prod(shape))) for name, shape in sizes.items()}
     meetings = SharedMemory(create=True, size=8 * count)
@@ -133,14 +134,14 @@ def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, 
 
 
 def best(count: int, size: int) -> tuple[np.ndarray, float, float]:
-    """The end, the least of three times of a sweep, and which part of it a process had no core."""
+    """Return the final state, the smallest of three times of an iteration, and the share of it without a core."""
     phase = 2 * np.pi * np.arange(size) / size
     found = [on_processes(count, np.sin(phase), np.cos(3 * phase)) for _ in range(3)]
     return found[0][0], *min(times for _, *times in found)
 
 
 def main() -> None:
-    """Bits, states, and times beside those of the model."""
+    """Compare bits, states, and times with those of the model."""
     ring = sc.IndexedSystem.from_text(
         name="ring",
         coordinates=["q[N]"],

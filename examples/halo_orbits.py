@@ -1,8 +1,9 @@
-"""Halo orbits of the Earth and the Moon about L2, a family followed towards the Moon by pseudo-arclength.
+"""Halo orbits of the Earth-Moon system about L2: a family continued towards the Moon by pseudo-arclength.
 
-The restricted three-body problem in its rotating frame. Each orbit is predicted along the line through two before it,
-and closed by `periodic_orbit`, whose steps are at right angles to the family, so that this may turn; the way to the
-next is longer where that was easy. Four orbits are held against the catalogue of the Jet Propulsion Laboratory.
+The restricted three-body problem in its rotating frame. Each orbit is predicted by extrapolation from two previous ones
+and corrected by `periodic_orbit` at right angles to the family, so that turning points are passed; the step along the
+family grows while the correction is small. Four orbits are compared with the catalogue of the Jet Propulsion
+Laboratory.
 """
 
 import matplotlib

@@ -1,7 +1,7 @@
-"""A chain of 100 rods between two hooks, in Cartesian coordinates: constraints, multipliers, a band of unknowns.
+"""Holonomic constraints: a chain of 100 rods between two hooks, in Cartesian coordinates, and its Lagrange multipliers.
 
-Let go from the shape of a V, with friction, it comes to rest as a catenary of rods. There the
-horizontal part of the tension is the same in every rod, which is what the multipliers of the constraints must say.
+Released from a V with friction, it comes to rest as a catenary of rods. There the horizontal part of the tension, which
+the multipliers determine, is the same in every rod.
 """
 
 from time import perf_counter
@@ -15,7 +15,7 @@ BEADS = range(1, RODS)
 
 
 def chain() -> LagrangianSystem:
-    """Beads of mass m between rods of one length, the ends at (0, 0) and (WIDTH, 0)."""
+    """Return beads of mass m between rods of equal length, with ends at (0, 0) and (WIDTH, 0)."""
     place = {0: ("0", "0"), RODS: ("w", "0")} | {k: (f"x{k}", f"y{k}") for k in BEADS}
     rods = [
         f"({place[k + 1][0]} - {place[k][0]})**2 + ({place[k + 1][1]} - {place[k][1]})**2 = l**2" for k in range(RODS)

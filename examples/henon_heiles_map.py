@@ -1,7 +1,8 @@
-"""Regular and chaotic motions of Henon and Heiles at the energy 1/8: MEGNO of a grid of initial states with x = 0.
+"""Chaos indicators: MEGNO of the Henon-Heiles system at energy 1/8, on a grid of initial states with x = 0.
 
-Each is carried along for 500 units of time with one small change: 2 or less is regular. With a number, as in
-`python henon_heiles_map.py 400`, so many of y and half as many of p_y are taken; 100 by default.
+Each trajectory has one tangent vector and is integrated for 500 units of time; a value of 2 or less is regular. With an
+argument, as in `python henon_heiles_map.py 400`, the grid has that number of y and half as many p_y; the default is
+100.
 """
 
 import sys

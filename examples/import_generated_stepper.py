@@ -1,4 +1,4 @@
-"""Generate a folder of C and Python once, then use it without SymPy."""
+"""Code generation: write a folder of C and Python once, then use it without SymPy."""
 
 import subprocess
 import sys

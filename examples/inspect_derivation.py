@@ -1,4 +1,4 @@
-"""The equations of a step, exactly as they are derived: text, LaTeX, and the table entries in radicals."""
+"""Derivation of the equations of a step: text, LaTeX, and table entries in radicals."""
 
 import scvi_codegen as sc
 

@@ -1,7 +1,7 @@
-"""Joints as equations between coordinates: rods, angles, slides, welds, belts, and a bridge made of rods.
+"""Constraints (DAEs): rods, angles, slides, welds, belts, and a truss, as equations between coordinates.
 
-Whatever holds bodies together is a formula in the list ``constraints``; how many there are does not matter, and what
-moves need not be worked out before. Multipliers are the forces of the joints: of g they push by multiplier * dg/dq.
+Each joint is a formula in the list ``constraints``; their number is arbitrary, and degrees of freedom need not be
+identified. The constraint force of g = 0 with respect to q is multiplier * dg/dq.
 """
 
 from typing import NamedTuple
@@ -11,66 +11,66 @@ import numpy as np
 from scvi_codegen import LagrangianSystem, Trajectory, compile_stepper
 
 Point = tuple[str, str]
-"""The names, or formulas, of x and y."""
+"""Names, or formulas, of x and y."""
 HOOK: Point = ("0", "0")
 GRAVITY = 9.81
 
 
 class Mechanism(NamedTuple):
-    """A system with constraints, and where a motion of it begins."""
+    """System with constraints, and its initial state."""
 
     system: LagrangianSystem
     q: list[float]
     velocity: list[float]
 
     def run(self, span: float, steps: int, method: str = "svi:4") -> Trajectory:
-        """Its motion."""
+        """Integrate the system over a span."""
         return compile_stepper(self.system, method).integrate(
             self.q, velocity=self.velocity, h=span / steps, steps=steps
         )
 
 
 def point(k: int) -> Point:
-    """The coordinates of a mass."""
+    """Return the coordinates of a mass."""
     return f"x{k}", f"y{k}"
 
 
 def falling(masses: dict[int, str]) -> str:
-    """T - V of point masses under gravity."""
+    """Return T - V of point masses under gravity."""
     return " + ".join(f"{m}*(x{k}_dot**2 + y{k}_dot**2)/2 - {m}*g*y{k}" for k, m in masses.items())
 
 
 def rod(a: Point, b: Point, length: str) -> str:
-    """Two points keep their distance. The pull is -2 * length * multiplier."""
+    """Return a constraint of constant distance; the tension is -2 * length * multiplier."""
     return f"({b[0]} - {a[0]})**2 + ({b[1]} - {a[1]})**2 = ({length})**2"
 
 
 def angle(a: Point, b: Point, c: Point, cosine: str) -> str:
-    """Two rods keep the angle at b in which they meet; ``cosine``: of it, times both lengths.
+    """Return a constraint of constant angle at b; ``cosine`` is its cosine times both lengths.
 
-    Not for angles of 0 and pi, where the formula has no slope: there, weld or leave out the point in the middle.
+    It is singular for angles of 0 and pi, where its gradient is 0: use a weld, or remove the middle point.
     """
     return f"({a[0]} - {b[0]})*({c[0]} - {b[0]}) + ({a[1]} - {b[1]})*({c[1]} - {b[1]}) = {cosine}"
 
 
 def slide(a: Point, slope: str) -> str:
-    """A point stays on a line through the origin."""
+    """Return a constraint of a point to a line through the origin."""
     return f"{a[0]}*sin({slope}) = {a[1]}*cos({slope})"
 
 
 def weld(one: tuple[str, str, str], other: tuple[str, str, str], along: str, turned: str) -> list[str]:
-    """Two bodies (x, y, angle) move as one, the other at a distance along the axis of the first."""
+    """Return constraints that join two bodies (x, y, angle) rigidly, at a distance along the axis of the first."""
     (x, y, a), (x2, y2, a2) = one, other
     return [f"{x2} = {x} + {along}*cos({a})", f"{y2} = {y} + {along}*sin({a})", f"{a2} = {a} + {turned}"]
 
 
 def belt(radius: str, a: str, other_radius: str, other: str) -> str:
-    """Two wheels turn with one speed of their rims; gears that mesh turn against each other, with a minus."""
+    """Return a constraint of equal rim speeds of two wheels; for meshing gears use a minus sign."""
     return f"{radius}*{a} = {other_radius}*{other}"
 
 
 def dumbbell() -> Mechanism:
-    """Two masses on a rod, thrown and turning."""
+    """Return two masses on a rod, thrown and rotating."""
     system = LagrangianSystem.from_text(
         name="dumbbell",
         coordinates=[*point(1), *point(2)],
@@ -82,7 +82,7 @@ def dumbbell() -> Mechanism:
 
 
 def bent_pendulum() -> Mechanism:
-    """Two rods that meet in a right angle, hanging by one end."""
+    """Return two rods at a right angle, hanging from one end."""
     system = LagrangianSystem.from_text(
         name="bent pendulum",
         coordinates=[*point(1), *point(2)],
@@ -98,7 +98,7 @@ def bent_pendulum() -> Mechanism:
 
 
 def pendulum_on_a_slide() -> Mechanism:
-    """A mass that slides down a slope, and another that hangs on it."""
+    """Return a mass that slides down a slope, with another hanging from it."""
     system = LagrangianSystem.from_text(
         name="pendulum on a slide",
         coordinates=[*point(1), *point(2)],
@@ -110,7 +110,7 @@ def pendulum_on_a_slide() -> Mechanism:
 
 
 def welded_plates() -> Mechanism:
-    """Two plates welded at a distance, thrown: they tumble as one body."""
+    """Return two plates welded at a distance, thrown."""
     bodies = [(f"x{k}", f"y{k}", f"a{k}") for k in (1, 2)]
     turning = " + ".join(f"J{k}*a{k}_dot**2/2" for k in (1, 2))
     system = LagrangianSystem.from_text(
@@ -124,7 +124,7 @@ def welded_plates() -> Mechanism:
 
 
 def winch() -> Mechanism:
-    """A motor turns a wheel, a belt turns another with a drum, and the rope on it lifts a load."""
+    """Return a motor whose wheel drives a drum by a belt; its rope lifts a load."""
     system = LagrangianSystem.from_text(
         name="winch",
         coordinates=["a1", "a2", "y"],
@@ -152,13 +152,13 @@ MEMBERS = [
     *((k, top) for k, top in zip(BOTTOM, TOP, strict=False)),
     *((top, k + 1) for k, top in zip(BOTTOM, TOP, strict=False)),
 ]
-"""Of Warren's truss: bottom chord, top chord, diagonals that rise and that fall."""
+"""Warren truss: bottom chord, top chord, rising and falling diagonals."""
 PLACES = np.array([*((k, 0.0) for k in BOTTOM), *((k + 0.5, HEIGHT) for k in range(PANELS))], dtype=float)
 LOADS = dict.fromkeys((*BOTTOM, *TOP), "m") | {1: "(m + load)"}
 
 
 def bridge(swing: float = 0.0) -> Mechanism:
-    """A truss of 15 rods with a load on it, hanging from two rods of one length, which have swung by an angle."""
+    """Return a loaded truss of 15 rods, hanging from two equal rods at an angle."""
     hangers = [rod((f"{k}", f"{HANGER}"), point(k), f"{HANGER}") for k in (BOTTOM[0], BOTTOM[-1])]
     system = LagrangianSystem.from_text(
         name="hanging bridge",
@@ -172,17 +172,17 @@ def bridge(swing: float = 0.0) -> Mechanism:
 
 
 def length(a: int, b: int) -> float:
-    """Of a member of the bridge."""
+    """Return the length of a member of the truss."""
     return float(np.hypot(*(PLACES[b] - PLACES[a])))
 
 
 def pulls(run: Trajectory) -> np.ndarray:
-    """(n, 17) by which the members of the bridge, then its hangers, pull; negative where they push."""
+    """Return (n, 17) tensions of the members and hangers of the truss; negative for compression."""
     return -2.0 * run.multipliers() * [*(length(a, b) for a, b in MEMBERS), HANGER, HANGER]
 
 
 def main() -> None:
-    """All of them, with a force that their joints must carry."""
+    """Run all mechanisms; print constraint errors and forces."""
     thrown = dumbbell().run(2.0, 100)
     print(f"dumbbell: pull {-2 * 0.8 * thrown.multipliers()[-1, 0]:.9f}, by its turning {0.75 * 2.5**2 * 0.8:.9f}")
     lifted = winch().run(2.0, 50)

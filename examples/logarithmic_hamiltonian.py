@@ -1,9 +1,9 @@
-"""Leapfrog that keeps Kepler's ellipse exactly, however eccentric: H = log(T + b) - log(1/r), explicit and symplectic.
+"""Leapfrog with the logarithmic Hamiltonian H = log(T + b) - log(1/r): Kepler's ellipse exactly, at any eccentricity.
 
-With the binding energy b as the momentum of time s, (T + b) r = 1 along the motion, and time runs at 1/(T + b). Drifts
-and kicks are those of Kepler's problem, of other lengths; the orbit of drift, kick and drift is the ellipse itself, and
-all error is in the time along it. Sources: S. Mikkola, K. Tanikawa, Celest. Mech. 74 (1999); M. Preto, S. Tremaine,
-Astron. J. 118 (1999).
+With the binding energy b as the momentum of time, (T + b) r = 1 along the trajectory, and dt = ds/(T + b). Drifts and
+kicks are those of Kepler's problem with other step sizes; the orbit of drift, kick and drift is the exact ellipse, and
+the whole error is in the time along it. The method is explicit and symplectic. Sources: S. Mikkola, K. Tanikawa,
+Celest. Mech. 74 (1999); M. Preto, S. Tremaine, Astron. J. 118 (1999).
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A crane from SymPy's joints: its Lagrangian, its motion beside SymPy's own equations, and where its energy goes."""
+"""A crane from SymPy's joints: its Lagrangian, comparison with SymPy's own equations, and its energy balance."""
 
 import numpy as np
 import sympy

@@ -1,7 +1,7 @@
-"""Poincare sections of the Henon-Heiles system: regular at a low energy, mostly chaotic near the energy of escape.
+"""Poincare sections of the Henon-Heiles system: regular at a low energy, mostly chaotic near the escape energy.
 
-Orbits of one energy are cut where they pass x = 0 to the right. Each crossing is found within its step, as accurately
-as the method integrates: the energy at the crossings is that of the start.
+Orbits of one energy are cut at x = 0, x increasing. Each crossing is located within its step to the order of the
+method: the energy at the crossings is that of the start.
 """
 
 import numpy as np

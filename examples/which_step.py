@@ -1,8 +1,8 @@
-"""One orbit of eccentricity 0.9, by every way to choose steps: what each costs, and what each keeps.
+"""Comparison of step-size selections on an orbit of eccentricity 0.9: cost, and conservation.
 
-Fixed steps, steps that choose their length (controlled), fixed steps of a transformed time, and steps of the reversible
-controller, each over so many periods, as one number on the command line says (default 1000). The orbit closes, so that
-the distance from the start after whole periods is the error.
+Fixed steps, adaptive steps, fixed steps of a time transformation, and steps of the reversible controller, each over a
+number of periods (argument on the command line, default 1000). The exact orbit is periodic, so that the distance from
+the start after whole periods is the error.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ ways = {
 }
 print(f"{'steps':28} {'a period':>8} {'us a period':>11} {'|dE/E|':>9} {'at the end':>10} {'|dq|':>9}")
 for name, run in ways.items():
-    run(2.0 * np.pi)  # compiles what is compiled late
+    run(2.0 * np.pi)  # compiles before timing
     began = time.perf_counter()
     found = run(end)
     seconds = time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""Direct collocation at Gauss's points, the usual way, in CasADi: what discrete mechanics is held against.
+"""Direct collocation at Gauss points in CasADi, the standard method, for comparison with discrete mechanics.
 
 The equations of motion are solved for the accelerations by SymPy, from L and the forces; neither they nor the
 collocation share code with the compiler.
@@ -13,7 +13,7 @@ QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
 class Motion:
-    """Accelerations as functions of (q, v, inputs), and the formulas of a task, in any library's symbols."""
+    """Accelerations as functions of (q, v, inputs), and formulas of a problem, in any library's symbols."""
 
     def __init__(self, system):
         q, v = list(system.coordinates), list(system.velocities)
@@ -30,13 +30,13 @@ class Motion:
         self.seen = {each.name: each for each in (*q, *v)} | dict(zip(system.inputs, held, strict=True))
 
     def called(self, library, texts=()):
-        """A function of lists q, v and inputs: the accelerations, then the values of texts."""
+        """Return a function of lists q, v and inputs: the accelerations, then the values of formulas."""
         formulas = [*self.accelerations, *(sp.sympify(text, self.seen) for text in texts)]
         return sp.lambdify(self.states, formulas, library, cse=True)
 
 
 def gauss_tableau(stages):
-    """A, b and c of the Gauss method."""
+    """Return A, b and c of the Gauss method."""
     c = (np.polynomial.legendre.leggauss(stages)[0] + 1) / 2
     powers = np.arange(1, stages + 1)
     inverse = np.linalg.inv(np.vander(c, increasing=True))
@@ -44,7 +44,7 @@ def gauss_tableau(stages):
 
 
 def collocated_step(motion, stages, degree, texts):
-    """(x, slopes, inputs, h) to the next x, what must vanish, and texts at the points with their integrals."""
+    """Return a function from (x, derivatives, inputs, h) to the next x, residuals, and formulas with integrals."""
     m, (A, b, c) = motion.system.dimension, gauss_tableau(stages)
     called = motion.called(ca, texts)
     x0, slopes, h = ca.SX.sym("x", 2 * m), ca.SX.sym("k", 2 * m, stages), ca.SX.sym("h")
@@ -62,7 +62,7 @@ def collocated_step(motion, stages, degree, texts):
 
 
 def collocated(system, stages, *, steps, duration, start, end, cost, guess, bounds=None, degree=0):
-    """A task as :func:`scvi_codegen.optimal_control` takes it, without the rarer options; a dictionary."""
+    """Solve a problem with the main arguments of :func:`scvi_codegen.optimal_control`; return a dictionary."""
     motion, bounds, m, k = Motion(system), bounds or {}, system.dimension, len(system.inputs)
     between = [text for text in bounds if text not in system.inputs]
     step = collocated_step(motion, stages, degree, [cost, *between])
@@ -103,12 +103,12 @@ def collocated(system, stages, *, steps, duration, start, end, cost, guess, boun
 
 
 def limits(pair):
-    """Least and largest, without ``None``."""
+    """Return least and largest value, without ``None``."""
     return (-np.inf if pair[0] is None else pair[0], np.inf if pair[1] is None else pair[1])
 
 
 def first_guess(system, stages, steps, guess, duration):
-    """States and slopes of the motion guessed, flat."""
+    """Return states and derivatives of the guess, flat."""
     fractions = np.linspace(0, 1, steps + 1)
     given = [np.atleast_1d(guess[q.name]) for q in system.coordinates]
     q = np.array([np.interp(fractions, np.linspace(0, 1, len(own)), own) for own in given])

@@ -1,4 +1,4 @@
-"""Discrete mechanics and collocation of the same order on one task: sizes, iterations, and where both truly lead."""
+"""Discrete mechanics and collocation of the same order on one problem: sizes, iterations, and true final states."""
 
 import time
 import warnings
@@ -14,10 +14,10 @@ HEADING = f"{'':19} steps  unknowns  iterations     ms  {'cost':12}  end off by"
 
 
 def truly(system, x, t, inputs):
-    """(2m,) positions and velocities to which inputs lead from x: by SciPy's DOP853, from breakpoint to breakpoint."""
+    """Return (2m,) final positions and velocities for given inputs by SciPy's DOP853, from breakpoint to breakpoint."""
     m, called = system.dimension, Motion(system).called("numpy")
     for begin, end in pairwise(t):
-        edge = 1e-12 * (end - begin)  # an input may jump at the ends of a piece
+        edge = 1e-12 * (end - begin)  # an input may jump at breakpoints
 
         def slopes(now, x, first=begin + edge, last=end - edge):
             pushes = [float(inputs[name](min(max(now, first), last))) for name in system.inputs]
@@ -28,7 +28,7 @@ def truly(system, x, t, inputs):
 
 
 def timed(function, *given, **named):
-    """What it gives, and the least milliseconds of processor time of three calls."""
+    """Return the result of a function, and the smallest processor time of three calls in milliseconds."""
     lasted = []
     for _ in range(3):
         begun = time.process_time()
@@ -38,12 +38,14 @@ def timed(function, *given, **named):
 
 
 def compared(system, points, task, momentum=None):
-    """A line for each way; where there is a momentum (q, v) that should stay 0, what is left of it. Gives ours."""
+    """Print a line for each method, with the error of a momentum (q, v) that should be 0; return ours."""
     method = f"svi:{points}"
     motion, lasted = timed(sc.optimal_control, system, method, **task)
     theirs, waited = timed(collocated, system, points, **task)
     stepper = sc.compile_stepper(system, method)
-    with warnings.catch_warnings(action="ignore", category=sc.AccuracyWarning):  # on coarse grids: the table tells
+    with warnings.catch_warnings(
+        action="ignore", category=sc.AccuracyWarning
+    ):  # the table shows the errors of coarse grids
         again = stepper.drive(motion.q[0], motion.p[0], inputs=motion.inputs, h=motion.h, t_end=motion.t[-1])
     x = np.concatenate([motion.q, stepper.velocity(motion.q, motion.p)], axis=1)
     ours = {"t": motion.t, "x": x, "inputs": motion.inputs, "cost": motion.cost, "solved": True}

@@ -1,6 +1,6 @@
-"""From a circular orbit to one of twice the radius in the shortest time, by a thrust of a hundredth of gravity there.
+"""Optimal control: minimum-time transfer from a circular orbit to twice the radius, with a thrust of 0.01 of gravity.
 
-For so small a thrust Edelbaum's formula says about how long it takes: the difference of the circular velocities by the
+For such low thrust Edelbaum's formula approximates the time: the difference of the circular velocities divided by the
 acceleration.
 """
 

@@ -1,6 +1,6 @@
-"""A satellite of three hinged panels turns by a quarter with its joints alone: its angular momentum is 0, and stays it.
+"""Optimal control: a satellite of three hinged panels rotates by a quarter turn with zero angular momentum.
 
-Three equal rods in the plane; what two torques in the joints cost is least. The falling cat does the same.
+Three equal rods in the plane; the cost of two joint torques is minimised. The falling cat works on the same principle.
 """
 
 import sys
@@ -16,7 +16,7 @@ angles, rates = sp.symbols("theta alpha beta"), sp.symbols("theta_dot alpha_dot 
 
 
 def turning(middle, left, right):
-    """Of the left, the middle and the right rod; joints count from the middle one."""
+    """Return the angles of the left, middle and right rod; joint angles are relative to the middle one."""
     return [middle + left, middle, middle + right]
 
 

@@ -1,4 +1,4 @@
-"""A cart swings its pole up in two seconds with the least effort, on a short track and with a weak motor."""
+"""Optimal control: swing-up of a pole on a cart in two seconds with least effort, short track and weak motor."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Fifteen asteroids: elements of the Small-Body Database of JPL, and the masses of DE421, which has 343 of them."""
+"""Fifteen asteroids: elements of the Small-Body Database of JPL, and masses from DE421, which has 343 of them."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def masses(names: Sequence[str]) -> dict[str, float]:
 
 
 def lagrangian(names: Sequence[str]) -> str:
-    """Newton's, with the attraction of the bodies of the ephemeris, but not of each other."""
+    """Return Newton's Lagrangian, with the attraction of the bodies of the ephemeris, but not of each other."""
     pairs = (attraction(a, b) for a, b in product(names, ephemeris.BODIES))
     return total([*(f"gm_{a}*{square(a)}/2" for a in names), *pairs])
 
 
 def heliocentric(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Position (au) and velocity (au/day) at :data:`EPOCH`, in the frame of the ephemeris."""
+    """Return position (au) and velocity (au/day) at :data:`EPOCH`, in the frame of the ephemeris."""
     _, a, e, *angles = ELEMENTS[name]
     inclination, argument, node, mean = np.radians(angles)
     E = newton(lambda E: E - e * np.sin(E) - mean, mean)
@@ -54,7 +54,7 @@ def heliocentric(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turned(axis: int, angle: float) -> np.ndarray:
-    """The matrix that turns vectors about a coordinate axis."""
+    """Return the matrix that rotates vectors about a coordinate axis."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
     matrix[[i, j], [i, j]] = np.cos(angle)

@@ -1,7 +1,7 @@
-"""The same bodies from the same states by REBOUND and here: distances from DE421, and the time of each.
+"""Comparison with REBOUND: the same bodies from the same states, distances from DE421, and computing times.
 
 REBOUND 5 with IAS15, alone for Newton and with `gr_full` of REBOUNDx for Einstein, Infeld and Hoffmann, if that is
-installed (`pip install rebound reboundx`). Forth from 1969 to 2053; the best of so many runs, in processor time.
+installed (`pip install rebound reboundx`). From 1969 to 2053; best of several runs, in processor time.
 """
 
 from __future__ import annotations

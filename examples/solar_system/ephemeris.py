@@ -20,7 +20,7 @@ tables = Ephemeris(de421)
 
 
 def constant(name: str) -> float:
-    """A number of the header of DE421."""
+    """Return a number from the header of DE421."""
     return float(getattr(tables, name))
 
 
@@ -34,14 +34,14 @@ EARTH_RADIUS, MOON_RADIUS, SUN_RADIUS = (constant(name) / AU for name in ("AE", 
 
 
 def masses() -> dict[str, float]:
-    """G m in au^3/day^2; planets with their moons, but for the Earth."""
+    """Return G m in au^3/day^2; planets include their moons, except the Earth."""
     moon = constant("GMB") / (1.0 + constant("EMRAT"))
     known = {body: constant(name) for body, name in GM.items()} | {"moon": moon, "earth": constant("GMB") - moon}
     return {body: known[body] for body in BODIES}
 
 
 def states(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric positions and velocities at those days, each (times, bodies, 3), in au and au/day."""
+    """Return barycentric positions and velocities at some days, each (times, bodies, 3), in au and au/day."""
     found = {name: _state(name, t) for name in {*BODIES, "earthmoon"} - {"earth"}}
     geocentric = found["moon"]
     found["earth"] = found["earthmoon"] - geocentric / (1.0 + constant("EMRAT"))
@@ -56,7 +56,7 @@ def _state(name: str, t: np.ndarray) -> np.ndarray:
 
 
 def relative(x: np.ndarray) -> np.ndarray:
-    """Planets as seen from the Sun and the Moon from the Earth, the Sun left out: (..., bodies, 3) to one body less."""
+    """Return planets relative to the Sun and the Moon relative to the Earth, without the Sun: (..., bodies - 1, 3)."""
     sun, earth, moon = (BODIES.index(body) for body in ("sun", "earth", "moon"))
     seen = x - x[..., sun : sun + 1, :]
     seen[..., moon, :] = x[..., moon, :] - x[..., earth, :]

@@ -1,4 +1,4 @@
-"""The libration of the Moon in longitude as DE421 has it: the angle by which it is ahead of Cassini's laws."""
+"""Libration of the Moon in longitude in DE421: its rotation angle relative to Cassini's laws."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import sympy
 
 OFFSET = np.radians(67.92 / 3600.0)
-"""Of the principal axis from the one towards the mean Earth: Williams, Boggs & Folkner (2008)."""
+"""Angle from the axis towards the mean Earth to the principal axis: Williams, Boggs & Folkner (2008)."""
 DRIFT = 1e-3
-"""Radians a day that the coordinate gains beside the angle. Steps judge changes beside velocities: this one is never
-near zero. The equations of motion are the same."""
+"""Constant rate added to the angle, in radians a day, so that the velocity is never near zero: step-size control
+compares changes with velocities. The equations of motion do not change."""
 
 
 def axes(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -24,7 +24,7 @@ def axes(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turn(t: np.ndarray) -> np.ndarray:
-    """The angle in radians."""
+    """Return the angle in radians."""
     pole, near = axes(t)
     towards = sympy.lambdify("century", figures.of_the_moon("century")[1])((t - ephemeris.YEAR_2000) / 36525.0)
     across = np.cross(pole, near, axis=0)
@@ -32,6 +32,6 @@ def turn(t: np.ndarray) -> np.ndarray:
 
 
 def state(t: float) -> tuple[float, float]:
-    """The coordinate at a time, the angle with its drift, and its rate in radians a day."""
+    """Return the coordinate at a time, the angle with its drift, and its rate in radians a day."""
     before, now, after = turn(t + np.array([-0.1, 0.0, 0.1]))
     return float(now) + DRIFT * t, float((after - before) / 0.2) + DRIFT

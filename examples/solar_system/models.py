@@ -1,4 +1,4 @@
-"""The ladder of Lagrangians, each with one effect more, as compiled steppers with their initial states at the epoch."""
+"""Sequence of Lagrangians, each with one more effect, as compiled steppers with initial states at the epoch."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ import scvi_codegen as sc
 
 DEGREE = 8  # order 16
 TURN = "moon_turn"
-"""The last coordinate, where the Moon has a figure."""
+"""Name of the last coordinate, if the Moon has a figure."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """L and forces of the solar system, as text; ``asteroids`` attract the others besides."""
+    """L and forces of the solar system, as text; ``asteroids`` act on the other bodies, too."""
 
     name: str
     lagrangian: str
@@ -33,16 +33,16 @@ class Model:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """All that moves."""
+        """Names of all bodies."""
         return BODIES + self.asteroids
 
     def with_term(self, name: str, term: str) -> Model:
-        """One effect more."""
+        """Return the model with one more effect."""
         return replace(self, name=name, lagrangian=f"{self.lagrangian} + {term}")
 
     @cached_property
     def stepper(self) -> sc.Stepper:
-        """Compiled."""
+        """Compiled stepper."""
         gm = ephemeris.masses() | asteroids.masses(self.asteroids)
         parameters = {f"gm_{body}": mass for body, mass in gm.items()}
         if "c**2" in self.lagrangian:
@@ -58,12 +58,12 @@ class Model:
 
     @property
     def turns(self) -> bool:
-        """Whether the Moon does."""
+        """True if the rotation of the Moon is a coordinate."""
         return TURN in self.lagrangian
 
     @cached_property
     def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities at the epoch; those of asteroids by going back to it from that of their elements."""
+        """Positions and velocities at the epoch; asteroids are integrated back to it from that of their elements."""
         if not self.asteroids:
             return self.state(0.0, np.zeros((2, 0, 3)))
         then = asteroids.EPOCH
@@ -75,18 +75,18 @@ class Model:
         return self.state(0.0, np.array([self.places(each[-1])[len(BODIES) :] for each in (run.q, run.velocity)]))
 
     def state(self, t: float, small: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates and velocities: those of DE421, and of asteroids as given, (2, asteroids, 3)."""
+        """Return coordinates and velocities of DE421, with those of asteroids, (2, asteroids, 3)."""
         large = np.array(ephemeris.states(np.array([t])))[:, 0]
         both = np.concatenate([large, small], axis=1).reshape(2, -1)
         q, v = np.column_stack([both, libration.state(t)]) if self.turns else both
         return q, v
 
     def places(self, q: np.ndarray) -> np.ndarray:
-        """Coordinates by bodies: (..., bodies, 3)."""
+        """Return coordinates by bodies: (..., bodies, 3)."""
         return q[..., : 3 * len(self.bodies)].reshape(*q.shape[:-1], -1, 3)
 
     def runs(self, h: float, save_every: int) -> tuple[sc.Trajectory, sc.Trajectory]:
-        """Back and forth from the epoch, to the ends of the ephemeris, by steps of h days."""
+        """Return trajectories backward and forward from the epoch, to the ends of the ephemeris, by steps of h days."""
         q, v = self.start
         spans = ((-h, -ephemeris.FIRST), (h, ephemeris.LAST))
         back, forth = (
@@ -98,14 +98,14 @@ class Model:
         return back, forth
 
     def motion(self, h: float, save_every: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times in ascending order, and positions (times, bodies, 3)."""
+        """Return times in ascending order, and positions (times, bodies, 3)."""
         back, forth = self.runs(h, save_every)
         q = np.concatenate([back.q[:0:-1], forth.q])
         return np.concatenate([back.t[:0:-1], forth.t]), self.places(q)
 
 
 def ladder(counts: Sequence[int] = (3,)) -> Iterator[Model]:
-    """Models, the last of them with so many asteroids."""
+    """Return the models, the last of them with ``asteroids`` asteroids."""
     century = f"((t - ({ephemeris.YEAR_2000!r}))/36525)"
     yield (model := Model("Newton", point_masses.newton(BODIES)))
     yield (model := model.with_term("+ Einstein, Infeld, Hoffmann", point_masses.relativity(BODIES)))

@@ -17,13 +17,13 @@ def coordinates(bodies: Sequence[str]) -> list[str]:
 
 
 def newton(bodies: Sequence[str]) -> str:
-    """L = sum m v^2/2 + sum over pairs of G m m'/r."""
+    """Return L = sum m v^2/2 + sum over pairs of G m m'/r."""
     kinetic = (f"gm_{a}*{square(a)}/2" for a in bodies)
     return total([*kinetic, *(f"{attraction(a, b)}" for a, b in combinations(bodies, 2))])
 
 
 def relativity(bodies: Sequence[str]) -> str:
-    """What Einstein, Infeld and Hoffmann add, of order 1/c^2.
+    """Return the terms of order 1/c^2 by Einstein, Infeld and Hoffmann.
 
     c^2 L = sum m v^4/8 + sum over pairs of G m m'/(2 r) [3 v^2 + 3 v'^2 - 7 v.v' - (v.n)(v'.n)]
             - sum over bodies a of m_a/2 (sum over other bodies b of G m_b/r_ab)^2
@@ -49,7 +49,7 @@ def distance(a: str, b: str) -> str:
 
 
 def square(a: str) -> str:
-    """The square of a speed."""
+    """Return the square of a speed."""
     return "(" + total(f"{a}_{x}_dot**2" for x in AXES) + ")"
 
 

@@ -1,7 +1,7 @@
-"""How the orbits of the giant planets turn: their secular frequencies over millions of years, beside Laskar's.
+"""Secular frequencies of the giant planets over millions of years, compared with Laskar's.
 
-Sun and giant planets of DE421, the inner planets within the Sun. The run is recorded in a folder: called again, it goes
-on from where it ended, or was killed.
+Sun and giant planets of DE421, the inner planets merged with the Sun. The run is recorded in a folder: a second call
+continues it, also after it was killed.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ def bodies() -> tuple[dict[str, float], np.ndarray, np.ndarray, float]:
 
 
 def pole(masses: dict[str, float], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The direction of the angular momentum."""
+    """Return the direction of the angular momentum."""
     momentum = np.array(list(masses.values())) @ np.cross(q, v)
     return momentum / np.linalg.norm(momentum)
 
 
 def stepper_of(masses: dict[str, float], rings: float, axis: np.ndarray, *, plain: bool = False) -> sc.Stepper:
-    """Of order 16; Newton's Lagrangian alone if ``plain``."""
+    """Return a stepper of order 16; with Newton's Lagrangian alone if ``plain``."""
     lagrangian = newton(tuple(masses))
     parameters = {f"gm_{body}": mass for body, mass in masses.items()}
     if not plain:
@@ -73,9 +73,9 @@ def stepper_of(masses: dict[str, float], rings: float, axis: np.ndarray, *, plai
 
 
 def elements(run: sc.Trajectory, masses: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Perihelia, e exp(i longitude), and nodes, sin(i/2) exp(i node), of planets: complex, (times, planets).
+    """Return perihelia, e exp(i longitude), and nodes, sin(i/2) exp(i node), of planets: complex, (times, planets).
 
-    About the Sun, in the plane at right angles to the angular momentum of all.
+    They are heliocentric, in the plane perpendicular to the total angular momentum.
     """
     gm = np.array(list(masses.values()))
     q, v = (x.reshape(len(x), -1, 3) for x in (run.q, run.velocity))
@@ -87,14 +87,14 @@ def elements(run: sc.Trajectory, masses: dict[str, float]) -> tuple[np.ndarray, 
     towards = np.cross(v, h) / (gm[0] + gm[1:])[:, None] - q / np.linalg.norm(q, axis=-1, keepdims=True)
     normal = h / np.linalg.norm(h, axis=-1, keepdims=True)
     nodes = (1j * normal[..., 0] - normal[..., 1]) / np.sqrt(2.0 * (1.0 + normal[..., 2]))
-    longitude = towards[..., 0] + 1j * towards[..., 1]  # of small inclinations
+    longitude = towards[..., 0] + 1j * towards[..., 1]  # for small inclinations
     return longitude, nodes
 
 
 def frequency(t: np.ndarray, signal: np.ndarray, rank: int = 0) -> float:
-    """The strongest frequency of a complex signal, or that of a rank after it, in radians per unit of t.
+    """Return the strongest frequency of a complex signal, or that of a later rank, in radians per unit of t.
 
-    Laskar's frequency analysis: where the Fourier integral with Hann's window is largest, then of what is left.
+    Laskar's frequency analysis: the maximum of the Fourier integral with a Hann window, then of the remainder.
     """
     window, lines = np.hanning(len(t)), 2.0 * np.pi * np.fft.fftfreq(len(t), t[1] - t[0])
 
@@ -110,18 +110,18 @@ def frequency(t: np.ndarray, signal: np.ndarray, rank: int = 0) -> float:
 
 
 def frequencies(t: np.ndarray, signals: dict[str, np.ndarray]) -> dict[str, float]:
-    """Of each signal, arcseconds a year; in the motion of Uranus g5 is stronger than g7."""
+    """Return the frequency of each signal in arcseconds a year; for Uranus g5 is stronger than g7."""
     return {name: ARCSECONDS * frequency(t, signal, int(name == "g7")) for name, signal in signals.items()}
 
 
 def parts(count: int, number: int) -> list[slice]:
-    """As many equal ones of so many rows."""
+    """Split ``count`` rows into ``number`` equal slices."""
     ends = np.linspace(0, count, number + 1).astype(int)
     return [slice(first, last) for first, last in pairwise(ends)]
 
 
 def recorded(folder: Path, steps: int, hours: float, *, plain: bool) -> sc.RecordedRun:
-    """The run in the folder, led on to so many steps, or for so many hours of processor time."""
+    """Return the run in the folder, continued to a number of steps, or for hours of processor time."""
     began = time.process_time()
 
     def stop() -> bool:

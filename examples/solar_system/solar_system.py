@@ -1,7 +1,7 @@
-"""The solar system from one Lagrangian, beside DE421: what each of its terms is worth, body by body.
+"""Solar system from one Lagrangian, compared with DE421: the effect of each of its terms, body by body.
 
-From the states of DE421 on 28 June 1969, back to 1899 and forth to 2200. Needs the extras `ephemeris` and `plot`.
-Numbers on the command line, up to 15, are of asteroids in further models, after the one with three.
+From the states of DE421 on 28 June 1969, backward to 1899 and forward to 2200. Needs the extras `ephemeris` and `plot`.
+Arguments on the command line, up to 15, are numbers of asteroids of further models, after the one with three.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ SHOWN = ("mercury", "earth", "moon", "mars", "jupiter", "neptune")
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Between the places of bodies, in km: (times, bodies)."""
+    """Return distances between positions of bodies in km: (times, bodies)."""
     return np.linalg.norm(ephemeris.relative(a) - ephemeris.relative(b), axis=-1) * AU
 
 
 def measured(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Times and positions at these; prints processor times and how far half steps lead away."""
+    """Return times and positions; print processor times and the difference to half the step size."""
     began = _processor_time()
     _ = model.stepper
     compiling = _processor_time() - began
@@ -50,12 +50,12 @@ def measured(model: Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _processor_time() -> float:
-    """Of this process and of the compilers it has called."""
+    """Return the processor time of this process and of the compilers it has called."""
     return sum(os.times()[:4])
 
 
 def turning_of_the_moon(t: np.ndarray, x: np.ndarray) -> float:
-    """How much more the mean motion of the Moon grows than in DE421, in arcseconds a century squared."""
+    """Return the excess of the Moon's mean acceleration over DE421, in arcseconds a century squared."""
     earth, moon = BODIES.index("earth"), BODIES.index("moon")
     q, v = (each[:, moon] - each[:, earth] for each in ephemeris.states(t))
     ahead = np.cross(np.cross(q, v), q)
@@ -65,7 +65,7 @@ def turning_of_the_moon(t: np.ndarray, x: np.ndarray) -> float:
 
 
 def conserved(model: Model) -> str:
-    """How well a run keeps what L conserves, over all years."""
+    """Return the errors of the conserved quantities of L over all years, as text."""
     runs = model.runs(STEP, round(SAMPLING / STEP))
     energy = max(abs(run.energy() / run.energy()[0] - 1.0).max() for run in runs)
     errors = np.max([abs(run.momentum_errors()).max(axis=0) for run in runs], axis=0)

@@ -1,8 +1,8 @@
-"""The tide that the Moon raises on the Earth, as forces: it lags behind, so it is no term of L.
+"""Tide raised by the Moon on the Earth, as forces: with a time lag it is not a term of L.
 
-Of degree two, with a Love number and a lag of its own for each order, as in DE421 (Williams, Boggs & Folkner, "DE421
-Lunar Orbit, Physical Librations, and Surface Coordinates", 2008). The tide at t was raised by the Moon of t - lag, and
-the turning Earth has carried it on since.
+It has degree two, with a Love number and a lag for each order, as in DE421 (Williams, Boggs & Folkner, "DE421 Lunar
+Orbit, Physical Librations, and Surface Coordinates", 2008). The tide at t was raised by the Moon at t - lag, and has
+been carried on by the rotation of the Earth since.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ TURNING = 2.0 * sympy.pi.evalf() * 1.00273781191135448  # radians a day
 
 
 def tide(radius: float, love: Sequence[float], lag: Sequence[float]) -> dict[str, str]:
-    """Forces by coordinate, G times Newton's; radius in au, lags in days, for the orders 0, 1, 2."""
+    """Return forces by coordinate, G times Newton's; radius in au, lags in days, for the orders 0, 1, 2."""
     moon, raising = sympy.symbols("x y z"), sympy.symbols("x_then y_then z_then")
     forces = [0, 0, 0]
     for order, (number, delay) in enumerate(zip(love, lag, strict=True)):
@@ -30,7 +30,7 @@ def tide(radius: float, love: Sequence[float], lag: Sequence[float]) -> dict[str
 
 
 def _harmonic(order: int, r: Sequence[sympy.Symbol], s: Sequence[sympy.Symbol]) -> sympy.Expr:
-    """The part of P_2(cos of the angle between r and s)/(|r| |s|)^3 of that order about the Earth's axis."""
+    """Return the part of P_2(cos of the angle between r and s)/(|r| |s|)^3 of an order about the Earth's axis."""
     (x, y, z), (a, b, c) = r, s
     squared, then = x**2 + y**2 + z**2, a**2 + b**2 + c**2
     across = x * a + y * b
@@ -43,7 +43,7 @@ def _harmonic(order: int, r: Sequence[sympy.Symbol], s: Sequence[sympy.Symbol]) 
 
 
 def _place_then(r: Sequence[sympy.Symbol], s: Sequence[sympy.Symbol], delay: float) -> dict:
-    """The Moon of that many days before, carried on by the Earth."""
+    """Return the position of the Moon ``delay`` days earlier, carried on by the rotation of the Earth."""
     x, y, z = (here - delay * sympy.Symbol(f"v_{here}") for here in r)
     turn = TURNING * delay
     carried = (sympy.cos(turn) * x - sympy.sin(turn) * y, sympy.sin(turn) * x + sympy.cos(turn) * y, z)
@@ -51,7 +51,7 @@ def _place_then(r: Sequence[sympy.Symbol], s: Sequence[sympy.Symbol], delay: flo
 
 
 def _as_coordinates(force: sympy.Expr) -> str:
-    """From the Earth to the Moon, in the coordinates of both."""
+    """Return the vector from the Earth to the Moon in the coordinates of both."""
     relative = {}
     for x in AXES:
         relative[sympy.Symbol(x)] = sympy.Symbol(f"moon_{x}") - sympy.Symbol(f"earth_{x}")

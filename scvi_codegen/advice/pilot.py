@@ -194,6 +194,7 @@ class Pilot:
             return 0.0
         apart = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)
         near = apart[: int(np.argmax(apart > RESOLVED)) or steps]
+        # Exponential growth exp(r t): the mean of the second half over the second quarter gives r.
         power = _power(near)
         return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > STEEP else 0.0
 
@@ -205,6 +206,7 @@ class Pilot:
             return max(float(self._errors(n)[-1]), self.late_error(n) / 3.0)  # the error may cross zero at the end
         if self.rate:
             return self._exploded(self.late_error(n))
+        # Fit error(t) = a t + b t^2 to the mean errors of two windows; symplectic methods: b = 0.
         early, late = _windows(self._errors(n))
         ratio = self.span / self.length
         if self.symplectic and self.growth < NEARLY_LINEAR:
@@ -232,6 +234,7 @@ class Pilot:
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]
         errors: Array = np.linalg.norm(both[1] - both[0], axis=1) / size
+        # The reference has the error e_ref = (n/finest)^order e_n, so that |q_n - q_ref| = (1 - (n/finest)^order) e_n.
         return errors / (1.0 - (n / finest) ** self.order)
 
     def _exploded(self, size: float) -> float:

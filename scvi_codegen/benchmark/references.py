@@ -162,6 +162,7 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
 def states_after(field: Field, start: Extended, steps: Sequence[float] | Extended) -> Extended:
     """Return (k, d) states after these steps."""
     a, b, guess_table = gauss_tables(STAGES)
+    # Compensated summation (Kahan): ``carry`` is the part of x that rounding cut off.
     x, carry, before, t = start.copy(), np.zeros_like(start), None, np.longdouble(0)
     stages: Extended | None = None
     for size in steps:

@@ -84,6 +84,7 @@ def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
     areas = np.tile(around.scales[:m] * around.scales[m:], 2)
     units = np.sqrt(np.outer(areas, areas))
     error = np.full_like(J, SPREAD * (around.uncertainty + EPSILON * ROUNDINGS))
+    # First-order bound |dJ^T Omega J + J^T Omega dJ| for an error |dJ| <= error of the differences.
     half = error.T @ np.abs(omega) @ np.abs(J)
     return np.abs(J.T @ omega @ J - shrunk * omega) / units, (half + half.T) / units
 
