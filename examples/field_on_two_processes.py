@@ -33,7 +33,7 @@ def tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def forces(x: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Of a Fermi-Pasta-Ulam-Tsingou ring at the points (stages, places), with a column of neighbours on either side."""
+    """Return the forces of a Fermi-Pasta-Ulam-Tsingou ring at (stages, sites), with a neighbour column on each side."""
     stretch = np.diff(np.concatenate([left, x, right], axis=1), axis=1)
     pull = stretch + stretch**3 / 4
     return np.diff(pull, axis=1)

@@ -15,7 +15,7 @@ compares changes with velocities. The equations of motion do not change."""
 
 
 def axes(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pole of the Moon's figure and its principal axis nearest to the Earth, by the angles of DE421: (3, times)."""
+    """Return the pole of the Moon's figure and its principal axis nearest to the Earth, by DE421: (3, times)."""
     phi, theta, psi = ephemeris.tables.position("librations", ephemeris.EPOCH, t)
     s, c = np.sin, np.cos
     pole = np.array([s(theta) * s(phi), -s(theta) * c(phi), c(theta)])

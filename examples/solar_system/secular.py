@@ -39,7 +39,7 @@ PUBLISHED = {"g5": 4.257452, "g6": 28.2449, "g7": 3.087946, "g8": 0.673019} | {
 
 
 def bodies() -> tuple[dict[str, float], np.ndarray, np.ndarray, float]:
-    """Masses, positions and velocities; J2 R^2 of inner planets as rings: half of sum m a^2 over the mass within."""
+    """Return masses, positions, velocities and J2 R^2 of inner planets as rings: sum m a^2 / 2 over the mass inside."""
     gm = ephemeris.masses()
     q, v = (dict(zip(ephemeris.BODIES, each[0], strict=True)) for each in ephemeris.states(np.zeros(1)))
     inside = sum(gm[body] for body in INNER)

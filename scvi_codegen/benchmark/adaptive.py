@@ -153,7 +153,7 @@ def kepler_ends(chosen: Case, velocity: Extended) -> Reference:
 
 def _kepler_end(q: Array, v: Array, t: float) -> tuple[Any, Any]:
     with mp.workdps(40):
-        # Lagrange's f and g functions of the change E of the eccentric anomaly (Battin 1999, sec. 4.3).
+        # Lagrange's f and g functions of the change E of the eccentric anomaly.
         (x, y), (u, w) = map(mp.mpf, q.tolist()), map(mp.mpf, v.tolist())
         r = mp.hypot(x, y)
         a = 1 / (2 / r - (u * u + w * w))
