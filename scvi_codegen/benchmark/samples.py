@@ -56,7 +56,7 @@ class Sampling:
             run.set_inputs(u=PUSH)
         binding, self._values = alone.binding, bare.parameters
         self._memory, report, room = binding.new("run *"), binding.new("report *"), binding.workspace()
-        binding.buffer(self._memory)[:] = bare.save()
+        binding.buffer(self._memory)[:] = bare.checkpoint()
         step, values, null = binding.function("advance", self._memory), binding.pointer(self._values), binding.null
         self.calls: dict[str, Callable[[], object]] = {
             "bare": lambda: step(1, 2**53, values, null, null, null, null, null, report, room),

@@ -83,7 +83,7 @@ class GrowthCheck:
         self.run, self.asked, self.lead = run, asked, lead or self._to
         self.wanted = adaptive and asked is not False and warnings_wanted()
         if self.wanted:
-            self.start: Any = run.save() if isinstance(run, Memory) else run.mark
+            self.start: Any = run.checkpoint() if isinstance(run, Memory) else run.mark
             self.parameters = (
                 run.parameters.copy() if isinstance(run, Memory) else None
             )  # inputs change them during the run
@@ -152,7 +152,7 @@ class GrowthCheck:
     def _begin(self, nudge: float, tolerance: float) -> None:
         """Reset the run to its perturbed initial state, on its constraints, with another local tolerance."""
         run = self.run
-        run.rewind(self.start)
+        run.rollback(self.start)
         if isinstance(run, Memory):
             run._parameters[:] = self.parameters
         assert run.goal is not None  # by construction

@@ -122,7 +122,7 @@ class IndexedSearch:
         """
         (_, old), (_, new) = ends
         start = self.run.apart(h)
-        start.rewind(before)
+        start.rollback(before)
         noise = self._rounding(start, k, old)
         change, doubt = self._first_change(before, start, k, h, noise)
         sign, size = 1.0 if change > 0.0 else -1.0, abs(change) + abs(new - old)
@@ -199,7 +199,7 @@ class IndexedSearch:
 
     def _end(self, before: IndexedMark, there: IndexedRun) -> None:
         """Leave the run at the state of a terminal event."""
-        self.run.rewind(before)
+        self.run.rollback(before)
         self.run.stand_at(there)
         self.ended = True
 
@@ -220,7 +220,7 @@ class IndexedSearch:
     def _part(self, before: IndexedMark, h: float) -> IndexedRun:
         """Return the state after a partial step."""
         run = self.run.apart(h)
-        run.rewind(replace(before, moments={**before.moments, "h": h}))
+        run.rollback(replace(before, moments={**before.moments, "h": h}))
         run.goal = None
         run.advance(1)
         return run

@@ -180,7 +180,7 @@ class IndexedRun(OneThread):
 
     @property
     def mark(self) -> IndexedMark:
-        """Snapshot of the present state for :meth:`rewind`."""
+        """Snapshot of the present state for :meth:`rollback`."""
         kept = {name: self._numbers[name].copy() for name in STATE}
         moments = {name: getattr(self._run, name) for name in MOMENTS}
         return IndexedMark(kept, moments, self.iterations)
@@ -193,7 +193,7 @@ class IndexedRun(OneThread):
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
     @alone
-    def rewind(self, mark: IndexedMark) -> None:
+    def rollback(self, mark: IndexedMark) -> None:
         """Restore a snapshot; the predictor of the next step is reset."""
         for name, values in mark.arrays.items():
             self._numbers[name][:] = values
@@ -318,8 +318,8 @@ class IndexedRun(OneThread):
         return self.goal is not None and self.t == self.goal.t_end and self._run.t_low == 0.0
 
     @alone
-    def save(self) -> bytes:
-        """Return the whole run as bytes in NumPy's format (.npz), for :meth:`IndexedStepper.restore`."""
+    def checkpoint(self) -> bytes:
+        """Return the whole run as bytes in NumPy's format (.npz), for :meth:`IndexedStepper.from_checkpoint`."""
         saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
         saved |= {"moments": [float(getattr(self._run, name)) for name in MOMENTS], "iterations": self.iterations}
@@ -327,7 +327,7 @@ class IndexedRun(OneThread):
         return saved_bytes(saved, self.problem.arrays, self.interface)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        given = (self.interface, self._binding, self.save(), self.options, self.goal, self.threads)
+        given = (self.interface, self._binding, self.checkpoint(), self.options, self.goal, self.threads)
         return type(self).restored, given
 
     @classmethod

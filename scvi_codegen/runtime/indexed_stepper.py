@@ -178,7 +178,7 @@ class IndexedStepper:
         moving = (p, "momenta") if velocity is None else (velocity, "velocities")
         return read_arrays(self.interface, q, parameters, tables), moving
 
-    def restore(
+    def from_checkpoint(
         self,
         saved: bytes,
         *,
@@ -187,7 +187,7 @@ class IndexedStepper:
         options: SolverOptions | None = None,
         threads: int | None = None,
     ) -> IndexedRun:
-        """Restore a run saved by :meth:`IndexedRun.save`; it continues bitwise equally if ``t_end`` is passed again.
+        """Restore a run from :meth:`IndexedRun.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
         Raises:
             StateError: if the bytes are no saved run or belong to another integrator.

@@ -241,8 +241,8 @@ class Memory(OneThread):
             self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
 
     @alone
-    def save(self) -> bytes:
-        """Return a bitwise copy of the run for :meth:`Stepper.restore` on the same kind of machine."""
+    def checkpoint(self) -> bytes:
+        """Return a bitwise copy of the run for :meth:`Stepper.from_checkpoint` on the same kind of machine."""
         return bytes(self.stepper.binding.buffer(self._memory))
 
     def check_inputs(self) -> None:
@@ -251,7 +251,7 @@ class Memory(OneThread):
             raise missing_input(self._awaited[0])
 
     @alone
-    def rewind(self, saved: bytes) -> None:
+    def rollback(self, saved: bytes) -> None:
         """Restore the state saved by :meth:`save`."""
         self.stepper.binding.buffer(self._memory)[:] = saved
 

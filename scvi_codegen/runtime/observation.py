@@ -100,18 +100,18 @@ class Observation:
 
     def _portion(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
-        before, failure = self.run.save(), None
+        before, failure = self.run.checkpoint(), None
         try:
             part = record(self.run, size)
         except StepFailedError as error:
             part, failure = Trajectory.before(error), error
         if self.end is not None and (part.t[-1] - self.end) * self.run.h >= 0.0:
-            self.run.rewind(before)
+            self.run.rollback(before)
             part, failure = self._arrived(part, before), None
         if self.search is not None:
             reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
             if self.search.ended:
-                self.run.rewind(before)
+                self.run.rollback(before)
                 part, failure, self.arrived = self._ended(record(self.run, reached)), None, False
         self._keep(part)
         if failure is not None:
@@ -131,7 +131,7 @@ class Observation:
         whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
         part = record(self.run, whole)
         while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: the previous step is the last one
-            self.run.rewind(before)
+            self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)
         q, p, tau = self._inside(part, self.end)

@@ -32,7 +32,7 @@ class Run(Memory):
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
         for name in self._awaited:
             del known[f"{name}_0"]
-        return (_restored, (self.stepper, self.save(), known, self._options, self.goal, self.longest))
+        return (_restored, (self.stepper, self.checkpoint(), known, self._options, self.goal, self.longest))
 
     @alone
     def record(

@@ -2,8 +2,8 @@
 
 ``step`` is a pure function. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: a predictor
 that extrapolates the previous step, and compensation terms of the state. The whole memory is one plain C struct;
-:meth:`Run.save` returns its bytes and :meth:`Stepper.restore` continues from them bitwise equally. Neither SymPy nor
-Jinja is imported.
+:meth:`Run.checkpoint` returns its bytes and :meth:`Stepper.from_checkpoint` continues from them bitwise equally.
+Neither SymPy nor Jinja is imported.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ class Stepper(Ensembles):
         check.warn(found)
         return found
 
-    def restore(
+    def from_checkpoint(
         self,
         saved: bytes,
         *,
@@ -263,7 +263,7 @@ class Stepper(Ensembles):
         parameters: Parameters = None,
         options: SolverOptions | None = None,
     ) -> Run:
-        """Restore a run saved by :meth:`Run.save`; it continues bitwise equally if ``t_end`` is passed again.
+        """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
         ``h`` is required with a monitor and not allowed otherwise.
         """

@@ -67,11 +67,11 @@ def _left(subject: Subject, stepper: Stepper, h: float, steps: int) -> tuple[flo
     first, parameters = subject.states[0], subject.parameters
     run = stepper.start(first.q, first.p, h=h, t=first.t, parameters=parameters)
     run.advance(steps)
-    here, saved = State(run.q, run.p, run.t, h), run.save()
+    here, saved = State(run.q, run.p, run.t, h), run.checkpoint()
     runs = (
-        stepper.restore(saved, parameters=parameters),
+        stepper.from_checkpoint(saved, parameters=parameters),
         stepper.start(here.q, here.p, h=h, t=here.t, parameters=parameters, options=ONE_ITERATION),
-        stepper.restore(saved, parameters=parameters, options=ONE_ITERATION),
+        stepper.from_checkpoint(saved, parameters=parameters, options=ONE_ITERATION),
     )
     for each in runs:
         each.advance(1)

@@ -238,7 +238,7 @@ def _turned(pace: Pace) -> Finding:
     first, end = pace.subject.states[0], float(_chosen(pace).t[-2])
     run = pace.stepper.start(first.q, first.p, h=pace.tau, t=first.t, t_end=end, parameters=pace.parameters)
     run.record()
-    back = pace.stepper.restore(run.save(), h=pace.tau, t_end=first.t, parameters=pace.parameters)
+    back = pace.stepper.from_checkpoint(run.checkpoint(), h=pace.tau, t_end=first.t, parameters=pace.parameters)
     back.record()
     change = np.abs(np.concatenate([back.q, back.p]) - first.z) / pace.subject.rounding(first)
     return Finding(float(change.max()) / run.steps, ROUNDINGS, f"in units of rounding, a step of {run.steps}")

@@ -87,7 +87,7 @@ def test_the_velocity_kept_from_the_last_step_yields_to_other_parameters(sample,
     run.record(5)
     heavier = {"m": 1.5, "M": 1.2}
     state, t = (run.q.copy(), run.p.copy()), run.t
-    continued = stepper.restore(run.save(), parameters=heavier).record(1)
+    continued = stepper.from_checkpoint(run.checkpoint(), parameters=heavier).record(1)
     q, p = stepper.step(*state, 0.05, t, heavier)
     assert np.abs([continued.q[-1] - q, continued.p[-1] - p]).max() < 1e-14
 

@@ -75,7 +75,10 @@ def test_two_former_steps_say_more_than_one(name):
     for steps in (1, 3):
         run = stepper(name, "fixed-point").start(given.q, given.p, h=CONTINUED[name] * given.h)
         run.advance(steps)
-        ends = [stepper(name, "fixed-point").restore(run.save(), options=options) for options in (None, ONE_ITERATION)]
+        ends = [
+            stepper(name, "fixed-point").from_checkpoint(run.checkpoint(), options=options)
+            for options in (None, ONE_ITERATION)
+        ]
         for each in ends:
             each.advance(1)
         left.append(max(abs(ends[0].q - ends[1].q)))

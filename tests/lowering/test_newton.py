@@ -118,7 +118,7 @@ class TestKeptFactors:
         run = chain(method).start(q, p, h=0.15)
         for portion in (1, 1, 2, 7, 20, 29):
             last = run.record(portion)
-            run = chain(method).restore(run.save())
+            run = chain(method).from_checkpoint(run.checkpoint())
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
         assert last.iterations[-1] == expected.iterations[-1]
@@ -131,7 +131,7 @@ class TestKeptFactors:
         run = stepper.start(q / 2, p, h=0.02)
         for portion in (*[1] * 30, 7, 23):
             last = run.record(portion)
-            run = stepper.restore(run.save())
+            run = stepper.from_checkpoint(run.checkpoint())
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
 
@@ -145,11 +145,11 @@ class TestKeptFactors:
         q, p = state()
         run = chain(method).start(q, p, h=0.15)
         run.record(10)
-        before = run.save()
-        strict = chain(method).restore(before, options=SolverOptions(max_iterations=1))
+        before = run.checkpoint()
+        strict = chain(method).from_checkpoint(before, options=SolverOptions(max_iterations=1))
         with pytest.raises(StepFailedError):
             strict.record(1)
-        assert strict.save() == before
+        assert strict.checkpoint() == before
 
 
 def test_a_wrong_sign_in_a_scatter_is_named_before_anything_is_compiled():

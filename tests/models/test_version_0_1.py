@@ -36,7 +36,7 @@ def test_its_runs_are_saved_and_restored_where_they_stand(stepper):
     run = stepper.start([0.5], [0.0], h=0.25, t=0.5)
     run.advance(15)
     assert run.t == 0.5 + 15 * 0.25
-    for again in (stepper.restore(run.save()), pickle.loads(pickle.dumps(run))):
+    for again in (stepper.from_checkpoint(run.checkpoint()), pickle.loads(pickle.dumps(run))):
         again.advance(25)
         assert (again.t, again.q[0], again.p[0]) == pytest.approx(END, rel=1e-13)
 

@@ -212,7 +212,7 @@ def test_copies_of_steppers_runs_and_trajectories_are_equal(kepler, duplicate, t
     run = kepler.start(*STATE, h=0.05, parameters={"mu": 1.1})
     run.record(50)
     other = duplicate(run)
-    assert (other.save(), other.steps, list(other.parameters)) == (run.save(), 50, [1.1])
+    assert (other.checkpoint(), other.steps, list(other.parameters)) == (run.checkpoint(), 50, [1.1])
     np.testing.assert_array_equal(run.record(50).q, other.record(50).q)
     assert final(duplicate(kepler)) == final(kepler)
     trajectory = kepler.integrate(*STATE, h=0.05, steps=10)

@@ -119,7 +119,7 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "ensemble": lambda x: stepper().integrate_ensemble(x, [[0.0]], **STEP),
     "ensemble parameters": lambda x: stepper().integrate_ensemble([[1.0]], [[0.0]], h=0.1, steps=2, parameters=x),
     "threads": lambda x: stepper().integrate_ensemble([[1.0]], [[0.0]], threads=1 if _is_huge(x) else x, **STEP),
-    "restore": lambda x: stepper().restore(x),
+    "restore": lambda x: stepper().from_checkpoint(x),
     "jacobian": lambda x: stepper().jacobian(x, [0.0], 0.1, parameters=INPUT),
     "energy": lambda x: stepper().energy([1.0], x, parameters=INPUT),
     "array q": lambda x: arrays().integrate(x, **TABLE),
@@ -131,7 +131,7 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "a field": lambda x: arrays().integrate([1.0, 2.0], parameters={"k": x}, **TABLE),
     "array events": lambda x: arrays().integrate([1.0, 2.0], events=x, **TABLE),
     "array threads": lambda x: arrays().integrate([1.0, 2.0], threads=1 if _is_huge(x) else x, **TABLE),
-    "array restore": lambda x: arrays().restore(x),
+    "array restore": lambda x: arrays().from_checkpoint(x),
     "coordinates": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=x, lagrangian="q_dot**2"),
     "lagrangian": lambda x: sc.LagrangianSystem.from_text(name="a", coordinates=["q"], lagrangian=x),
     "defaults": lambda x: sc.LagrangianSystem.from_text(

@@ -192,9 +192,9 @@ def test_a_number_is_a_real_number(what, kepler):
         lambda s: s.integrate_ensemble([Q], [P], h=0.1, steps=2**52, threads=-1),
         lambda s: s.energy([Q, Q], [P, P], [0.0, np.nan]),
         lambda s: s.energy([Q, [np.nan, 1.0]], [P, P]),
-        lambda s: s.restore("x" * 232),
-        lambda s: s.restore(None),
-        lambda s: s.restore(b""),
+        lambda s: s.from_checkpoint("x" * 232),
+        lambda s: s.from_checkpoint(None),
+        lambda s: s.from_checkpoint(b""),
     ],
 )
 def test_refused_by_name(call, kepler):
@@ -207,17 +207,17 @@ def test_damaged_bytes_of_a_run_are_refused_or_continued_within_bounds(method):
     stepper = prepared(stepper_for("kepler", method))
     run = stepper.start(Q, P, h=0.1)
     run.record(3)
-    saved, random = run.save(), Random(5)
+    saved, random = run.checkpoint(), Random(5)
     for byte in (b"\0", b"\xff", b"\x7f"):
         with pytest.raises(StateError, match="not a saved run"):
-            stepper.restore(byte * len(saved))
+            stepper.from_checkpoint(byte * len(saved))
     for _ in range(300):
         damaged = bytearray(saved)
         for _ in range(random.choice((1, 1, 8))):
             damaged[random.randrange(len(damaged))] = random.randrange(256)
         with guarded():
             try:
-                states = stepper.restore(bytes(damaged)).record(3)
+                states = stepper.from_checkpoint(bytes(damaged)).record(3)
             except REFUSED:
                 continue
         assert np.isfinite(states.q).all()

@@ -113,7 +113,7 @@ def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
     for name in ("t", "h", "goal", "options", "steps", "longest"):
         assert getattr(copy, name) == getattr(run, name), name
     assert np.array_equal(copy.parameters, run.parameters)
-    assert copy.save() == run.save()
+    assert copy.checkpoint() == run.checkpoint()
     assert_same(record(run), record(copy))
 
 
@@ -146,4 +146,4 @@ def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -
                 each.advance(1)
             each.set_inputs(**{name: 0.2})
         each.advance(2)
-    assert copy.save() == run.save()
+    assert copy.checkpoint() == run.checkpoint()

@@ -212,14 +212,14 @@ def test_a_run_goes_on_bit_for_bit(kepler):
     whole = kepler.integrate(q, p, t_end=20.0)
     run = kepler.start(q, p, t_end=20.0)
     first = run.record(37)
-    again = kepler.restore(run.save(), t_end=20.0)
+    again = kepler.from_checkpoint(run.checkpoint(), t_end=20.0)
     rest, pickled = again.record(), pickle.loads(pickle.dumps(run)).record()
     assert first.steps == 37
     assert np.array_equal(np.concatenate([first.t, rest.t[1:]]), whole.t)
     assert np.array_equal(rest.q[-1], whole.q[-1])
     assert np.array_equal(pickled.q, rest.q)
     with pytest.raises(StateError, match="not a saved run"):
-        kepler.restore(run.save())
+        kepler.from_checkpoint(run.checkpoint())
 
 
 def test_a_collision_is_refused_where_it_is(kepler):
@@ -334,7 +334,7 @@ def test_newtons_iteration_has_them(method):
         assert np.abs(np.diff(run.energy())).max() < 3e-14
     saved = stepper.start(q, p, t_end=20.0)
     first = saved.record(31)
-    rest = stepper.restore(saved.save(), t_end=20.0).record()
+    rest = stepper.from_checkpoint(saved.checkpoint(), t_end=20.0).record()
     assert np.array_equal(np.concatenate([first.q, rest.q[1:]]), run.q)
 
 

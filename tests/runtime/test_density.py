@@ -191,7 +191,7 @@ def test_states_between_events_and_portions_of_a_run():
     for _ in range(3):
         pieces.record(11)
     again = pickle.loads(pickle.dumps(pieces))
-    restored = stepper.restore(pieces.save(), h=0.2, t_end=3 * PERIOD)
+    restored = stepper.from_checkpoint(pieces.checkpoint(), h=0.2, t_end=3 * PERIOD)
     for each in (pieces, again, restored):
         assert np.array_equal(each.record().q[-1], run.q[-1])
 
@@ -228,7 +228,7 @@ def test_a_fallback_is_borrowed_here_too():
         (lambda s: s.integrate(*START, h=-0.1, t_end=1.0), "positive"),
         (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "leave out steps"),
         (lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0), "no ensembles"),
-        (lambda s: s.restore(b"", t_end=1.0), "and t_end"),
+        (lambda s: s.from_checkpoint(b"", t_end=1.0), "and t_end"),
     ],
 )
 def test_what_is_missing_is_said(call, words):

@@ -110,7 +110,7 @@ def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
     again = stepper.start([0.3], [0.0], h=0.01)
     for k in range(50):
         again.update(parameters={"u_0": -2.0 * again.q[0] - 0.5 * again.p[0], "w_0": 0.0})
-        again = stepper.restore(again.save(), parameters=again.parameters)
+        again = stepper.from_checkpoint(again.checkpoint(), parameters=again.parameters)
         again.advance(4)
         assert (again.q[0], again.p[0]) == states[k]
     sloped = {"u_0": 1.0, "u_1": 2.0, "u_2": -1.0, "u_3": 0.5, "u_t": 0.3, "w_0": 0.0}

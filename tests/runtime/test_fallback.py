@@ -130,16 +130,16 @@ def test_low_words_do_not_depend_on_how_a_run_is_cut():
     whole.advance(40)
     for _ in range(40):
         cut.advance(1)
-    assert whole.save() == cut.save()
+    assert whole.checkpoint() == cut.checkpoint()
 
 
 def test_a_run_that_fails_stands_before_the_step(start):
     borrowing, _ = both(SVI(4))
     run = borrowing.start(*start, h=40.0)
-    before = run.save()
+    before = run.checkpoint()
     with pytest.raises(StepFailedError):
         run.advance(1)
-    assert run.save() == before
+    assert run.checkpoint() == before
 
 
 def test_prepare_compiles_all_that_later_calls_need(tmp_path, monkeypatch):

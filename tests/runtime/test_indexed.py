@@ -229,17 +229,17 @@ def test_a_saved_run_goes_on(method: str) -> None:
     stepper = sc.compile_indexed(each.system, method)
     run = stepper.start(each.q, velocity=each.velocity, h=0.1, tables=each.tables, parameters=each.parameters)
     run.advance(7)
-    again = stepper.restore(run.save())
+    again = stepper.from_checkpoint(run.checkpoint())
     for one in (run, again):
         one.advance(5)
     assert np.array_equal(run.q["q"], again.q["q"])
     assert np.array_equal(run.p["q"], again.p["q"])
     assert (run.t, run.steps, run.iterations, run.energy) == (again.t, again.steps, again.iterations, again.energy)
-    for wrong in (b"", b"no run", run.save()[:200]):
+    for wrong in (b"", b"no run", run.checkpoint()[:200]):
         with pytest.raises(sc.StateError, match="no saved run"):
-            stepper.restore(wrong)
+            stepper.from_checkpoint(wrong)
     with pytest.raises(sc.StateError, match="this is a run of"):
-        sc.compile_indexed(each.system, "svi:2").restore(run.save())
+        sc.compile_indexed(each.system, "svi:2").from_checkpoint(run.checkpoint())
 
 
 def test_observed_runs_keep_what_is_asked_for() -> None:

@@ -163,7 +163,7 @@ def test_observed_and_restored_runs_go_on_to_the_bit(stepper):
     for _ in range(10):
         other.advance(1)
         other.multipliers, other.constraint_values  # noqa: B018  (they leave what the next step begins with)
-    other = stepper.restore(other.save())
+    other = stepper.from_checkpoint(other.checkpoint())
     other.advance(10)
     assert (one.q["r"] == other.q["r"]).all()
     assert (one.p["r"] == other.p["r"]).all()

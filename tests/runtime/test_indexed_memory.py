@@ -119,7 +119,7 @@ class TestPickles:
 
     def test_an_input_is_still_awaited(self, chain: Any) -> None:
         run = start(chain, parameters={"k": K})
-        for other in (copy.copy(run), chain.restore(run.save())):
+        for other in (copy.copy(run), chain.from_checkpoint(run.checkpoint())):
             with pytest.raises(StateError, match="the input F is not given"):
                 other.advance(1)
 
@@ -150,41 +150,41 @@ class TestDamage:
     def test_changed_numbers_are_found_by_the_checksum(self, chain: Any) -> None:
         run = start(chain)
         run.advance(2)
-        for name, array in parts(run.save()).items():
+        for name, array in parts(run.checkpoint()).items():
             if name == indexed_saving.CHECKSUM:
                 continue
             spoiled = array + 1 if array.dtype.kind in "if" else ~array if array.dtype.kind == "b" else array + "x"
             if array.size:
                 with pytest.raises(StateError, match=r"checksum differs|not of"):
-                    chain.restore(put_together(parts(run.save()) | {name: spoiled}, checksum=False))
+                    chain.from_checkpoint(put_together(parts(run.checkpoint()) | {name: spoiled}, checksum=False))
 
     @pytest.mark.parametrize("value", [-1.0, 3.0, 0.5, 1e300, -1e300, np.nan, np.inf, 2.0**63, -(2.0**62)])
     @pytest.mark.parametrize("name", indexed_saving.RANGES)
     def test_counts_of_no_run(self, chain: Any, name: str, value: float) -> None:
         run = start(chain, h=None, t_end=2.0)
         run.advance(3)
-        found = parts(run.save())
+        found = parts(run.checkpoint())
         found["moments"][MOMENTS.index(name)] = value
         least, most = indexed_saving.RANGES[name]
         if least <= value <= most and value == int(value):
-            chain.restore(put_together(found), t_end=2.0).advance(3)
+            chain.from_checkpoint(put_together(found), t_end=2.0).advance(3)
             return
         with pytest.raises(StateError, match=name):
-            chain.restore(put_together(found), t_end=2.0)
+            chain.from_checkpoint(put_together(found), t_end=2.0)
 
     @pytest.mark.parametrize("which", ["chain", "pendulums"])
     def test_every_array(self, which: str, request: Any) -> None:
         stepper = request.getfixturevalue(which)
         run = start(stepper)
         run.advance(2)
-        whole, refused = parts(run.save()), 0
+        whole, refused = parts(run.checkpoint()), 0
         for name, array in whole.items():
             shapes = [array.reshape(-1)[:0], np.append(array, array), array.astype("U9"), np.array(10**6)]
             numbers = [np.full_like(array, value) for value in (-(10**6), 10**6)] if array.dtype.kind in "if" else []
             numbers += [np.full_like(array, np.nan)] if array.dtype.kind == "f" else []
             for spoiled in (*shapes, *numbers):
                 try:
-                    other = stepper.restore(put_together(whole | {name: spoiled}))
+                    other = stepper.from_checkpoint(put_together(whole | {name: spoiled}))
                     other.advance(2)
                 except (StateError, sc.StepFailedError):
                     refused += 1
@@ -192,26 +192,26 @@ class TestDamage:
 
     def test_bytes_at_random(self, chain: Any) -> None:
         run, random = start(chain), np.random.default_rng(3)
-        whole = run.save()
+        whole = run.checkpoint()
         for _ in range(300):
             spoiled = bytearray(whole)
             for place in random.integers(0, len(whole), 3):
                 spoiled[place] ^= int(random.integers(1, 256))
             try:
-                chain.restore(bytes(spoiled)).advance(1)
+                chain.from_checkpoint(bytes(spoiled)).advance(1)
             except StateError:
                 continue
         for spoiled in (b"", b"x", whole[:-1], whole[:100], np.zeros(3).tobytes()):
             with pytest.raises(StateError, match="no saved run"):
-                chain.restore(spoiled)
+                chain.from_checkpoint(spoiled)
         with pytest.raises(StateError, match="is bytes, not int"):
-            chain.restore(3)
+            chain.from_checkpoint(3)
 
     def test_a_run_of_the_other_kind_of_steps(self, chain: Any) -> None:
         with pytest.raises(StateError, match="give its t_end"):
-            chain.restore(start(chain, h=None, t_end=2.0).save())
+            chain.from_checkpoint(start(chain, h=None, t_end=2.0).checkpoint())
         with pytest.raises(StateError, match="leave it out"):
-            chain.restore(start(chain).save(), t_end=2.0)
+            chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
 def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
@@ -224,5 +224,5 @@ def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
             before = getattr(run._memory, name)
             setattr(run._memory, name, value)
             with pytest.raises(StateError, match=f"not a saved run.*{name}"):
-                stepper.restore(run.save(), t_end=5.0, tolerance=1e-6)
+                stepper.from_checkpoint(run.checkpoint(), t_end=5.0, tolerance=1e-6)
             setattr(run._memory, name, before)

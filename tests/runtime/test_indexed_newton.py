@@ -84,14 +84,14 @@ def test_saved_runs_go_on_with_it_alone():
     own, other = (sc.compile_indexed(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
     run = own.start(np.sin(np.arange(8.0)), h=0.1)
     run.advance(3)
-    saved = run.save()
-    again = own.restore(saved)
+    saved = run.checkpoint()
+    again = own.from_checkpoint(saved)
     for each in (run, again):
         each.advance(3)
     assert (run.q["q"] == again.q["q"]).all()
     assert run.iterations == again.iterations
     with pytest.raises(sc.StateError, match=r"a run of '.*, newton', not of '.*, fixed-point'"):
-        other.restore(saved)
+        other.from_checkpoint(saved)
 
 
 def test_a_step_that_comes_to_no_rest_fails():

@@ -110,7 +110,7 @@ class TestControlledSteps:
         goal = {"t_end": 4.0, "tolerance": 1e-8}
         run = stepper.start(Q, velocity=V, **goal)
         run.advance(3)
-        again = stepper.restore(run.save(), **goal)
+        again = stepper.from_checkpoint(run.checkpoint(), **goal)
         for each in (run, again):
             each.advance(1000)
         assert run.t == again.t == 4.0
@@ -239,7 +239,7 @@ class TestInputs:
             for run in (others, none):
                 run.set_inputs(F=math.cos(run.t))
                 if run is none:
-                    run.rewind(run.mark)
+                    run.rollback(run.mark)
                 run.advance(1)
         assert same.iterations == free.iterations
         assert np.abs(same.q["q"] - free.q["q"]).max() < 1e-15

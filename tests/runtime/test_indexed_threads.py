@@ -221,7 +221,7 @@ def test_a_run_goes_on_by_other_threads() -> None:
     whole.advance(6)
     parts = stepper.start(q, h=0.01, threads=3)
     parts.advance(3)
-    parts = stepper.restore(parts.save(), threads=2)
+    parts = stepper.from_checkpoint(parts.checkpoint(), threads=2)
     parts.advance(3)
     assert bits(parts) == bits(whole)
     assert parts.apart(0.01).threads == 2

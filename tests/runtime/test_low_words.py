@@ -147,8 +147,8 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
         own.run.advance(STEPS // 5)
         worst = np.maximum(worst, np.abs(own.off(start)))
         if part == 2:  # and as bytes, from there on
-            saved = own.run.save()
-            own.run = own.stepper.restore(saved)
+            saved = own.run.checkpoint()
+            own.run = own.stepper.from_checkpoint(saved)
     assert own.time() == Fraction(1 / 3) + STEPS * Fraction(H)
     assert worst[0] < 1e-17
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits

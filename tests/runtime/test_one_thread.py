@@ -67,7 +67,7 @@ def entries(run: Any) -> dict[str, Callable[[], Any]]:
         "advance": lambda: run.advance(1),
         "update": lambda: run.update(h=0.2),
         "set_inputs": lambda: run.set_inputs(),
-        "save": lambda: run.save(),
+        "checkpoint": lambda: run.checkpoint(),
         "copy": lambda: copy.copy(run),
     }
     return found | ({"record": lambda: run.record(1)} if hasattr(run, "record") else {})
@@ -106,8 +106,8 @@ def test_a_run_that_is_recorded_into_a_folder(stepper: sc.Stepper, tmp_path: Any
 
 def test_the_thread_that_holds_a_run_may_enter_it_again(stepper: sc.Stepper) -> None:
     run, saved = stepper.start([1.0], [0.0], h=0.1), []
-    run.record(5, progress=lambda _: saved.append(run.save()))
-    assert saved[-1] == run.save()
+    run.record(5, progress=lambda _: saved.append(run.checkpoint()))
+    assert saved[-1] == run.checkpoint()
 
 
 @pytest.mark.parametrize("kind", ["scalar", "arrays"])

@@ -277,7 +277,10 @@ def test_of_runs_saved_pickled_and_gone_on_with(number):
     options = sc.SolverOptions(tolerance=3e-15, max_iterations=47)
     begun = compiled.start(Q, velocity=V, h=given.h, t=given.t, parameters=own, options=options)
     begun.advance(2 * given.save_every)
-    copies = (pickle.loads(pickle.dumps(begun)), compiled.restore(begun.save(), parameters=own, options=options))
+    copies = (
+        pickle.loads(pickle.dumps(begun)),
+        compiled.from_checkpoint(begun.checkpoint(), parameters=own, options=options),
+    )
     rest = begun.record(STEPS + 1 - 2 * given.save_every, save_every=given.save_every)
     assert np.allclose(rest.q, run.q[2:], rtol=0, atol=1e-13)
     for copy in copies:

@@ -136,8 +136,8 @@ def test_a_restored_run_continues_bit_for_bit(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
     one = stepper.start(*state, h=0.05, t=0.3)
     one.record(123)
-    saved = one.save()
-    other = pickle.loads(pickle.dumps(stepper)).restore(saved)
+    saved = one.checkpoint()
+    other = pickle.loads(pickle.dumps(stepper)).from_checkpoint(saved)
     assert (other.t, other.steps) == (one.t, 123)
     assert np.array_equal([other.q, other.p], [one.q, one.p])
     assert same(one.record(200, save_every=3), other.record(200, save_every=3))
@@ -159,15 +159,15 @@ def test_every_counts_from_the_start_of_the_run(kepler):
 
 def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
     run = kepler.start(*STATE, h=0.05, parameters={"mu": 0.9})
-    saved = run.save()
+    saved = run.checkpoint()
     expected = run.record(5)
-    assert same(kepler.restore(saved, parameters={"mu": 0.9}).record(5), expected)
-    assert not same(kepler.restore(saved).record(5), expected)
+    assert same(kepler.from_checkpoint(saved, parameters={"mu": 0.9}).record(5), expected)
+    assert not same(kepler.from_checkpoint(saved).record(5), expected)
 
 
 def test_bytes_of_another_length_are_refused(kepler):
     with pytest.raises(StateError, match="3 bytes are not a saved run"):
-        kepler.restore(b"abc")
+        kepler.from_checkpoint(b"abc")
 
 
 # Wrong arguments.
@@ -297,12 +297,12 @@ def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step
     assert len(kept) == error.step // 2 + 1
     again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
     assert np.array_equal(kept.q, again.q)
-    before = run.save()
+    before = run.checkpoint()
     with pytest.raises(StepFailedError) as repeated:
         run.record(1)
     assert repeated.value.step == error.step
     assert len(repeated.value.trajectory) == 1
-    assert run.save() == before
+    assert run.checkpoint() == before
 
 
 def test_a_failed_run_can_go_on_with_better_options(compiled):
@@ -315,7 +315,7 @@ def test_a_failed_run_can_go_on_with_better_options(compiled):
         f"step {run.steps} at t = {run.t:.17g} with h = 0.3 failed: the iteration on the stage equations did not "
         f"converge (last update {failed.value.residual:.3g}; "
     )
-    assert state[0].restore(run.save()).record(3).q[-1] == pytest.approx(
+    assert state[0].from_checkpoint(run.checkpoint()).record(3).q[-1] == pytest.approx(
         state[0].integrate(*STATE, h=0.3, steps=3).q[-1], abs=1e-14
     )
 

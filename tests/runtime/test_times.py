@@ -61,7 +61,7 @@ def test_runs_and_ensembles_have_the_same_times(free):
 def test_a_run_restored_has_the_time_it_had(free):
     run = free.start([0.1], [0.0], h=0.1, t=0.3)
     run.advance(1234)
-    again = free.restore(run.save())
+    again = free.from_checkpoint(run.checkpoint())
     for each in (run, again):
         each.advance(777)
     assert again.t == run.t

@@ -155,13 +155,13 @@ class Case:
         goal = {"t_end": self.given.t + self.span} if self.kind == "monitored" else {}
         return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(h=self.h, **goal, **more))
 
-    def restore(self, run: Any, saved: bytes) -> Any:
+    def from_checkpoint(self, run: Any, saved: bytes) -> Any:
         """The run again, in a stepper that was pickled."""
         stepper = pickle.loads(pickle.dumps(self.stepper))
         if self.kind == "array":
-            return stepper.restore(saved, options=self.options)
+            return stepper.from_checkpoint(saved, options=self.options)
         goal = {"t_end": self.given.t + self.span, "h": self.h} if self.kind == "monitored" else {}
-        return stepper.restore(saved, parameters=run.parameters, options=self.options, **goal)
+        return stepper.from_checkpoint(saved, parameters=run.parameters, options=self.options, **goal)
 
 
 def as_rows(found: Any) -> SimpleNamespace:
@@ -396,7 +396,7 @@ def restarts(case: Case) -> None:
         whole.advance(20)
         for steps in (1, 7, 3):
             first.advance(steps)
-        again = case.restore(first, first.save())
+        again = case.from_checkpoint(first, first.checkpoint())
         assert low_words(again) == low_words(first)
         again.advance(9)
         assert low_words(again) == low_words(whole)

@@ -30,7 +30,7 @@ class Chunk:
     Attributes:
         piece: the states.
         step: number of steps at the checkpoint.
-        memory: memory of the run, as returned by :meth:`Run.save`.
+        memory: memory of the run, as returned by :meth:`Run.checkpoint`.
     """
 
     piece: Piece

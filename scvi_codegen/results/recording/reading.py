@@ -121,7 +121,7 @@ class RecordedRun:
             BuildError: if there is no C compiler.
         """
         manifest, goal = self.manifest, self.manifest.goal
-        return self.stepper.restore(
+        return self.stepper.from_checkpoint(
             self._last.memory,
             t_end=goal.t_end if goal else None,
             tolerance=(goal.tolerance or None) if goal else None,

@@ -176,7 +176,7 @@ class _Recorder:
         self.folder, self.manifest, self.run = folder, manifest, run
         self.seconds, self.steps = seconds, steps
         self.number, self.written, self.written_t = 0, -1, run.t
-        self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.save())
+        self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.checkpoint())
 
     def go_on_from(self, folder: Path) -> None:
         """Load the last file in order to complete it."""
@@ -241,7 +241,7 @@ class _Recorder:
 
     def keep(self, piece: Piece) -> None:
         """Store states and memory in one assignment, so that they stay consistent after an interruption."""
-        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.t, self.run.save())
+        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.t, self.run.checkpoint())
 
     def checkpoint(self) -> None:
         """Write the states computed since the last checkpoint.
