@@ -1,5 +1,7 @@
 """Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
 
+Where tangent vectors grow along the guess, the period is cut into segments first (multiple shooting).
+
 Periodic orbits are not isolated: the initial point is arbitrary, and orbits form one-parameter families (by energy or
 another conserved quantity). Each Newton step is the minimum-norm solution of the linearised equations (Moore-Penrose
 inverse), so the iteration converges to a nearby orbit without phase conditions. Equations implied by conserved
@@ -30,6 +32,8 @@ from scvi_codegen.runtime.times import steps_within, times_after
 __all__ = ["periodic_orbit"]
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
+EASY, GROWTH = 10.0, 4.0
+"""Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
 UNDECIDED = 1e-9
 """Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
@@ -65,6 +69,8 @@ def periodic_orbit(
     options: SolverOptions | None = None,
 ) -> PeriodicOrbit:
     """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
+
+    Where the orbit is unstable, multiple shooting improves the guess first.
 
     Args:
         stepper: the compiled stepper.
@@ -113,13 +119,13 @@ class _OrbitSearch:
     """Equations of a periodic orbit as a function of z = (q, p, period).
 
     Attributes:
-        free: (j,) indices of the free entries of z.
+        held: indices of the fixed entries of z, -1 that of the period.
     """
 
     stepper: Stepper
     period: float
     steps: int
-    free: NDArray[np.intp]
+    held: tuple[int, ...]
     energy: float | None
     gain: Array
     t: float
@@ -143,7 +149,7 @@ class _OrbitSearch:
         options: SolverOptions | None,
     ) -> _OrbitSearch:
         """Construct from validated arguments of :func:`periodic_orbit`."""
-        interface, names = stepper.interface, (*state_names(stepper), "period")
+        interface, names = stepper.interface, state_names(stepper)
         stepper.check_steps_of_h("a periodic orbit")
         check_inputs_given(interface, parameters)
         if interface.constraints:
@@ -155,14 +161,13 @@ class _OrbitSearch:
         if (steps is None) == (h is None):
             raise StateError("the number of steps of a period, or h, the longest of them: give one of them")
         for name in hold:
-            if name not in names[:-1]:
-                raise StateError(f"the state has no '{name}' to hold{closest(name, names[:-1])}")
-        held = {*hold, *(["period"] if fixed_period else [])}
+            if name not in names:
+                raise StateError(f"the state has no '{name}' to hold{closest(name, names)}")
         return cls(
             stepper=stepper,
             period=period,
             steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
-            free=np.array([k for k, name in enumerate(names) if name not in held], dtype=np.intp),
+            held=(*map(names.index, dict.fromkeys(hold)), *([-1] if fixed_period else [])),
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
             t=checked_number(t, "the time t"),
@@ -172,24 +177,19 @@ class _OrbitSearch:
 
     def orbit(self, guess: Array) -> PeriodicOrbit:
         """Return the orbit near a guess."""
-        z, found = guess, self._closing(guess)
-        for iteration in range(MOST_ITERATIONS):  # noqa: B007  (the count is reported)
-            nearer = self._nearer(z, found)
-            if nearer is None:
-                break
-            z, found = nearer
-        m, motion = self.stepper.dimension, found.monodromy
+        z, found, iterations = self._iterated(*self._by_segments(guess))
+        m, motion = self.stepper.dimension, found.motion
         size = float(np.abs([z[:-1], guess[:-1]]).max())
-        allowed = CLOSED * max(1.0, float(np.linalg.norm(motion, 2)))
+        allowed = CLOSED * max(1.0, float(np.linalg.norm(motion.monodromy, 2)))
         if not found.error <= allowed * size:
             raise OrbitError(
-                f"no orbit closes near here: after {iteration} iterations it ends {found.error:.1e} from where it "
+                f"no orbit closes near here: after {iterations} iterations it ends {found.error:.1e} from where it "
                 "began. Give a nearer guess, or more steps"
             )
         self._check_energy(found, allowed * size)
-        if np.linalg.norm(found.by_period) * z[-1] <= RESTING * size:
+        if np.linalg.norm(motion.by_period) * z[-1] <= RESTING * size:
             raise OrbitError("the iteration ended in a state at rest, which every period closes: give a nearer guess")
-        if found.by_time.any():
+        if motion.by_time.any():
             self._check_repeats(z, found, allowed * size)
         return PeriodicOrbit(
             q=z[:m],
@@ -197,13 +197,45 @@ class _OrbitSearch:
             t=self.t,
             period=float(z[-1]),
             steps=self.steps,
-            monodromy=motion,
+            monodromy=motion.monodromy,
             residual=found.error,
-            iterations=iteration,
+            iterations=iterations,
             parameters=self.parameters,
             stepper=self.stepper,
             options=self.options,
         )
+
+    def _by_segments(self, guess: Array) -> tuple[Array, _Closing, int]:
+        """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
+
+        States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
+        *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
+        period backward from the guess: an error of the guess grows by the square root of the growth in a period.
+        """
+        half, start = self.steps // 2, guess[:-1]
+        forward = self._segment(start, 0, half, guess[-1])
+        backward = self._segment(start, 0, self.steps - half, -guess[-1])
+        monodromy = np.linalg.solve(backward.monodromy.T, forward.monodromy.T).T
+        growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
+        if growth <= EASY:
+            return guess, self._closing(guess), 0
+        count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)), self.steps)
+        later = backward.states + np.append(self.gain, np.zeros(len(self.gain)))
+        path = np.vstack([start, forward.states, later[-2::-1]])
+        nodes = np.append(path[self._bounds(count)[:-1]], guess[-1])
+        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
+        nearer = np.append(z[: len(start)], z[-1])
+        return nearer, self._closing(nearer), iterations
+
+    def _bounds(self, count: int) -> NDArray[np.intp]:
+        """Return the (count + 1,) numbers of the steps at which segments begin and end."""
+        return np.linspace(0, self.steps, count + 1).round().astype(np.intp)
+
+    def _iterated(self, z: Array, found: _Closing, iterations: int) -> tuple[Array, _Closing, int]:
+        """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
+        while iterations < MOST_ITERATIONS and (nearer := self._nearer(z, found)) is not None:
+            (z, found), iterations = nearer, iterations + 1
+        return z, found, iterations
 
     def _check_energy(self, found: _Closing, allowed: float) -> None:
         """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
@@ -217,13 +249,13 @@ class _OrbitSearch:
     def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:
         """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
         period = float(z[-1])
-        if len(z) - 1 in self.free:
+        if -1 not in self.held:
             raise MethodError(
                 f"'{self.stepper.interface.system}' depends on time, and orbits close after a period of what it "
                 "depends on: give that as period, with fixed_period=True"
             )
         later = replace(self, t=self.t + period)._closing(z)
-        away = max(float(np.abs(later.end - found.end).max()), later.error)
+        away = max(float(np.abs(later.motion.states[-1] - found.motion.states[-1]).max()), later.error)
         if not away <= allowed:
             raise OrbitError(
                 f"what closes from t = {self.t:g} ends {away:.1e} from there after another period: what "
@@ -236,8 +268,9 @@ class _OrbitSearch:
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
+        free = np.delete(np.arange(len(z)), self.held)
         inverse = np.zeros((len(z), len(found.defects)))
-        inverse[self.free] = np.linalg.pinv(found.slopes[:, self.free], UNDECIDED)
+        inverse[free] = np.linalg.pinv(found.slopes[:, free], UNDECIDED)
         change = inverse @ found.defects
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
@@ -253,39 +286,69 @@ class _OrbitSearch:
         return None
 
     def _closing(self, z: Array) -> _Closing:
-        """Integrate one period and return the residuals with their derivatives."""
-        stepper, m, size = self.stepper, self.stepper.dimension, len(z) - 1
-        h = z[-1] / self.steps
-        starts = Starts.chain(z[:m], z[m:-1], times_after(self.t, h, np.arange(self.steps))[0], np.full(self.steps, h))
-        vectors = np.zeros((self.steps + 1, size + 2, stepper.given))
-        vectors[0, :size, :size] = np.eye(size)
-        vectors[0, size:, [-1, -2]] = np.diag([1.0 / self.steps, 1.0])
-        q, p = stepper.linearise(starts, vectors, self.parameters, self.options, chained=True)
-        slopes = vectors[-1, :, :size].T
-        monodromy, by_period, by_time = slopes[:, :size], slopes[:, size], slopes[:, size + 1]
-        end = np.concatenate([q[-1], p[-1]])
-        defects = end - z[:-1] - np.append(self.gain, np.zeros(m))
-        slopes = np.column_stack([monodromy - np.eye(size), by_period])
-        free = self._not_implied(z, end, monodromy)
-        rows, wanted = free @ slopes, free @ defects
+        """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
+        size = 2 * self.stepper.dimension
+        starts = z[:-1].reshape(-1, size)
+        count = len(starts)
+        bounds = self._bounds(count)
+        segments = [self._segment(*each, z[-1]) for each in zip(starts, bounds[:-1], bounds[1:], strict=True)]
+        rows = np.zeros((count, size, count * size + 1))
+        defects = np.array([segment.states[-1] for segment in segments]) - np.roll(starts, -1, axis=0)
+        defects[-1] -= np.append(self.gain, np.zeros(size // 2))
+        for k, segment in enumerate(segments):
+            after = (k + 1) % count
+            rows[k, :, k * size : (k + 1) * size] = segment.monodromy
+            rows[k, :, after * size : (after + 1) * size] -= np.eye(size)
+            rows[k, :, -1] = segment.by_period
+        error = float(np.abs(defects).max())
+        left = self._not_implied(starts, segments)
+        rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
+        slopes, wanted = rows.reshape(count * size, -1), defects.ravel()
         if self.energy is not None:
-            wanted = np.append(wanted, stepper.energy(z[:m], z[m:-1], self.t, self.parameters) - self.energy)
-            rows = np.vstack([rows, np.append(self._slopes_of_integrals(z[:-1], self.t)[0], 0.0)])
-        error, derivatives = float(np.abs(defects).max()), (monodromy.copy(), by_period.copy(), by_time.copy())
-        return _Closing(end, error, wanted, rows, *derivatives)
+            first = starts[0]
+            energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
+            wanted = np.append(wanted, energy - self.energy)
+            row = np.zeros(len(z))
+            row[:size] = self._slopes_of_integrals(first, self.t)[0]
+            slopes = np.vstack([slopes, row])
+        return _Closing(segments, error, wanted, slopes)
 
-    def _not_implied(self, z: Array, end: Array, monodromy: Array) -> Array:
-        """Return the (2m, 2m) projection onto the equations not implied by conserved quantities.
+    def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
+        """Integrate from the start of step ``first`` to the start of step ``last``."""
+        stepper, size, steps = self.stepper, len(start), last - first
+        h = period / self.steps
+        times = times_after(self.t, h, np.arange(first, last))[0]
+        starts = Starts.chain(start[: size // 2], start[size // 2 :], times, np.full(steps, h))
+        vectors = np.zeros((steps + 1, size + 2, stepper.given))
+        vectors[0, :size, :size] = np.eye(size)
+        vectors[0, size, -2:] = first / self.steps, 1.0 / self.steps
+        vectors[0, size + 1, -2] = 1.0
+        q, p = stepper.linearise(starts, vectors, self.parameters, self.options, chained=True)
+        slopes = vectors[-1, :, :size].T.copy()
+        return _Segment(
+            states=np.column_stack([q, p]),
+            start_time=self.t + period * (first / self.steps),
+            end_time=self.t + period * (last / self.steps),
+            monodromy=slopes[:, :size],
+            by_period=slopes[:, size],
+            by_time=slopes[:, size + 1],
+        )
 
-        Energy and momentum maps count as conserved if the monodromy matrix maps their gradients accordingly.
+    def _not_implied(self, starts: Array, segments: Sequence[_Segment]) -> Array:
+        """Return the (2m, 2m) projection onto the equations of return not implied by conserved quantities.
+
+        Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
         """
-        start, ends = (self._slopes_of_integrals(state, t) for state, t in ((z[:-1], self.t), (end, self.t + z[-1])))
-        carried = ends @ monodromy
-        sizes = np.linalg.norm(ends, axis=1) * np.linalg.norm(monodromy, 2)
-        kept = start[np.linalg.norm(carried - start, axis=1) <= KEPT * sizes]
-        directions, strengths, _ = np.linalg.svd(kept.T, full_matrices=False)
+        kept = []
+        for start, segment in zip(starts, segments, strict=True):
+            begin = self._slopes_of_integrals(start, segment.start_time)
+            end = self._slopes_of_integrals(segment.states[-1], segment.end_time)
+            sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(segment.monodromy, 2)
+            kept.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= KEPT * sizes)
+        conserved = self._slopes_of_integrals(starts[0], self.t)[np.all(kept, axis=0)]
+        directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > KEPT * strengths.max(initial=0.0)]
-        projection: Array = np.eye(len(end)) - directions @ directions.T
+        projection: Array = np.eye(starts.shape[1]) - directions @ directions.T
         return projection
 
     def _slopes_of_integrals(self, state: Array, t: float) -> Array:
@@ -305,21 +368,41 @@ class _OrbitSearch:
 
 
 @dataclass(frozen=True, eq=False)
-class _Closing:
-    """Residuals of the closing conditions.
+class _Segment:
+    """Trajectory along some of the steps of a period.
 
     Attributes:
-        end: (2m,) state after one period.
-        error: largest entry of the end minus the start.
-        defects: (r,) residuals.
-        slopes: (r, 2m + 1) Jacobian of the residuals with respect to (q, p, period).
+        states: (n, 2m) states after each step.
+        start_time, end_time: times of its ends.
         monodromy, by_period, by_time: derivatives of the end; the last is 0 for autonomous systems.
     """
 
-    end: Array
-    error: float
-    defects: Array
-    slopes: Array
+    states: Array
+    start_time: float
+    end_time: float
     monodromy: Array
     by_period: Array
     by_time: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Closing:
+    """Residuals of the conditions of continuity and closing.
+
+    Attributes:
+        segments: in their order.
+        error: largest entry of the ends minus the starts that follow.
+        defects: (r,) residuals.
+        slopes: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+    """
+
+    segments: Sequence[_Segment]
+    error: float
+    defects: Array
+    slopes: Array
+
+    @property
+    def motion(self) -> _Segment:
+        """Return the only segment, of a whole period."""
+        (motion,) = self.segments
+        return motion

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 from scipy.special import ellipk
 
 from scvi_codegen import (
@@ -61,18 +62,20 @@ def test_a_halo_orbit_is_the_published_one(restricted):
     assert len(orbit.run(save_every=50)) == 5
 
 
-def _monodromy(orbit):
-    """Of positions and momenta: p = v + (-y, x, 0), H = p^2/2 + y p_x - x p_y - .."""
+def _motion(t, z):
+    """Return the rates of positions and momenta: p = v + (-y, x, 0), H = p^2/2 + y p_x - x p_y - .."""
+    (x, y, w), p = z[:3], z[3:]
+    v = np.array([p[0] + y, p[1] - x, p[2]])
+    near, far = (x + EARTH_MOON, y, w), (x - 1 + EARTH_MOON, y, w)
+    pull = sum(m * np.array(r) / np.linalg.norm(r) ** 3 for m, r in ((1 - EARTH_MOON, near), (EARTH_MOON, far)))
+    return [*v, p[1] - pull[0], -p[0] - pull[1], -pull[2]]
 
-    def motion(t, z):
-        (x, y, w), p = z[:3], z[3:]
-        v = np.array([p[0] + y, p[1] - x, p[2]])
-        near, far = (x + EARTH_MOON, y, w), (x - 1 + EARTH_MOON, y, w)
-        pull = sum(m * np.array(r) / np.linalg.norm(r) ** 3 for m, r in ((1 - EARTH_MOON, near), (EARTH_MOON, far)))
-        return [*v, p[1] - pull[0], -p[0] - pull[1], -pull[2]]
+
+def _monodromy(orbit):
+    """Return the monodromy by differences of motions by DOP853."""
 
     def end(z):
-        return solve_ivp(motion, (0, orbit.period), z, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+        return solve_ivp(_motion, (0, orbit.period), z, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
 
     start = np.concatenate([orbit.q, orbit.p])
     columns = []
@@ -80,6 +83,32 @@ def _monodromy(orbit):
         a, b, c, d = (end(start + s * unit) for s in (1, -1, 2, -2))
         columns.append((8 * (a - b) - (c - d)) / 12e-5)
     return np.array(columns).T
+
+
+@pytest.mark.parametrize("error", [0.01, -0.01, 0.02, -0.02, 0.05, -0.05])
+def test_an_unstable_orbit_is_found_from_a_velocity_some_percent_off(restricted, error):
+    """A Lyapunov orbit about L1: tangent vectors grow by 1190 in a period. The reference is shooting by DOP853."""
+    x, speed, period = 0.8069, *_lyapunov_orbit(0.8069)
+    guess = {"velocity": [0.0, (1.0 + error) * speed, 0.0], "period": period}
+    orbit = periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, hold=["x", "y"])
+    assert restricted.velocity(orbit.q, orbit.p) == pytest.approx([0.0, speed, 0.0], abs=1e-9)
+    assert orbit.period == pytest.approx(period, abs=1e-8)
+    assert np.abs(orbit.stability_indices).max() == pytest.approx(594.2, abs=0.1)
+    assert orbit.residual < 1e-11
+
+
+def _lyapunov_orbit(x):
+    """Speed at (x, 0) and period of the planar orbit that crosses y = 0 again at right angles."""
+
+    def half(speed):
+        end = lambda t, z: z[1] if t > 0.5 else 1.0  # noqa: E731  (solve_ivp reads an attribute of it)
+        end.terminal = True
+        start = [x, 0.0, 0.0, 0.0, speed + x, 0.0]
+        found = solve_ivp(_motion, (0, 4), start, method="DOP853", rtol=1e-13, atol=1e-14, events=end)
+        return found.y_events[0][0, 3] + found.y_events[0][0, 1], found.t_events[0][0]
+
+    speed = brentq(lambda v: half(v)[0], 0.29, 0.31, xtol=1e-14)
+    return speed, 2.0 * half(speed)[1]
 
 
 def test_a_pendulum_swings_as_long_as_the_elliptic_integral_says():
