@@ -290,6 +290,7 @@ def test_folders_that_are_no_packages_are_named(pendulum, tmp_path):
         (json.dumps(record | {"format": 99}), "another format"),
         (json.dumps(record | {"interface": {}}), "damaged"),
         (json.dumps({"format": 1}), "damaged"),
+        (json.dumps(record | {"interface": record["interface"] | {"unknowns": 7}}), "damaged"),
     ):
         path.write_text(text)
         with pytest.raises(PackageError, match=message):
