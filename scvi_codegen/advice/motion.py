@@ -205,7 +205,7 @@ def _plan(
     if _paced(stepper):
         error = wish.rtol or 0.0
         tau = longest_step(stepper, *motion, error, **along)
-        return _Chosen(tau, None, lambda run: too_wrong(run.step_error, run.step_error_t, error) or "")
+        return _Chosen(tau, None, lambda run: too_wrong(run.step_error, run.worst_step_time, error) or "")
     advised = wish.tolerance if wish.tolerance is not None or _chooses(stepper) else ADVISED
     if wish.rtol is not None or uncompiled is None or advised is None:
         return _Chosen(None, wish.rtol)

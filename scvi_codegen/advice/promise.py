@@ -66,7 +66,7 @@ def _worst_step(trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> 
     if not trajectory.step_error > STEP_MARGIN * tolerance:
         return ""
     return (
-        f"the tolerance {tolerance:g} is not kept: the step from t = {trajectory.step_error_t:g} alone has a "
+        f"the tolerance {tolerance:g} is not kept: the step from t = {trajectory.worst_step_time:g} alone has a "
         f"relative error of about {trajectory.step_error:.1e}"
     )
 

@@ -32,7 +32,7 @@ def run_numbers(
     return {
         **_about(model),
         "steps": run.steps,
-        "rejected": run.rejected,
+        "rejected_steps": run.rejected_steps,
         "h": run.goal.tau or None if run.goal else run.h,
         "states": len(trajectory),
         "seconds": outcome.seconds,
@@ -41,7 +41,7 @@ def run_numbers(
         "work": None if balance is None else balance.work,
         "energy_balance": None if balance is None else balance.error,
         "step_error": trajectory.step_error,
-        "step_error_t": trajectory.step_error_t,
+        "worst_step_time": trajectory.worst_step_time,
         "final": {"t": t, "q": _named(model, q), "p": _named(model, p)},
         "final_error": None if known is None else {"q": _named(model, known.q), "p": _named(model, known.p)},
         "chaotic": None if known is None else known.chaotic,

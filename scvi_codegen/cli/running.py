@@ -183,7 +183,7 @@ def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | No
     allowed = allowed_error(model)
     if allowed is None or not model.paced:
         return None
-    return too_wrong(trajectory.step_error, trajectory.step_error_t, allowed)
+    return too_wrong(trajectory.step_error, trajectory.worst_step_time, allowed)
 
 
 def _length(model: Model) -> int:
@@ -241,7 +241,7 @@ def of_length(h: float | None, run: Run) -> str:
         return f"of {run.h:g} in tau"
     if run.goal and run.goal.tau:
         return f"of {run.goal.tau:g} in tau by the reversible controller"
-    return f"of their own lengths ({run.rejected} rejected)" if run.goal or h is None else f"of {h:g}"
+    return f"of their own lengths ({run.rejected_steps} rejected)" if run.goal or h is None else f"of {h:g}"
 
 
 def _speed(outcome: RunOutcome, save_every: int) -> str:
@@ -269,7 +269,7 @@ def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) ->
 
     The warning does not depend on options such as ``--quiet``.
     """
-    error, begun = trajectory.step_error, f"from t = {trajectory.step_error_t:g}"
+    error, begun = trajectory.step_error, f"from t = {trajectory.worst_step_time:g}"
     if math.isnan(error):
         yield "worst step: its error is not known, nothing tells it here"
     else:
@@ -313,5 +313,5 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
         q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
         iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
-        lengths=np.concatenate([*(piece.lengths[:-1] for piece in pieces), last.lengths[-1:]]),
+        step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in pieces), last.step_sizes[-1:]]),
     )

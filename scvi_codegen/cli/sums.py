@@ -196,7 +196,7 @@ def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
         "energy_error": _energy_error(outcome),
         "momentum_changes": dict(_map_changes(outcome)),
         "step_error": trajectory.step_error,
-        "step_error_t": trajectory.step_error_t,
+        "worst_step_time": trajectory.worst_step_time,
         "final": {"t": run.t, "q": run.q, "p": run.p},
         "failure": failure if outcome.failure is None else str(outcome.failure),
     }

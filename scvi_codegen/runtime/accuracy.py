@@ -65,7 +65,7 @@ class Steps(Protocol):
     @property
     def step_error(self) -> float: ...
     @property
-    def step_error_t(self) -> float: ...
+    def worst_step_time(self) -> float: ...
 
 
 class EnergyAtEnds(Protocol):
@@ -119,8 +119,8 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
     if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
         return
     warn(
-        f"the step from t = {trajectory.step_error_t:g} with h = {trajectory.h:g} is too long: the relative error of "
-        f"its end is about {error:.1e}; take a shorter h{remedy}",
+        f"the step from t = {trajectory.worst_step_time:g} with h = {trajectory.h:g} is too long: the relative error "
+        f"of its end is about {error:.1e}; take a shorter h{remedy}",
         AccuracyWarning,
     )
 

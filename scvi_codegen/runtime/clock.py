@@ -75,7 +75,7 @@ def _steps_from(states: KeptStates, kept: int) -> tuple[Array, Array, Array, flo
     """Return the states of all steps from a saved state up to the next one, and the size of these steps."""
     assert states.tau is not None
     t, q, p = (array[kept : kept + 1] for array in (states.t, states.q, states.p))
-    h = float(np.nan_to_num(states.lengths[kept], nan=states.h))
+    h = float(np.nan_to_num(states.step_sizes[kept], nan=states.h))
     count = round((states.tau[kept + 1] - states.tau[kept]) / h) if kept + 1 < len(states) else 1
     if count <= 1:
         return t, q, p, h

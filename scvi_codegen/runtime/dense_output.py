@@ -62,11 +62,11 @@ def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array,
         _check_on_grid(states)
         return states_by_clock(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    if states.goal is not None and np.isnan(states.lengths[:-1]).any():
+    if states.goal is not None and np.isnan(states.step_sizes[:-1]).any():
         return *_run_to_each(states, left, times, states.goal), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
-    whole = whole_steps(times - t, np.nan_to_num(states.lengths[left], nan=np.inf))
+    whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
     between = np.flatnonzero(whole)
     _takewhole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
     _take_parts(states, t, times - t, q, p)
@@ -117,7 +117,7 @@ def _takewhole_steps(
                 states.stepper,
                 q[k],
                 p[k],
-                h=states.lengths[kept],
+                h=states.step_sizes[kept],
                 t=t[k],
                 parameters=states.parameters,
                 options=states.options,
@@ -173,7 +173,7 @@ def within(times: Array, first: float, last: float) -> Array:
 def grid_tolerance(states: KeptStates) -> Array:
     """Return (n,) distances within which a time counts as the end of a step: times are rounded."""
     rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped).max()
-    tolerance: Array = np.fmax(ON_GRID * np.abs(states.lengths), rounding)
+    tolerance: Array = np.fmax(ON_GRID * np.abs(states.step_sizes), rounding)
     return tolerance
 
 
@@ -183,12 +183,12 @@ def lengths_at(states: KeptStates, times: Array) -> Array:
     after = np.minimum(before + 1, len(states) - 1)
     nearest = np.where(np.abs(states.t[after] - times) < np.abs(times - states.t[before]), after, before)
     off = np.abs(times - states.t[nearest]) > grid_tolerance(states)[nearest]
-    return np.where(off, np.nan, states.lengths[nearest])
+    return np.where(off, np.nan, states.step_sizes[nearest])
 
 
 def _check_on_grid(states: KeptStates) -> None:
     """Raise ``StateError`` unless all states but the last (an event may end it) are at whole steps from the first."""
-    if np.isnan(states.lengths[:-1]).any():
+    if np.isnan(states.step_sizes[:-1]).any():
         raise StateError(
             "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
             "integrate without t_eval, then ask for states between"

@@ -301,7 +301,7 @@ def with_end(piece: Trajectory, run: Run) -> Trajectory:
         q=np.append(piece.q, [run.q], axis=0),
         p=np.append(piece.p, [run.p], axis=0),
         iterations=np.append(piece.iterations, np.int32(iterations)),
-        lengths=np.append(piece.lengths, run.h),
+        step_sizes=np.append(piece.step_sizes, run.h),
     )
 
 

@@ -137,9 +137,9 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
         return self.pieces[-1].step_error
 
     @property
-    def step_error_t(self) -> float:
+    def worst_step_time(self) -> float:
         """Start time of the step with the largest error."""
-        return self.pieces[-1].step_error_t
+        return self.pieces[-1].worst_step_time
 
     def __len__(self) -> int:
         return len(self.t)

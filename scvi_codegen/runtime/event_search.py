@@ -63,7 +63,7 @@ class CrossingSearch:
             EventError: if an event function is not finite.
             StepFailedError: if a partial step fails.
         """
-        h, t, q, p = map(np.ascontiguousarray, (part.lengths, part.t, part.q, part.p))
+        h, t, q, p = map(np.ascontiguousarray, (part.step_sizes, part.t, part.q, part.p))
         parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
         workspace, report = self.binding.workspace(), self.binding.new("report *")
         done = 0
@@ -121,7 +121,7 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
         StateError: if intermediate states were not saved.
         EventError, StepFailedError: as :meth:`CrossingSearch.search`.
     """
-    lengths, spans, tolerance = states.lengths.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]
+    lengths, spans, tolerance = states.step_sizes.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]
     short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
     if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
         raise StateError(
@@ -131,5 +131,5 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
     search = CrossingSearch(stepper)
     for number in range(len(stepper.events)):
         search.watch.remaining[number] = 0
-    search.search(replace(states, lengths=lengths))
+    search.search(replace(states, step_sizes=lengths))
     return search.crossings()

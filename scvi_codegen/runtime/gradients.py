@@ -194,7 +194,7 @@ def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors
 
 def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of segments whose steps are all saved, or of two consecutive saved states."""
-    spans, lengths = np.diff(states.stepped), states.lengths[:-1]
+    spans, lengths = np.diff(states.stepped), states.step_sizes[:-1]
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
     first = 0
     while first < len(spans):
@@ -208,10 +208,10 @@ def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
 
 def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
     """Return the steps of a segment, and (steps + 1,) indices of the saved states at their ends, -1 if not saved."""
-    length, span = float(states.lengths[first]), float(states.stepped[last] - states.stepped[first])
+    length, span = float(states.step_sizes[first]), float(states.stepped[last] - states.stepped[first])
     count = steps_between(length, span) if last == first + 1 else 1
     if count == 1:
-        spans, lengths = np.diff(states.stepped[first : last + 1]), states.lengths[first:last]
+        spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
         h = np.where(np.abs(spans - lengths) < SAME_LENGTH * np.abs(lengths), lengths, spans)
         of = slice(first, last + 1)
         starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())

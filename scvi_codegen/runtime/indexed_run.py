@@ -303,12 +303,12 @@ class IndexedRun(OneThread):
         return float(self._binding.function("step_error")(self._run))
 
     @property
-    def step_error_t(self) -> float:
+    def worst_step_time(self) -> float:
         """Start time of the worst step."""
         return float(self._run.error_t)
 
     @property
-    def rejected(self) -> int:
+    def rejected_steps(self) -> int:
         """Number of rejected steps."""
         return int(self._run.rejected)
 

@@ -40,10 +40,10 @@ class IndexedTrajectory(Confirmed):
         inverse_masses: 1/m of every coordinate, in the shape of one state; empty for a Hamiltonian.
         h: step size, that of the last step if adaptive.
         steps, iterations: numbers of steps and of solver iterations.
-        step_error, step_error_t: estimated error of the worst step, relative to the largest coordinate, and its start
-            time; NaN for explicit methods.
+        step_error, worst_step_time: estimated error of the worst step, relative to the largest coordinate, and its
+            start time; NaN for explicit methods.
         goal: step plan of adaptive steps, else ``None``.
-        rejected: number of rejected adaptive steps.
+        rejected_steps: number of rejected adaptive steps.
         events: crossings of each event, in their order.
         departures: data for dense output after each state.
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
@@ -60,9 +60,9 @@ class IndexedTrajectory(Confirmed):
     steps: int
     iterations: int
     step_error: float
-    step_error_t: float
+    worst_step_time: float
     goal: Goal | None = None
-    rejected: int = 0
+    rejected_steps: int = 0
     events: tuple[IndexedCrossings, ...] = ()
     departures: tuple[Departure, ...] = field(default=(), repr=False)
     confirmation: GlobalError | None = field(default=None, repr=False)
@@ -268,9 +268,9 @@ class IndexedRecord:
             steps=run.steps,
             iterations=run.iterations,
             step_error=run.step_error,
-            step_error_t=run.step_error_t,
+            worst_step_time=run.worst_step_time,
             goal=run.goal,
-            rejected=run.rejected,
+            rejected_steps=run.rejected_steps,
             events=self.search.crossings() if self.search else (),
             departures=tuple(self.departures),
         )

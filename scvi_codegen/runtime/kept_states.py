@@ -47,14 +47,14 @@ class KeptStates:
     """Saved states with the data for dense output and events; other fields as of :class:`Trajectory`.
 
     Attributes:
-        lengths: (n,) size of the step that follows each state, NaN for a state within a step.
-        tau: (n,) values of tau in transformed time, else ``None``; ``lengths`` are then steps of tau.
+        step_sizes: (n,) size of the step that follows each state, NaN for a state within a step.
+        tau: (n,) values of tau in transformed time, else ``None``; ``step_sizes`` are then steps of tau.
     """
 
     t: Array
     q: Array
     p: Array
-    lengths: Array
+    step_sizes: Array
     h: float
     parameters: Array
     stepper: Integrator = field(repr=False)

@@ -66,7 +66,7 @@ class TransformedTime(OwnTime):
     @classmethod
     def of(cls, states: KeptStates) -> TransformedTime:
         """Construct from the states of a run."""
-        held = len(states) > 1 and bool(np.isnan(states.lengths[-1]))
+        held = len(states) > 1 and bool(np.isnan(states.step_sizes[-1]))
         repeated = held and bool(states.stepped[-1] == states.stepped[-2])
         return cls(_before_last(states) if repeated else states, held, repeated)
 
@@ -131,7 +131,7 @@ def _before_last(states: KeptStates) -> KeptStates:
         t=states.t[:-1],
         q=states.q[:-1],
         p=states.p[:-1],
-        lengths=states.lengths[:-1],
+        step_sizes=states.step_sizes[:-1],
         h=states.h,
         parameters=states.parameters,
         stepper=states.stepper,

@@ -299,7 +299,7 @@ class Memory(OneThread):
         return self.goal is not None and self.left_to(self.goal.t_end) == 0.0
 
     @property
-    def rejected(self) -> int:
+    def rejected_steps(self) -> int:
         """Number of rejected steps."""
         return int(getattr(self._memory, "rejected", 0))
 

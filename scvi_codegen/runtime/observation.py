@@ -122,7 +122,7 @@ class Observation:
         assert self.search is not None
         last = self.search.found[-1][-1]
         _, _, tau = self._inside(part, float(last["t"]))
-        return self._closed(part, part.lengths, last["t"], last["q"], last["p"], tau)
+        return self._closed(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
         """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
@@ -135,7 +135,7 @@ class Observation:
             whole -= 1
             part = record(self.run, whole)
         q, p, tau = self._inside(part, self.end)
-        lengths = part.lengths.copy()
+        lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
         if tau is None:
             run = self.run
@@ -176,7 +176,7 @@ class Observation:
         wanted[0] = first
         wanted[-1] |= self.ended or self.run.arrived
         q, p = part.q[wanted], part.p[wanted]
-        self.states.append((part.t[wanted], q, p, part.lengths[wanted], part.stepped[wanted], total[wanted]))
+        self.states.append((part.t[wanted], q, p, part.step_sizes[wanted], part.stepped[wanted], total[wanted]))
 
     def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
         assert self.times is not None
@@ -198,7 +198,7 @@ class Observation:
     ) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
         tau = stepped if self.run.stepper.interface.energy_parameter else None
-        return trajectory_of(self.run, t, q, p, iterations, lengths=lengths, events=crossings, tau=tau)
+        return trajectory_of(self.run, t, q, p, iterations, step_sizes=lengths, events=crossings, tau=tau)
 
 
 def observed_until(

@@ -148,7 +148,7 @@ def _joined(memory: Memory, pieces: Sequence[_Piece], save_every: int) -> Trajec
     lengths = np.full(len(t), np.nan)
     if save_every == 1:
         lengths[:-1] = np.diff(t)
-    return trajectory_of(memory, t, q, p, iterations, lengths=lengths)
+    return trajectory_of(memory, t, q, p, iterations, step_sizes=lengths)
 
 
 def trajectory_of(
@@ -158,24 +158,24 @@ def trajectory_of(
     p: Array,
     iterations: NDArray[np.int32],
     *,
-    lengths: Array | None = None,
+    step_sizes: Array | None = None,
     events: tuple[Crossings, ...] = (),
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
-    step_error, step_error_t = memory.step_error
+    step_error, worst_step_time = memory.step_error
     return Trajectory(
         t=t,
         q=q,
         p=p,
         iterations=iterations,
-        lengths=np.broadcast_to(memory.h, t.shape) if lengths is None else lengths,
+        step_sizes=np.broadcast_to(memory.h, t.shape) if step_sizes is None else step_sizes,
         h=memory.h if memory.goal is None else first_length(memory.goal, t),
         goal=memory.goal,
         steps=memory.steps,
-        rejected=memory.rejected,
+        rejected_steps=memory.rejected_steps,
         step_error=step_error,
-        step_error_t=step_error_t,
+        worst_step_time=worst_step_time,
         parameters=memory.parameters,
         stepper=memory.stepper,
         options=memory.options,

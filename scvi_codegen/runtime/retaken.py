@@ -37,7 +37,7 @@ def retaken(
         StepFailedError: if Newton's iteration does not converge.
     """
     for k, (start, length, end) in enumerate(
-        zip(states.t[:-1].tolist(), states.lengths[:-1].tolist(), states.t[1:].tolist(), strict=True)
+        zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), states.t[1:].tolist(), strict=True)
     ):
         count, given = steps_between(length, end - start), []
         q, p = states.q[k], states.p[k]

@@ -106,7 +106,7 @@ def along(states: KeptStates, changes: Changes) -> Deviations:
         carry(states, steps, numbers, vectors, back=False)
 
     states.stepper.check_own_time("what nearby motions do")
-    first = states.q[0], states.p[0], float(states.lengths[0]), float(states.t[0])
+    first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
     spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper.given, states.t)
     spreading.follow((starts_of(states, first, last) for first, last in pieces(states)), carried)
     return Deviations.of(states.t, spreading.growth.found)

@@ -52,18 +52,18 @@ class Trajectory(NearbyMotions, Confirmed):
         p: (n, m) momenta.
         iterations: (n,) solver iterations since the previous state, 0 for the first.
         h: step size (negative: backward), the first one for adaptive steps.
-        lengths: (n,) size of the step that follows each state; NaN for a state within a step, of ``t_eval`` or where an
-            event ended the run.
-        tau: (n,) values of tau in transformed time (:func:`~scvi_codegen.reparametrise`), where h and lengths are steps
-            of tau; else ``None``.
+        step_sizes: (n,) size of the step that follows each state; NaN for a state within a step, of ``t_eval`` or where
+            an event ended the run.
+        tau: (n,) values of tau in transformed time (:func:`~scvi_codegen.reparametrise`), where h and ``step_sizes``
+            are steps of tau; else ``None``.
         parameters: (k,) values in the order of ``stepper.parameters``.
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
         goal: step plan of adaptive steps, else ``None``.
-        steps, rejected: numbers of completed and of rejected steps since the start of the run.
-        step_error, step_error_t: estimated relative error of the worst step of the run, and its start time. The error
-            is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
+        steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
+        step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
+            error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
             without an error estimate.
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
     """
@@ -71,9 +71,9 @@ class Trajectory(NearbyMotions, Confirmed):
     iterations: NDArray[np.int32]
     events: tuple[Crossings, ...] = ()
     steps: int = 0
-    rejected: int = 0
+    rejected_steps: int = 0
     step_error: float = np.nan
-    step_error_t: float = np.nan
+    worst_step_time: float = np.nan
     confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
@@ -95,7 +95,7 @@ class Trajectory(NearbyMotions, Confirmed):
             k = checked_row(rows, len(self))
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
         first, last, stride = checked_rows(rows, len(self))
-        lengths = self.lengths[rows]
+        lengths = self.step_sizes[rows]
         if stride > 1 and self.goal is not None:  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
@@ -103,7 +103,7 @@ class Trajectory(NearbyMotions, Confirmed):
             self,
             **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
             tau=None if self.tau is None else self.tau[rows],
-            lengths=lengths,
+            step_sizes=lengths,
             events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
         )
 
@@ -238,12 +238,14 @@ class Trajectory(NearbyMotions, Confirmed):
         return card(self.stepper.title, facts, grid(rows))
 
     def _steps(self) -> str:
-        return f"{self.steps} steps of their own lengths, {self.rejected} rejected" if self.goal else f"h = {self.h:g}"
+        if self.goal:
+            return f"{self.steps} steps of their own lengths, {self.rejected_steps} rejected"
+        return f"h = {self.h:g}"
 
     def _worst(self) -> str:
         if math.isnan(self.step_error):
             return "not known: nothing tells it here"
-        said = f"about {self.step_error:.1e} relative in the step from t = {self.step_error_t:g}, the worst"
+        said = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
         return f"{said}; too long" if self.step_error > TOLERABLE_ERROR else said
 
     def _energies(self, save_every: int) -> Array | None:

@@ -59,7 +59,7 @@ class TestLongSteps:
         chosen = sc.problem(name)
         stepper = sc.compile_stepper(chosen.system, sc.SVI(2))
         run = stepper.integrate(chosen.q, stepper.momentum(chosen.q, chosen.velocity), h=h, steps=200)
-        k = int(np.searchsorted(run.t, run.step_error_t))
+        k = int(np.searchsorted(run.t, run.worst_step_time))
         better = stepper.integrate(run.q[k], run.p[k], h=h / 16, steps=16).q[-1]
         true = np.abs(run.q[k + 1] - better).max() / np.abs(better).max()
         assert true / 10 < run.step_error < 1e-3

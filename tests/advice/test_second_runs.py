@@ -93,7 +93,7 @@ def test_a_chaotic_motion_is_known_as_such():
 def of_promise(**more):
     """A run whose worst step and energy are in doubt or not."""
     q = np.ones((64, 1))
-    stated = {"step_error": 1e-12, "step_error_t": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
+    stated = {"step_error": 1e-12, "worst_step_time": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
     return SimpleNamespace(**(stated | {"energy": lambda: np.ones(64)} | more))
 
 

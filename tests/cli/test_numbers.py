@@ -292,7 +292,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         "method": lambda x: x == kind.method[1],
         "order": lambda x: x == kind.method[2],
         "steps": lambda x: x == kind.steps if kind.steps else count - x + kind.save_every >= 0 and x <= count,
-        "rejected": lambda x: x == 0 if kind.h else 0 <= x < count,
+        "rejected_steps": lambda x: x == 0 if kind.h else 0 <= x < count,
         "h": lambda x: x == kind.h,
         "states": lambda x: x == len(done.t),
         "seconds": lambda x: 0.0 < x < 5.0,
@@ -305,7 +305,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         "work": lambda x: abs(x - work) < 2e-3 * abs(work) if kind.accounted else x is None,
         "energy_balance": lambda x: balance_fits(done, x) if kind.accounted else x is None,
         "step_error": lambda x: errors.max() / 100 / kind.save_every < x < kind.pessimism * errors.max(),
-        "step_error_t": worst_found,
+        "worst_step_time": worst_found,
         "final": lambda x: x["q"] == named(done.q[-1]) and x["p"] == named(done.p[-1]) and x["t"] == done.t[-1],
         "final_error": near_truth,
         "chaotic": lambda x: x is False,
@@ -352,7 +352,7 @@ def first_lines(done: Done, lines: list[str]) -> None:
     assert (int(title[1]), title[2]) == (kind.method[2], kind.symplectic)
     way = re.fullmatch(r"(\d+) steps of (.*) from t = (\S+) to t = (\S+); (\d+) states kept", lines[2])
     assert (int(way[1]), int(way[5])) == (numbers["steps"], len(done.t))
-    assert way[2] == (f"{kind.h:g}" if kind.h else f"their own lengths ({numbers['rejected']} rejected)")
+    assert way[2] == (f"{kind.h:g}" if kind.h else f"their own lengths ({numbers['rejected_steps']} rejected)")
     assert (way[3], way[4]) == (f"{T:g}", f"{done.t[-1]:g}")
     speed = re.fullmatch(r"(\S+) s, (\S+) (\w+) a step, (\S+) iterations a step; prepared in (\S+) s", lines[3])
     a_step = float(speed[2]) * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[speed[3]]
@@ -387,7 +387,7 @@ def test_every_line_of_the_text(done):
         assert float(found[1]) == pytest.approx(relative_map(done, name), abs=2e-15)
     worst = re.fullmatch(r"worst step: relative error estimated at (\S+), from t = (\S+?)(: too long)?", rest.pop(0))
     assert worst[1] == f"{done.numbers['step_error']:.1e}"
-    assert worst[2] == f"{done.numbers['step_error_t']:g}"
+    assert worst[2] == f"{done.numbers['worst_step_time']:g}"
     assert (worst[3] is not None) == (done.numbers["step_error"] > 1e-3)
     assert rest.pop(0) == "final state (in the digits that a second run confirms)"
     for i, name in enumerate(done.kind.coordinates):
@@ -560,7 +560,7 @@ def test_every_field_and_line_of_an_array_system(tmp_path, monkeypatch):
             and x["momentum of q"] == pytest.approx(largest(p.sum(axis=1) - p[0].sum()), abs=1e-15)
         ),
         "step_error": lambda x: 1e-7 < x < 1e-2,
-        "step_error_t": lambda x: x % 0.25 == 0.0 and 0.0 <= x < 15.0,
+        "worst_step_time": lambda x: x % 0.25 == 0.0 and 0.0 <= x < 15.0,
         "final": lambda x: (x["t"], x["q"]["q"], x["p"]["q"]) == (15.0, q[-1].tolist(), p[-1].tolist()),
         "failure": lambda x: x is None,
         "written": lambda x: x == ["ring.npz"],

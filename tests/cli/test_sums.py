@@ -230,7 +230,7 @@ def test_pictures(axes: str, tmp_path: Path) -> None:
     values = np.arange(np.prod(shape), dtype=float).reshape(shape)
     nothing = {"observed": None, "energies": values, "maps": values, "inverse_masses": {}, "h": 1.0, "steps": 2}
     run = IndexedTrajectory(
-        t=np.arange(3.0), q={"q": values}, p={"q": values}, **nothing, iterations=0, step_error=0.0, step_error_t=0.0
+        t=np.arange(3.0), q={"q": values}, p={"q": values}, **nothing, iterations=0, step_error=0.0, worst_step_time=0.0
     )
     ax = plot_arrays(run, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 1000

@@ -176,7 +176,7 @@ class TestTrajectory:
             p=run.p,
             iterations=run.iterations,
             h=run.h,
-            lengths=run.lengths,
+            step_sizes=run.step_sizes,
             parameters=run.parameters,
             stepper=run.stepper,
         )

@@ -78,7 +78,7 @@ def test_a_part_is_a_trajectory_that_knows_states_between(kepler):
     piece, times = found[100:200], np.linspace(run.t[120], run.t[180], 9)
     assert np.array_equal(piece.at(times)[0], run.at(times)[0])
     assert np.abs(found[::5].at(times)[0] - run.at(times)[0]).max() < 1e-8
-    assert (piece.steps, piece.rejected, piece.step_error) == (run.steps, run.rejected, run.step_error)
+    assert (piece.steps, piece.rejected_steps, piece.step_error) == (run.steps, run.rejected_steps, run.step_error)
     assert found[:].h == found.h == run.h
     assert len(found[:0]) == 0
 

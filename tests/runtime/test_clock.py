@@ -146,8 +146,8 @@ def test_runs_end_at_a_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=9.0)
     assert run.t[-1] == 9.0
     assert run.tau is not None
-    assert 0.0 < run.lengths[-2] < 0.1
-    assert run.tau[-1] - run.tau[-2] == pytest.approx(run.lengths[-2])
+    assert 0.0 < run.step_sizes[-2] < 0.1
+    assert run.tau[-1] - run.tau[-2] == pytest.approx(run.step_sizes[-2])
     assert np.abs(kepler_time(run.q) - run.t).max() < 5e-13
     back = stepper(form).integrate(run.q[-1], run.p[-1], h=-0.1, t=9.0, t_end=0.0)
     assert back.t[-1] == 0.0

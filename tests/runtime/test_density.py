@@ -62,7 +62,7 @@ def test_steps_are_those_of_the_controller(method, solver):
     found = np.column_stack([run.t, run.q, run.p])[1:-1]
     assert np.abs(found - expected).max() < 1e-12
     assert run.t[-1] == 3.0
-    assert 0.0 < run.t[-1] - run.t[-2] <= run.lengths[-3] * 1.5
+    assert 0.0 < run.t[-1] - run.t[-2] <= run.step_sizes[-3] * 1.5
 
 
 def test_the_monitor_may_depend_on_time_where_the_system_does():
@@ -89,7 +89,7 @@ def test_a_hamiltonian_has_monitors_of_its_momenta():
     stepper = compile_stepper(system, SVI(4), monitor="1/(p_q1**2 + p_q2**2 + 1/(q1**2 + q2**2))", flags=QUICK_FLAGS)
     run = stepper.integrate(*START, h=0.3, t_end=20 * PERIOD)
     assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-7
-    lengths = run.lengths[:-2]
+    lengths = run.step_sizes[:-2]
     near = np.hypot(*run.q[:-2].T) < 0.3
     assert 4.0 * lengths[near].mean() < lengths[~near].mean()
 
@@ -124,7 +124,7 @@ def test_a_run_that_turns_goes_back_on_its_own_steps(system):
 
 def off_the_monitor(run):
     """How far lengths of whole steps are from h = tau g in their middle, of Kepler's orbit, tau = 0.1."""
-    t, lengths = run.t[:-2], run.lengths[:-2]
+    t, lengths = run.t[:-2], run.step_sizes[:-2]
     return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
 
 

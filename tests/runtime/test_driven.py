@@ -178,7 +178,7 @@ def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
     assert len(turns) == np.count_nonzero(np.diff(np.sign(run.p[:, 0])))
     run.plot(tmp_path / "run.png")
     assert 0.0 < run.step_error < 1e-4
-    assert run.step_error_t in run.t
+    assert run.worst_step_time in run.t
 
 
 def test_momentum_maps_with_inputs():
@@ -341,7 +341,7 @@ def test_events_and_monitors_know_inputs_by_name(pendulum):
     same = slowed.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3)
     assert_allclose(same.q[-1], run.q[-1], atol=1e-8)
     by_hand = 1 / (2 + same.q[:, 0] ** 2 + 0.1 * same.t)
-    lengths = np.concatenate([piece.lengths[:-1] for piece in same.pieces])
+    lengths = np.concatenate([piece.step_sizes[:-1] for piece in same.pieces])
     ratio = lengths / (0.1 * by_hand[:-1])
     assert np.median(np.abs(ratio - 1)) < 0.05
     with pytest.raises(ExpressionError, match=r"Known here: .* u, w"):

@@ -134,7 +134,7 @@ def start_of(name: str) -> Any:
 def bits(run: Any) -> tuple[Any, ...]:
     """All that must not depend on the number of threads."""
     states = (values.tobytes() for values in (*run.q.values(), *run.p.values()))
-    return (*states, run.iterations, run.steps, run.rejected, repr(run.step_error))
+    return (*states, run.iterations, run.steps, run.rejected_steps, repr(run.step_error))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -70,5 +70,5 @@ def test_the_worst_step_begins_at_the_perihelion():
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(3), flags=("-O0",))
     for start in (0.0, 7.25, -3.5):
         run = stepper.integrate([1.6, 0.0], [0.0, 0.5], h=0.05, steps=120, t=start)
-        assert abs(run.step_error_t - (start + np.pi)) < 2 * 0.05
-        assert np.abs(run.t - run.step_error_t).min() < 1e-12
+        assert abs(run.worst_step_time - (start + np.pi)) < 2 * 0.05
+        assert np.abs(run.t - run.worst_step_time).min() < 1e-12

@@ -69,11 +69,11 @@ def test_a_run_restored_has_the_time_it_had(free):
 
 def test_states_know_the_step_that_follows(free):
     run = free.integrate([0.1], [0.0], h=0.25, steps=8, save_every=2)
-    assert run.lengths.tolist() == [0.25] * 5
+    assert run.step_sizes.tolist() == [0.25] * 5
     between = free.integrate([0.1], [0.0], h=0.25, steps=8, t_eval=[0.0, 0.3, 0.5])
-    assert np.array_equal(between.lengths, [0.25, np.nan, 0.25], equal_nan=True)
+    assert np.array_equal(between.step_sizes, [0.25, np.nan, 0.25], equal_nan=True)
     ended = free.integrate([0.1], [0.0], h=0.25, steps=8, events="q")
-    assert ended.lengths[-1] == 0.25
+    assert ended.step_sizes[-1] == 0.25
 
 
 def test_spans_are_made_of_equal_steps_none_of_them_longer():

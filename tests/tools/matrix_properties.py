@@ -176,7 +176,7 @@ def as_rows(found: Any) -> SimpleNamespace:
         momentum_maps=found.momentum_maps,
         steps=found.steps,
         step_error=found.step_error,
-        step_error_t=found.step_error_t,
+        worst_step_time=found.worst_step_time,
         at=lambda t: tuple(each["q"].reshape(len(t), -1) for each in found.at(t)),
         events=[
             SimpleNamespace(t=e.t, q=e.q["q"].reshape(len(e), -1), p=e.p["q"].reshape(len(e), -1)) for e in found.events
@@ -460,9 +460,9 @@ def controlled(case: Case) -> None:
     near(q, case.truth.q(times), 1e-8)
     near(p, case.truth.p(times), 1e-8)
     assert 0.0 < run.step_error < 1e-9
-    assert min(case.given.t, end) <= run.step_error_t <= max(case.given.t, end)
+    assert min(case.given.t, end) <= run.worst_step_time <= max(case.given.t, end)
     if case.given.save_every == 1:
-        assert run.step_error_t in run.t
+        assert run.worst_step_time in run.t
 
 
 def _differences(case: Case, names: list[str], width: float) -> dict[str, np.ndarray]:

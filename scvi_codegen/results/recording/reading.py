@@ -229,19 +229,19 @@ class RecordedRun:
         manifest, run = self.manifest, self._standing
         taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
-        step_error, step_error_t = run.step_error
+        step_error, worst_step_time = run.step_error
         return Trajectory(
             t=t,
             q=q,
             p=p,
             iterations=iterations,
-            lengths=self._lengths(t, rows),
+            step_sizes=self._lengths(t, rows),
             h=self.h,
             goal=manifest.goal,
             steps=run.steps,
-            rejected=run.rejected,
+            rejected_steps=run.rejected_steps,
             step_error=step_error,
-            step_error_t=step_error_t,
+            worst_step_time=worst_step_time,
             parameters=np.array(manifest.parameters),
             stepper=run.stepper,
             options=run.options,
