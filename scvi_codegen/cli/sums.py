@@ -55,7 +55,7 @@ def refuse(what: dict[str, object]) -> None:
     """
     for name, value in what.items():
         if value not in (None, False):
-            instead = INSTEAD.get(name, "leave it out, or write the system out (expand_sums)")
+            instead = INSTEAD.get(name, "leave it out, or write the system out (unroll_sums)")
             raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices: {instead}")
 
 

@@ -22,11 +22,11 @@ from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 
-__all__ = ["vary", "with_changes"]
+__all__ = ["variational_system", "with_changes"]
 
 
 @takes(system=SYSTEM)
-def vary(system: MechanicalSystem, count: int) -> LagrangianSystem:
+def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem:
     """Return the system extended by ``count`` tangent vectors of its trajectory, as coordinates named ``x_change_1``.
 
     With SVI and collocation methods they are the exact directional derivatives of the computed trajectory, equal to

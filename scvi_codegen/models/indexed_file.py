@@ -151,7 +151,7 @@ def _check_known(document: Document) -> None:
             if key in OTHERS[name]:
                 where = f"[{name}] {key}" if name else f"[{key}]"
                 raise ModelFileError(
-                    f"{where} is not for sums over indices: leave it out, or write the system out (expand_sums)"
+                    f"{where} is not for sums over indices: leave it out, or write the system out (unroll_sums)"
                 )
     check_keys(document, SECTIONS, "section")
     for name, known in KEYS.items():

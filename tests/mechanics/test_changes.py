@@ -14,7 +14,7 @@ from scvi_codegen import (
     compile_stepper,
     hamiltonian_of,
     problem,
-    vary,
+    variational_system,
 )
 from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.forms import forms_of
@@ -66,7 +66,10 @@ def test_changes_by_sweeps_are_the_derivative_of_the_computed_motion(method):
     """Steps commute with differentiation: the tangent map of the run, also of a Hamiltonian, and symplectic."""
     kepler, (q, p) = problem("kepler").system, ([0.5, 0.0], [0.0, 3**0.5])
     tangent = compile_stepper(kepler, method, flags=QUICK_FLAGS).integrate(q, p, h=0.1, steps=63).tangent()[-1]
-    made, directions = compile_stepper(vary(hamiltonian_of(kepler), 4), method, flags=QUICK_FLAGS), np.eye(4)
+    made, directions = (
+        compile_stepper(variational_system(hamiltonian_of(kepler), 4), method, flags=QUICK_FLAGS),
+        np.eye(4),
+    )
     starts = (np.concatenate([own, of.T.ravel()]) for own, of in ((q, directions[:2]), (p, directions[2:])))
     end = made.integrate(*starts, h=0.1, steps=63)
     found = np.vstack([end.q[-1, 2:].reshape(4, 2).T, end.p[-1, 2:].reshape(4, 2).T])
@@ -77,4 +80,4 @@ def test_changes_by_sweeps_are_the_derivative_of_the_computed_motion(method):
 
 def test_what_has_no_changes_of_its_own_is_refused():
     with pytest.raises(SystemDefinitionError, match=r"'double pendulum' do not follow by its own sweeps.*run.tangent"):
-        vary(problem("double-pendulum").system, 2)
+        variational_system(problem("double-pendulum").system, 2)

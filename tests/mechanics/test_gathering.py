@@ -60,7 +60,7 @@ EXAMPLES = [bodies(4), bodies(12), lattice(5), lattice(13), damped(6), canonical
 
 @pytest.mark.parametrize("system", EXAMPLES, ids=lambda each: each.name)
 def test_the_motion_is_the_same(system):
-    found = sc.gather_sums(system)
+    found = sc.roll_sums(system)
     q, v = np.random.default_rng(3).normal(size=(2, len(system.coordinates)))
     start = {"p" if system.auxiliaries else "velocity": v}
     run = sc.compile_indexed(found.system, "gauss:4").integrate(
@@ -72,14 +72,14 @@ def test_the_motion_is_the_same(system):
 
 
 def test_the_text_does_not_grow():
-    few, many = (sc.gather_sums(bodies(count)) for count in (6, 20))
+    few, many = (sc.roll_sums(bodies(count)) for count in (6, 20))
     assert str(few.system) == str(many.system)
     assert len(few.system.terms) == 2
-    assert len(sc.gather_sums(lattice(40)).system.terms) < 10  # some constants are 0, 1 or reduced
+    assert len(sc.roll_sums(lattice(40)).system.terms) < 10  # some constants are 0, 1 or reduced
 
 
 def test_parameters_that_all_have_in_common_stay():
-    found = sc.gather_sums(bodies(4))
+    found = sc.roll_sums(bodies(4))
     assert [str(name) for name in found.system.parameters] == ["G"]
     assert found.system.defaults == (0.5,)
 
@@ -109,7 +109,7 @@ def test_parameters_that_all_have_in_common_stay():
 )
 def test_what_is_refused(system, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        sc.gather_sums(system)
+        sc.roll_sums(system)
 
 
 def test_inputs_keep_their_names():
@@ -122,7 +122,7 @@ def test_inputs_keep_their_names():
         inputs=["u"],
         forces={"q3": "-u*q3_dot"},
     )
-    found = sc.gather_sums(system)
+    found = sc.roll_sums(system)
     assert found.system.inputs == ("u",)
     assert (
         found.system.parameters
@@ -141,7 +141,7 @@ def test_inputs_keep_their_names():
 @pytest.mark.parametrize("term", ["3", "3*sin(t)", "g", "g*cos(t) + x*0 + 2"])
 def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
     written = lagrangian(["x", "y"], f"x_dot**2/2 - x**2/2 + y_dot**2/2 - y**2/2 + {term}", g=2.0)
-    found = sc.gather_sums(written)
+    found = sc.roll_sums(written)
     assert {name: table.shape[1] for name, table in found.tables.items()} == {
         f"at{k}": 1 for k in range(len(found.tables))
     }
@@ -155,7 +155,7 @@ def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
 def test_names_of_parameters_are_no_names_of_arrays_and_tables(name):
     written = lagrangian(["x", "y"], f"x_dot**2/2 + y_dot**2/2 - {name}*x**2/2 - 3*{name}*y**2/2", **{name: 1.3})
-    found = sc.gather_sums(written)
+    found = sc.roll_sums(written)
     own = sc.compile_indexed(found.system, "stoermer-verlet").integrate(
         [1.0, 2.0], h=0.1, steps=3, tables=found.tables, parameters={**found.parameters, name: 1.7}
     )

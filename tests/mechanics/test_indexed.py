@@ -5,7 +5,7 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.indexed.expansion import expand_sums
+from scvi_codegen.mechanics.indexed.expansion import unroll_sums
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 
@@ -85,7 +85,7 @@ def test_what_is_written_out() -> None:
         tables=["bonds[B, 2]"],
         lagrangian="sum(i in N, q_dot[i]**2/2) - c*sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
     )
-    found = expand_sums(net, {"N": 3, "B": 2}, tables={"bonds": [[0, 2], [2, 1]]}, parameters={"k": [5, 7], "c": 3})
+    found = unroll_sums(net, {"N": 3, "B": 2}, tables={"bonds": [[0, 2], [2, 1]]}, parameters={"k": [5, 7], "c": 3})
     q, v, k = (sympy.symbols(f"{name}_:3{end}", real=True) for name, end in (("q", ""), ("q", "_dot"), ("k", "")))
     c = sympy.Symbol("c", real=True)
     springs = k[0] * (q[0] - q[2]) ** 2 + k[1] * (q[2] - q[1]) ** 2
@@ -109,7 +109,7 @@ def test_what_cannot_be_written_out(sizes: dict[str, int], beside: dict[str, obj
         name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
     )
     with pytest.raises(SystemDefinitionError, match=message):
-        expand_sums(chain, sizes, **beside)
+        unroll_sums(chain, sizes, **beside)
 
 
 def test_what_is_derived_is_shown() -> None:
@@ -235,7 +235,7 @@ def test_forces_and_what_they_conserve() -> None:
 
 def test_forces_are_written_out() -> None:
     """At every place, of every component, and at one place."""
-    found = expand_sums(
+    found = unroll_sums(
         system(
             "r[N, 2]",
             "sum(i in N, sum(a in 2, r_dot[i, a]**2))",

@@ -52,7 +52,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "lagrangian_of": {"system": sc.hamiltonian_of(SYSTEM)},
     "change_coordinates": {"system": SYSTEM, "old": {"q1": "u", "q2": "w"}, "coordinates": ["u", "w"]},
     "reparametrise": {"system": SYSTEM},
-    "vary": {"system": SYSTEM, "count": 1},
+    "variational_system": {"system": SYSTEM, "count": 1},
     "exact_map": {"system": SYSTEM, "q0": Q, "p0": P, "h": 0.1, "t": 0.0, "parameters": None, "digits": 16},
     "exact_discrete_lagrangian": {"system": SYSTEM, "q0": Q, "q1": Q, "h": 0.1, "parameters": None, "guess": None},
     "problem": {"name": "kepler"},

@@ -109,7 +109,7 @@ def test_as_written_out(name: str, method: str) -> None:
         tables=each.tables,
         parameters=each.parameters,
     )
-    written = sc.expand_sums(each.system, each.sizes, tables=each.tables, parameters=each.parameters)
+    written = sc.unroll_sums(each.system, each.sizes, tables=each.tables, parameters=each.parameters)
     stepper = sc.compile_stepper(written, method)
     velocity = np.zeros(each.q.size) if each.velocity is None else each.velocity.reshape(-1)
     other = stepper.integrate(each.q.reshape(-1), velocity=velocity, h=each.h, steps=40, save_every=10)
@@ -138,7 +138,7 @@ def test_a_hamiltonian_as_written_out(method: str) -> None:
     q, p = 0.5 * random(2, 4)
     stepper = sc.compile_indexed(field, method)
     run = stepper.integrate(q, p, h=0.05, steps=100, save_every=25, tables=bonds)
-    written = sc.expand_sums(field, {"N": 4, "B": 4}, tables=bonds)
+    written = sc.unroll_sums(field, {"N": 4, "B": 4}, tables=bonds)
     other = sc.compile_stepper(written, method).integrate(q, p, h=0.05, steps=100, save_every=25)
     assert run.q["q"] == pytest.approx(other.q, abs=1e-13)
     assert run.p["q"] == pytest.approx(other.p, abs=1e-13)
@@ -198,7 +198,7 @@ def test_energy_has_the_terms_without_coordinates(method: str) -> None:
         parameters={"a": 2, "f[N]": 1},
         lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2) + {beside}",
     )
-    written = sc.compile_stepper(sc.expand_sums(system, {"N": 3}), method)
+    written = sc.compile_stepper(sc.unroll_sums(system, {"N": 3}), method)
     f = {"f_0": 0.3, "f_1": -0.7, "f_2": 1.9}
     start = {"velocity": random(3), "h": 0.1, "steps": 4, "t": 0.7}
     own = sc.compile_indexed(system, method).integrate(random(3), parameters={"a": 1.5, "f": list(f.values())}, **start)
@@ -376,7 +376,7 @@ def test_an_index_leaves_no_table() -> None:
     with pytest.raises(sc.StateError, match=message):
         sc.compile_indexed(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
     with pytest.raises(sc.SystemDefinitionError, match="out of bounds"):
-        sc.expand_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
+        sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
 
 
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
@@ -414,7 +414,7 @@ def test_forces_of_velocities_as_written_out(method: str) -> None:
     """Friction at every place, between the ends of bonds, and a drive at one place."""
     bonds, masses = {"bonds": [[0, 1], [1, 2], [2, 3], [0, 3]]}, {"m": [1, 2, 3, 4]}
     q, velocity = random(2, 4, 2)
-    written = sc.expand_sums(FORCED, {"N": 4, "B": 4}, tables=bonds, parameters=masses)
+    written = sc.unroll_sums(FORCED, {"N": 4, "B": 4}, tables=bonds, parameters=masses)
     stepper = sc.compile_indexed(FORCED, method)
     run = stepper.integrate(q, velocity=velocity, h=0.05, steps=40, tables=bonds, parameters=masses)
     other = sc.compile_stepper(written, method).integrate(
@@ -436,7 +436,7 @@ def test_forces_of_position_and_time(method: str) -> None:
     )
     q, velocity = random(2, 3)
     run = sc.compile_indexed(driven, method).integrate(q, velocity=velocity, h=0.1, steps=30)
-    other = sc.compile_stepper(sc.expand_sums(driven, {"N": 3}), method)
+    other = sc.compile_stepper(sc.unroll_sums(driven, {"N": 3}), method)
     assert run.q["q"] == pytest.approx(other.integrate(q, velocity=velocity, h=0.1, steps=30).q, abs=1e-14)
     damped = sc.IndexedSystem.from_text(**chain, lagrangian=lagrangian, forces={"q[i]": "-c*q_dot[i]"})
     with pytest.raises(sc.MethodError, match="is explicit for forces of positions and time"):
@@ -455,7 +455,7 @@ def test_forces_of_momenta() -> None:
     )
     q, p = 0.3 * random(2, 3)
     run = sc.compile_indexed(system, "gauss:3").integrate(q, p, h=0.1, steps=30)
-    other = sc.compile_stepper(sc.expand_sums(system, {"N": 3}), "gauss:3").integrate(q, p, h=0.1, steps=30)
+    other = sc.compile_stepper(sc.unroll_sums(system, {"N": 3}), "gauss:3").integrate(q, p, h=0.1, steps=30)
     assert run.q["q"] == pytest.approx(other.q, abs=1e-14)
 
 
@@ -485,7 +485,7 @@ def test_a_table_of_one_axis() -> None:
     )
     run = sc.compile_indexed(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
     assert run.q["q"][-1] == pytest.approx([1, np.cos(1), 1, np.cos(1)], abs=1e-12)
-    written = str(sc.expand_sums(pinned, {"N": 2, "P": 1}, tables={"pins": [1]}).formula)
+    written = str(sc.unroll_sums(pinned, {"N": 2, "P": 1}, tables={"pins": [1]}).formula)
     assert "q_1**2" in written
     assert "q_0**2" not in written
 

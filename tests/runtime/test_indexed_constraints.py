@@ -64,7 +64,7 @@ def stepper():
 
 def test_steps_states_and_multipliers_are_those_of_the_system_written_out(stepper):
     q, data = chain(3)
-    small = sc.expand_sums(net(), {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
+    small = sc.unroll_sums(net(), {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
     other = sc.compile_stepper(small, RATTLE)
     own = stepper.integrate(q, h=0.01, steps=100, **data)
     expected = other.integrate(q.ravel(), np.zeros(8), h=0.01, steps=100)
@@ -239,7 +239,7 @@ def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
     end = np.loadtxt(folder / "end.txt")
     assert np.abs(end[:12] - run.q["r"][-1].ravel()).max() < 1e-12
     assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in derive_sums(model.system, model.method)
-    with pytest.raises(MethodError, match="expand_sums"):
+    with pytest.raises(MethodError, match="unroll_sums"):
         sc.verify_indexed(model.system, model.method, model.q, h=0.01)
 
 

@@ -39,7 +39,7 @@ def molecules():
 def test_steps_are_those_of_newtons_iteration_of_the_system_written_out(method, strength, h):
     system, masses = field(strength), np.linspace(1.0, 2.0, 5)
     own = sc.compile_indexed(system, method, solver="newton")
-    small = sc.expand_sums(system, {"N": 5}, parameters={"m": masses})
+    small = sc.unroll_sums(system, {"N": 5}, parameters={"m": masses})
     other = sc.compile_stepper(small, method, solver="newton")
     q, v = RANDOM.normal(size=(2, 5))
     for _ in range(5):

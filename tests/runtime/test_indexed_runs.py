@@ -17,7 +17,7 @@ DATA = {"F": (T, np.sin(T), "cubic")}
 
 
 def written(system):
-    return sc.compile_stepper(sc.expand_sums(system, {"N": N}), "svi:6")
+    return sc.compile_stepper(sc.unroll_sums(system, {"N": N}), "svi:6")
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ class TestControlledSteps:
             hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
         )
         run = sc.compile_indexed(system, "gauss:4").integrate(Q, V, t_end=3.0, tolerance=1e-10)
-        other = sc.compile_stepper(sc.expand_sums(system, {"N": N}), "gauss:4").integrate(Q, V, t_end=3.0)
+        other = sc.compile_stepper(sc.unroll_sums(system, {"N": N}), "gauss:4").integrate(Q, V, t_end=3.0)
         assert np.abs(run.q["q"][-1] - other.q[-1]).max() < 1e-8
 
     def test_runs_are_saved_and_steppers_pickled(self, steppers):

@@ -94,7 +94,7 @@ def test_steps_are_those_of_the_system_written_out(name, k):
     """By Newton's iteration with whole matrices; the least lattices are too small to be asked for waves."""
     for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
         sizes = dict(zip(("NX", "NY"), shape, strict=True)) if "plane" in name else {"N": shape}
-        small = sc.expand_sums(lattice(name), sizes)
+        small = sc.unroll_sums(lattice(name), sizes)
         q, v = smooth(shape), smooth(shape)
         run = stepper_of(name).start(q, velocity=v, h=0.5, parameters={"k": k})
         run.advance(1)

@@ -25,14 +25,14 @@ from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["expand_sums"]
+__all__ = ["unroll_sums"]
 
 Elements = Mapping[str, int]
 Tables = Mapping[str, NDArray[np.int64]]
 
 
 @takes(SystemDefinitionError, system=INDEXED, sizes=MAPPING, tables=MAPPING, parameters=MAPPING)
-def expand_sums(
+def unroll_sums(
     system: IndexedSystem,
     sizes: Mapping[str, int],
     *,
@@ -53,7 +53,7 @@ def expand_sums(
     >>> chain = IndexedSystem.from_text(
     ...     name="chain", coordinates=["q[N]"],
     ...     lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2)")
-    >>> expand_sums(chain, {"N": 2}).formula
+    >>> unroll_sums(chain, {"N": 2}).formula
     q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
     """
     given, places = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}

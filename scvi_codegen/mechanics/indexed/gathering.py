@@ -22,14 +22,14 @@ from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.like_terms import LikeTerms, like_terms
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 
-__all__ = ["GatheredSums", "gather_sums"]
+__all__ = ["RolledSums", "roll_sums"]
 
 MOST_FAMILIES = 64
 """Maximum number of term groups; systems with more are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
-class GatheredSums:
+class RolledSums:
     """Indexed system with the data that make it equal to the original system.
 
     Attributes:
@@ -45,7 +45,7 @@ class GatheredSums:
 
 
 @takes(SystemDefinitionError, system=SYSTEM)
-def gather_sums(system: MechanicalSystem) -> GatheredSums:
+def roll_sums(system: MechanicalSystem) -> RolledSums:
     """Return the indexed system of a Lagrangian or Hamiltonian with many similar terms, and of its forces.
 
     Parameters that differ from term to term become arrays of their default values; the others remain parameters.
@@ -58,7 +58,7 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
     >>> chain = LagrangianSystem.from_text(
     ...     name="chain", coordinates=["x", "y", "z"],
     ...     lagrangian="x_dot**2/2 + y_dot**2/2 + z_dot**2/2 - (x - y)**2/2 - 3*(y - z)**2/2")
-    >>> print(gather_sums(chain).system)
+    >>> print(roll_sums(chain).system)
     chain: L(q[N]) = sum(b in B0, c0_1[b]*(-q[at0[b, 0]] + q[at0[b, 1]])**2) + sum(b in B1, q_dot[at1[b, 0]]**2/2)
     """
     _check_what_stands_beside(system)
@@ -82,7 +82,7 @@ def gather_sums(system: MechanicalSystem) -> GatheredSums:
     fields = {f"{name}[B{mark}{k}]": 1.0 for k, each in enumerate(found) for name in each.fields}
     written = " + ".join(f"sum({b} in B{mark}{k}, {each.text})" for k, each in enumerate(found[: len(kinds)]))
     given = {"hamiltonian": written, "momenta": [f"{p}[{n}]"]} if system.auxiliaries else {"lagrangian": written}
-    return GatheredSums(
+    return RolledSums(
         IndexedSystem.from_text(
             name=system.name,
             coordinates=[f"{q}[{n}]"],

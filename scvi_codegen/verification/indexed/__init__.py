@@ -1,6 +1,6 @@
 """Certificates of integrators of indexed systems.
 
-At small sizes, cut out of the arrays, the loops are compared with the unrolled system (:func:`expand_sums`): its
+At small sizes, cut out of the arrays, the loops are compared with the unrolled system (:func:`unroll_sums`): its
 equations in 60 digits, its exact motion and its compiled steps, none of which has loops. At full size, the rates are
 compared with NumPy, and conserved quantities are measured along a run.
 """
@@ -20,7 +20,7 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.given.kinds import MAPPING, of, takes
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.lowering.indexed import one_coordinate
-from scvi_codegen.mechanics.indexed.expansion import expand_sums
+from scvi_codegen.mechanics.indexed.expansion import unroll_sums
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
@@ -81,7 +81,7 @@ def verify_indexed(
     chosen = as_method(method, one_coordinate(system))
     if system.constraints:
         raise MethodError(
-            "sums over indices with constraints have no certificate: verify a small one written out (expand_sums) by "
+            "sums over indices with constraints have no certificate: verify a small one written out (unroll_sums) by "
             "SVI(1, 'gauss-lobatto:2')"
         )
     stepper = stepper or compile_indexed(system, chosen, flags=tuple(flags))
@@ -121,7 +121,7 @@ def _subject(start: WholeStart) -> Subject:
     given = small.given
     names = [parameter.name for parameter in start.system.parameters]
     numbers = dict(zip(names, given.numbers, strict=True))
-    written = expand_sums(start.system, given.sizes, tables=given.places, parameters={**numbers, **given.fields})
+    written = unroll_sums(start.system, given.sizes, tables=given.places, parameters={**numbers, **given.fields})
     q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (given.state, small.p))
     stepper = SmallStepper(start.stepper, small, written)
     return Subject(written, start.method, cast(Stepper, stepper), None, State(q, p, start.t, start.h))
