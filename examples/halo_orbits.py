@@ -32,8 +32,8 @@ PUBLISHED = (
 )
 
 
-def closed(z: np.ndarray, hold: list[str]) -> sc.PeriodicOrbit:
-    return sc.periodic_orbit(stepper, z[:3], z[3:6], period=z[6], steps=160, hold=hold)
+def closed(z: np.ndarray, fixed: list[str]) -> sc.PeriodicOrbit:
+    return sc.periodic_orbit(stepper, z[:3], z[3:6], period=z[6], steps=160, fixed=fixed)
 
 
 def place(orbit: sc.PeriodicOrbit) -> np.ndarray:

@@ -26,9 +26,9 @@ q = np.column_stack([np.zeros(inside.sum()), y[inside]])
 p = np.column_stack([np.sqrt(square[inside]), p_y[inside]])
 
 stepper = sc.compile_stepper(sc.problem("henon-heiles").system, sc.SVI(2))
-stepper.deviations_ensemble(q[:1], p[:1], h=STEP, steps=1, count=1)  # compiles
+stepper.chaos_indicators_ensemble(q[:1], p[:1], h=STEP, steps=1, count=1)  # compiles
 begun, work = time.perf_counter(), time.process_time()
-found = stepper.deviations_ensemble(q, p, h=STEP, steps=round(SPAN / STEP), count=1)
+found = stepper.chaos_indicators_ensemble(q, p, h=STEP, steps=round(SPAN / STEP), count=1)
 took, work = time.perf_counter() - begun, time.process_time() - work
 
 megno = np.full(y.shape, np.nan)

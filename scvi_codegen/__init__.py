@@ -32,7 +32,7 @@ _HOMES = {
     "compiler": ("compile_stepper", "generate_source"),
     "runtime.ensemble_trajectory": ("EnsembleTrajectory",),
     "exact.discrete_lagrangian": ("ExactStep", "exact_discrete_lagrangian", "exact_map"),
-    "runtime.deviations": ("Deviations",),
+    "runtime.deviations": ("ChaosIndicators",),
     "runtime.driven_trajectory": ("DrivenTrajectory",),
     "runtime.events": ("Crossings", "Event"),
     "runtime.fitting": ("Fit", "fit"),

@@ -101,7 +101,7 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
-from scvi_codegen.runtime.deviations import Deviations as Deviations
+from scvi_codegen.runtime.deviations import ChaosIndicators as ChaosIndicators
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory as DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory as EnsembleTrajectory
 from scvi_codegen.runtime.events import Crossings as Crossings

@@ -17,11 +17,11 @@ from scvi_codegen.given.counts import checked_count
 from scvi_codegen.runtime.growth import SERIES
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["Deviations"]
+__all__ = ["ChaosIndicators"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Deviations:
+class ChaosIndicators:
     """Chaos indicators of k tangent vectors at n saved states; for an ensemble of K trajectories of shape (n, K, k).
 
     Norms are Euclidean norms of the 2m entries of (q, p); use units in which these are of comparable size.
@@ -45,7 +45,7 @@ class Deviations:
     status: NDArray[np.str_] | None = None
 
     @classmethod
-    def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> Deviations:
+    def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> ChaosIndicators:
         """Construct from (n,) times and (5, n, .., k) values of :data:`~scvi_codegen.runtime.growth.SERIES`."""
         return cls(t=t, status=status, **dict(zip(SERIES, found, strict=True)))
 

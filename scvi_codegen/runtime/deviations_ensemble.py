@@ -22,7 +22,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.accuracy import warn_of_long_steps
 from scvi_codegen.runtime.changes_in_lanes import MOTIONS, in_lanes
-from scvi_codegen.runtime.deviations import Deviations
+from scvi_codegen.runtime.deviations import ChaosIndicators
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import OK
 from scvi_codegen.runtime.growth import SERIES
@@ -41,7 +41,7 @@ ASKED: Final = 64
 
 
 class DeviationsEnsemble:
-    """Computation of the chaos indicators of many initial states; arguments as of ``deviations_ensemble``."""
+    """Computation of the chaos indicators of many initial states; arguments as of ``chaos_indicators_ensemble``."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class DeviationsEnsemble:
         self.status = np.full(len(self.q), OK, dtype="<U16")
         self.found = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
 
-    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> Deviations:
+    def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> ChaosIndicators:
         """Compute the indicators; ``progress`` is called with the number of finished trajectories and may raise.
 
         Trajectories without SIMD support, or whose SIMD steps failed, use the derivatives of single steps.
@@ -91,7 +91,7 @@ class DeviationsEnsemble:
                 threads=threads,
             )
         self._warn_of_long_steps()
-        return Deviations.of(self.t[:: self.save_every], self.found, self.status)
+        return ChaosIndicators.of(self.t[:: self.save_every], self.found, self.status)
 
     def _warn_of_long_steps(self) -> None:
         """Warn of too large steps: rerun every ``ASKED``-th trajectory singly, as SIMD steps estimate no error."""

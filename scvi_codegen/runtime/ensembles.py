@@ -12,7 +12,7 @@ from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import warn_of_lost_energies
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
-from scvi_codegen.runtime.deviations import Deviations
+from scvi_codegen.runtime.deviations import ChaosIndicators
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
@@ -137,7 +137,7 @@ class Ensembles(ConstrainedStates):
         return work.result()
 
     @takes(StateError, progress=FUNCTION)
-    def deviations_ensemble(
+    def chaos_indicators_ensemble(
         self,
         q: ArrayLike,
         p: ArrayLike | None = None,
@@ -153,7 +153,7 @@ class Ensembles(ConstrainedStates):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
-    ) -> Deviations:
+    ) -> ChaosIndicators:
         """Return chaos indicators of K initial states over ``steps`` steps of size h.
 
         For constant diagonal masses and forces of position and time, methods with a fixed-point iteration (SVI,
@@ -162,14 +162,14 @@ class Ensembles(ConstrainedStates):
 
         Args:
             q, p, velocity: (K, m) initial states, as of :meth:`integrate_ensemble`.
-            count, directions: tangent vectors, as of :meth:`Trajectory.deviations`; one suffices for MEGNO.
+            count, directions: tangent vectors, as of :meth:`Trajectory.chaos_indicators`; one suffices for MEGNO.
             save_every: steps between saved values; by default only the last is saved.
             t, parameters, options, threads: as of :meth:`integrate_ensemble`.
             progress: called with the number of completed trajectories.
 
         Returns:
-            :class:`Deviations` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has NaN
-            from at most a thousand steps before the failure on, and the reason in ``status``. An
+            :class:`ChaosIndicators` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has
+            NaN from at most a thousand steps before the failure on, and the reason in ``status``. An
             :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
 
         Raises:

@@ -98,7 +98,7 @@ class Fit:
     StateError,
     stepper=of("a compiled stepper", Stepper),
     unknown=NAMES,
-    state=SWITCH,
+    fit_initial_state=SWITCH,
     observed=NAMES,
     inputs=MAPPING,
     bounds=MAPPING,
@@ -114,7 +114,7 @@ def fit(
     h: float,
     parameters: Mapping[str, float] | Sequence[float] | Array | None = None,
     unknown: Sequence[str] | None = None,
-    state: bool = True,
+    fit_initial_state: bool = True,
     start: float | None = None,
     observed: Sequence[str] | None = None,
     deviations: ArrayLike | None = None,
@@ -128,11 +128,12 @@ def fit(
         stepper: the compiled stepper.
         t: (n,) ascending times.
         measured: (n,) or (n, c) values; NaN for missing measurements.
-        q, p, velocity: (m,) initial state, with one of p and velocity: initial guess, or known if ``state`` is false.
+        q, p, velocity: (m,) initial state, with one of p and velocity: initial guess, or known if ``fit_initial_state``
+            is false.
         h: largest step size.
         parameters: initial guesses of the unknown parameters, values of the others; defaults of the system otherwise.
         unknown: names of the parameters to estimate, by default all but those of inputs.
-        state: whether to estimate the initial state as well.
+        fit_initial_state: whether to estimate the initial state as well.
         start: time of the initial state, by default that of the first measurement.
         observed: names of the columns of ``measured``, coordinates and momenta (``"p_x"``, or the names of the
             Hamiltonian); by default the coordinates in order.
@@ -156,7 +157,7 @@ def fit(
     measurements = Measurements.checked(
         stepper, t, measured, observed, deviations, start, h, checked_inputs(stepper.interface, inputs)
     )
-    model = _Model.checked(measurements, q, p, velocity, parameters, unknown, state=state)
+    model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
     chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
@@ -214,7 +215,7 @@ class _Model:
         parameters: Mapping[str, float] | Sequence[float] | Array | None,
         unknown: Sequence[str] | None,
         *,
-        state: bool,
+        fit_initial_state: bool,
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
@@ -223,11 +224,11 @@ class _Model:
         for name in wanted:
             if name not in own:
                 raise StateError(f"there is no parameter '{name}' to find{closest(name, own)}")
-        if p is None and not state:
+        if p is None and not fit_initial_state:
             raise StateError(
                 "momenta follow from velocities by way of the parameters: give p, or let the state be found, too"
             )
-        if not wanted and not state:
+        if not wanted and not fit_initial_state:
             raise StateError("there is nothing to find: no parameter is unknown, and the initial state is known")
         if isinstance(parameters, Sequence) and any(isinstance(value, str) for value in parameters):
             raise StateError(
@@ -237,8 +238,8 @@ class _Model:
         values = checked_parameters(stepper.interface, parameters)
         momenta = stepper.momenta_given(q, p, velocity, measurements.start, values)
         places = [2 * m + stepper.parameters.index(name) for name in wanted]
-        names = (*wanted, *state_names(stepper)) if state else tuple(wanted)
-        places += range(2 * m) if state else ()
+        names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
+        places += range(2 * m) if fit_initial_state else ()
         first = (checked_vector(stepper.interface, given, name) for given, name in ((q, "q"), (momenta, "p")))
         known = np.concatenate([*first, values])
         return cls(measurements, names, np.array(places, dtype=np.intp), known)
@@ -362,6 +363,6 @@ def _as_known(names: Sequence[str]) -> str:
     """Return advice on treating an unknown as known."""
     return (
         f"Take {names[0] if len(names) == 1 else 'one of them'} as known: list only the parameters to find in unknown=["
-        "...] (by default all are) and give values of the others in parameters={...}; state=False keeps the initial "
-        "state (with p) as given"
+        "...] (by default all are) and give values of the others in parameters={...}; fit_initial_state=False keeps "
+        "the initial state (with p) as given"
     )

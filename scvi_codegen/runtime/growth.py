@@ -13,7 +13,7 @@ from scvi_codegen.runtime.inputs import Array
 __all__ = ["SERIES", "Growth", "apart", "triangles"]
 
 SERIES = ("lengths", "greatest", "stretches", "rates", "mean_rates")
-"""Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.deviations.Deviations`."""
+"""Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.deviations.ChaosIndicators`."""
 
 APART = 1e3
 """Largest ratio of growth between tangent vectors within a segment; bounds the loss of significant digits."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import SWITCH, takes
-from scvi_codegen.runtime.deviations import Deviations
+from scvi_codegen.runtime.deviations import ChaosIndicators
 from scvi_codegen.runtime.gradients import Gradient, carried, pulled_back, sensitivity
 from scvi_codegen.runtime.hessians import hessian_product
 from scvi_codegen.runtime.kept_states import Array, KeptStates
@@ -86,7 +86,7 @@ class NearbyMotions(KeptStates):
         """
         return hessian_product(self, cotangents, directions, curvatures)
 
-    def deviations(self, count: int | None = None, *, directions: ArrayLike | None = None) -> Deviations:
+    def chaos_indicators(self, count: int | None = None, *, directions: ArrayLike | None = None) -> ChaosIndicators:
         """Return the growth of tangent vectors along the run, from which all chaos indicators are computed.
 
         Args:
@@ -104,28 +104,28 @@ class NearbyMotions(KeptStates):
 
     @takes(StateError, history=SWITCH)
     def lyapunov_exponents(self, *, history: bool = False) -> Array:
-        """Return the (2m,) finite-time Lyapunov exponents of the run, descending; raises as :meth:`deviations`.
+        """Return the (2m,) finite-time Lyapunov exponents of the run, descending; raises as :meth:`chaos_indicators`.
 
         For symplectic steps they occur in pairs of opposite sign, to round-off.
 
         Args:
             history: return (n, 2m) exponents up to each state instead; NaN at the first state.
         """
-        exponents = self.deviations().lyapunov_exponents()
+        exponents = self.chaos_indicators().lyapunov_exponents()
         return exponents if history else exponents[-1]
 
     def megno(self) -> Array:
-        """Return (n,) MEGNO: 2 for regular motion, lambda t / 2 for chaotic motion; see :meth:`Deviations.megno`."""
-        return self.deviations(1).megno()
+        """Return (n,) MEGNO: 2 if regular, lambda t / 2 if chaotic; see :meth:`ChaosIndicators.megno`."""
+        return self.chaos_indicators(1).megno()
 
     def fli(self) -> Array:
-        """Return (n,) the fast Lyapunov indicator: log t or lambda t; see :meth:`Deviations.fli`."""
-        return self.deviations().fli()
+        """Return (n,) the fast Lyapunov indicator: log t or lambda t; see :meth:`ChaosIndicators.fli`."""
+        return self.chaos_indicators().fli()
 
     def gali(self, k: int = 2) -> Array:
-        """Return (n,) the generalised alignment index of k tangent vectors, 2 to 2m; see :meth:`Deviations.gali`."""
-        return self.deviations(checked_count(k, "k", least=2)).gali(k)
+        """Return (n,) the generalised alignment index of k vectors, 2 to 2m; see :meth:`ChaosIndicators.gali`."""
+        return self.chaos_indicators(checked_count(k, "k", least=2)).gali(k)
 
     def sali(self) -> Array:
-        """Return (n,) the smaller alignment index of two tangent vectors; see :meth:`Deviations.sali`."""
-        return self.deviations(2).sali()
+        """Return (n,) the smaller alignment index of two tangent vectors; see :meth:`ChaosIndicators.sali`."""
+        return self.chaos_indicators(2).sali()

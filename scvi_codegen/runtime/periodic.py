@@ -50,7 +50,7 @@ RESTING = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper), hold=NAMES, fixed_period=SWITCH)
+@takes(StateError, stepper=of("a compiled stepper", Stepper), fixed=NAMES, fixed_period=SWITCH)
 def periodic_orbit(
     stepper: Stepper,
     q: ArrayLike,
@@ -62,7 +62,7 @@ def periodic_orbit(
     h: float | None = None,
     fixed_period: bool = False,
     energy: float | None = None,
-    hold: Sequence[str] = (),
+    fixed: Sequence[str] = (),
     gain: ArrayLike | None = None,
     t: float = 0.0,
     parameters: Parameters = None,
@@ -80,7 +80,7 @@ def periodic_orbit(
         h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
         fixed_period: keep the period fixed; required if the system depends on time.
         energy: prescribed energy of the orbit.
-        hold: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
+        fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
             ``["y"]``.
         gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0.
         t, parameters, options: as of :meth:`Stepper.integrate`.
@@ -103,7 +103,7 @@ def periodic_orbit(
         h=h,
         fixed_period=fixed_period,
         energy=energy,
-        hold=hold,
+        fixed=fixed,
         gain=gain,
         t=t,
         parameters=parameters,
@@ -142,7 +142,7 @@ class _OrbitSearch:
         h: float | None,
         fixed_period: bool,
         energy: float | None,
-        hold: Sequence[str],
+        fixed: Sequence[str],
         gain: ArrayLike | None,
         t: float,
         parameters: Parameters,
@@ -160,14 +160,14 @@ class _OrbitSearch:
             raise StateError(f"a period is positive, not {period:g}")
         if (steps is None) == (h is None):
             raise StateError("the number of steps of a period, or h, the longest of them: give one of them")
-        for name in hold:
+        for name in fixed:
             if name not in names:
-                raise StateError(f"the state has no '{name}' to hold{closest(name, names)}")
+                raise StateError(f"the state has no '{name}' to keep fixed{closest(name, names)}")
         return cls(
             stepper=stepper,
             period=period,
             steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
-            held=(*map(names.index, dict.fromkeys(hold)), *([-1] if fixed_period else [])),
+            held=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
             t=checked_number(t, "the time t"),
@@ -243,7 +243,7 @@ class _OrbitSearch:
         if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
             raise OrbitError(
                 f"the orbit that closes near here has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
-                "hold less of the state, or give a nearer guess"
+                "fix fewer components of the state, or give a nearer guess"
             )
 
     def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:

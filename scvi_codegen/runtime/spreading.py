@@ -18,7 +18,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.deviations import Deviations
+from scvi_codegen.runtime.deviations import ChaosIndicators
 from scvi_codegen.runtime.gradients import carry, pieces, starts_of
 from scvi_codegen.runtime.growth import Growth, apart, triangles
 from scvi_codegen.runtime.inputs import Array
@@ -99,7 +99,7 @@ def _frame(dimension: int) -> Array:
     return np.hstack([first, second[:, ::-1]])
 
 
-def along(states: KeptStates, changes: Changes) -> Deviations:
+def along(states: KeptStates, changes: Changes) -> ChaosIndicators:
     """Return the deviations of a run at its saved states; steps between these are recomputed."""
 
     def carried(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
@@ -109,7 +109,7 @@ def along(states: KeptStates, changes: Changes) -> Deviations:
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
     spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper.given, states.t)
     spreading.follow((starts_of(states, first, last) for first, last in pieces(states)), carried)
-    return Deviations.of(states.t, spreading.growth.found)
+    return ChaosIndicators.of(states.t, spreading.growth.found)
 
 
 def ahead(

@@ -142,7 +142,7 @@ def test_trajectories_refuse_wrong_types_by_name(run, tmp_path):
     refused(run.pullback, {"cotangents": np.zeros((6, 4))})
     refused(run.tangent, {"directions": Q + P})
     known = {"stepper": run.stepper, "t": run.t, "measured": run.q, "q": Q, "p": P, "h": 0.1, "parameters": None}
-    asked = {"unknown": ["mu"], "state": True, "start": 0.0, "observed": ["q1", "q2"], "deviations": 1.0}
+    asked = {"unknown": ["mu"], "fit_initial_state": True, "start": 0.0, "observed": ["q1", "q2"], "deviations": 1.0}
     refused(sc.fit, known | asked | {"inputs": None, "bounds": {"mu": (0.0, 2.0)}})
     refused(run.crossings, {"events": "q1"})
     refused(run.save, {"path": tmp_path / "run.npz", "units": None})

@@ -56,7 +56,7 @@ def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
     """
     q, p = np.tile(CHAOTIC[0], (12, 1)), np.tile(CHAOTIC[1], (12, 1))
     q[:, 1] += 1e-6 * np.arange(12)
-    found = galaxy.deviations_ensemble(q, p, h=0.2, steps=20_000, count=1)
+    found = galaxy.chaos_indicators_ensemble(q, p, h=0.2, steps=20_000, count=1)
     assert found.lyapunov_exponents()[-1].mean() == pytest.approx(0.047, abs=0.01)
     regular = galaxy.integrate(*REGULAR, h=0.2, steps=20_000, save_every=2000).lyapunov_exponents(history=True)
     assert regular[-1, 0] < 2 * np.log(4000.0) / 4000.0
@@ -70,7 +70,7 @@ def test_a_saddle_has_the_exponents_of_its_linear_motion():
     )
     run = compile_stepper(saddle, Gauss(4)).integrate([0.0, 0.1], [0.0, 0.0], h=0.1, steps=4000)
     assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=1e-2)
-    deviations = run.deviations()
+    deviations = run.chaos_indicators()
     assert deviations.log_gali(2)[-1] < -110.0
     assert slope(run.t[2000:], deviations.log_gali(2)[2000:]) == pytest.approx(-0.3, rel=1e-3)
     assert slope(run.t[2000:], deviations.log_gali(4)[2000:]) == pytest.approx(-1.2, rel=1e-3)
@@ -82,7 +82,7 @@ def test_a_free_particle_spreads_as_it_can_be_written_down():
     """A change (u, v) becomes (u + v t, v), for every method; integrals by the steps, to their second order."""
     free = LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2")
     run = compile_stepper(free, SVI(2)).integrate([0.0], [1.0], h=0.01, steps=2000)
-    found, t = run.deviations(directions=[3.0, 4.0]), run.t
+    found, t = run.chaos_indicators(directions=[3.0, 4.0]), run.t
     lengths = np.log(np.hypot(0.6 + 0.8 * t, 0.8))
     assert_allclose(found.lengths[:, 0], lengths, atol=1e-13)
     assert_allclose(found.fli(), np.maximum.accumulate(lengths), atol=1e-13)
@@ -95,7 +95,7 @@ def test_a_free_particle_spreads_as_it_can_be_written_down():
 def test_indicators_are_those_of_the_variational_equations(galaxy):
     """Changes, the integrals of MEGNO and volumes of a chaotic orbit by DOP853."""
     run = compile_stepper(problem("henon-heiles").system, SVI(6)).integrate(*CHAOTIC, h=0.02, steps=2500)
-    found = run.deviations(3)
+    found = run.chaos_indicators(3)
     changes = Changes.checked(run.stepper, 3, None).at(run.q[0], run.p[0], 0.02, 0.0, run.parameters, None)
     assert_allclose(changes.T @ changes, np.eye(3), atol=1e-14)
 
@@ -124,12 +124,12 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     """MEGNO to 2 or along lambda t / 2; GALI_2 constant, GALI_3 and GALI_4 as t^-2 and t^-4, or exponential."""
     regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=10_000) for start in (REGULAR, CHAOTIC))
     assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
-    late, found = slice(1000, None), regular.deviations()
+    late, found = slice(1000, None), regular.chaos_indicators()
     powers = [slope(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
     assert_allclose(powers, [0.0, -2.0, -4.0], atol=0.3)
     assert slope(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
     assert regular.gali(2).min() > 0.05
-    found, t = chaotic.deviations(), chaotic.t[-1]
+    found, t = chaotic.chaos_indicators(), chaotic.t[-1]
     exponents = found.lyapunov_exponents()[-1]
     assert 2.0 * chaotic.megno()[-1] / t == pytest.approx(exponents[0], rel=0.4)
     assert chaotic.fli()[-1] / t == pytest.approx(exponents[0], rel=0.1)
@@ -143,7 +143,9 @@ def test_states_left_out_change_nothing(galaxy):
     whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
     some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, save_every=50)
     for name in SERIES:
-        assert_allclose(getattr(some.deviations(), name), getattr(whole.deviations(), name)[::50], rtol=1e-9, atol=1e-9)
+        assert_allclose(
+            getattr(some.chaos_indicators(), name), getattr(whole.chaos_indicators(), name)[::50], rtol=1e-9, atol=1e-9
+        )
     back = galaxy.integrate(whole.q[-1], whole.p[-1], h=-0.2, steps=600)
     assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
 
@@ -151,11 +153,11 @@ def test_states_left_out_change_nothing(galaxy):
 def test_a_length_is_greatest_wherever_it_was(galaxy):
     """Between states that are kept, too: of a regular motion, whose changes come and go."""
     run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
-    greatest = run.deviations(1).lengths.max()
-    assert run.deviations(1).lengths[-1, 0] < greatest - 0.01
-    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, save_every=60).deviations(1)
+    greatest = run.chaos_indicators(1).lengths.max()
+    assert run.chaos_indicators(1).lengths[-1, 0] < greatest - 0.01
+    some = galaxy.integrate(*REGULAR, h=0.2, steps=60, save_every=60).chaos_indicators(1)
     assert some.fli()[-1] == pytest.approx(greatest, abs=1e-12)
-    many = galaxy.deviations_ensemble(*start, h=0.2, steps=60, count=1)
+    many = galaxy.chaos_indicators_ensemble(*start, h=0.2, steps=60, count=1)
     assert many.fli()[-1, 0] == pytest.approx(greatest, abs=1e-12)
 
 
@@ -187,31 +189,33 @@ def test_constraints_leave_fewer_changes():
     assert np.abs(exponents).max() < 0.02
     assert run.megno()[-1] == pytest.approx(2.0, abs=0.3)
     with pytest.raises(StateError, match="constraints leave 2 independent changes of the state, not 3"):
-        run.deviations(3)
-    assert run.deviations(directions=[0.0, 1.0, 0.0, 0.0]).lengths.shape == (4001, 1)
+        run.chaos_indicators(3)
+    assert run.chaos_indicators(directions=[0.0, 1.0, 0.0, 0.0]).lengths.shape == (4001, 1)
     with pytest.raises(StateError, match="one that the constraints do not allow"):
-        run.deviations(directions=[0.0, 0.0, 1.0, 0.0])
+        run.chaos_indicators(directions=[0.0, 0.0, 1.0, 0.0])
 
 
 def test_ensembles_are_the_same_as_runs(galaxy):
     q, p = np.array([REGULAR[0], CHAOTIC[0], [0.0, 0.95]]), np.array([REGULAR[1], CHAOTIC[1], [0.4, 0.4]])
     done = []
     with np.errstate(all="ignore"):
-        found = galaxy.deviations_ensemble(q, p, h=0.2, steps=1200, save_every=200, threads=2, progress=done.append)
+        found = galaxy.chaos_indicators_ensemble(
+            q, p, h=0.2, steps=1200, save_every=200, threads=2, progress=done.append
+        )
     assert list(found.status) == ["ok", "ok", found.status[2]]
     assert found.status[2] != "ok"
     assert np.isnan(found.megno()[-1, 2])
     assert done[-1] == 3
     for j, start in enumerate((REGULAR, CHAOTIC)):
-        alone = galaxy.integrate(*start, h=0.2, steps=1200, save_every=200).deviations()
+        alone = galaxy.integrate(*start, h=0.2, steps=1200, save_every=200).chaos_indicators()
         assert_array_equal(found.t, alone.t)
         assert_allclose(found.lengths[:, j], alone.lengths, rtol=1e-5)
         assert_allclose(found.megno()[:, j], alone.megno(), rtol=1e-5)
         assert_allclose(found.lyapunov_exponents()[1:, j], alone.lyapunov_exponents()[1:], atol=1e-6)
         assert_allclose(found.log_gali(3)[:, j], alone.log_gali(3), rtol=1e-5, atol=1e-9)
-    last = galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1, threads=1)
+    last = galaxy.chaos_indicators_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1, threads=1)
     assert_array_equal(
-        last.megno()[-1], galaxy.deviations_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1).megno()[-1]
+        last.megno()[-1], galaxy.chaos_indicators_ensemble(q[:2], p[:2], h=0.2, steps=3000, count=1).megno()[-1]
     )
     assert last.megno().shape == (2, 2)
 
@@ -258,9 +262,9 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     stepper = compile_stepper(system, method)
     alone = by_derivatives(stepper)
     options = {"h": 0.1, "steps": 120, "save_every": 40} | options
-    found = stepper.deviations_ensemble(*start, **options)
+    found = stepper.chaos_indicators_ensemble(*start, **options)
     assert stepper.changes(found.lengths.shape[-1]) is not None
-    same(found, alone.deviations_ensemble(*start, **options), 1e-12)
+    same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
 def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
@@ -268,10 +272,10 @@ def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
     saddle = LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
     stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
     alone = by_derivatives(stepper)
-    found = stepper.deviations_ensemble(*start, h=0.1, steps=300, save_every=100)
+    found = stepper.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100)
     assert_allclose(found.stretches.sum(axis=-1), 0.0, atol=1e-10)
     assert_allclose(found.lyapunov_exponents()[-1], [[10.0, -10.0]] * 2, atol=0.05)
-    same(found, alone.deviations_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
+    same(found, alone.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
 
 
 def test_a_motion_that_leaves_its_lane_is_followed_alone():
@@ -281,10 +285,10 @@ def test_a_motion_that_leaves_its_lane_is_followed_alone():
     alone = by_derivatives(stepper)
     start = np.linspace(0.0, 0.8, 20)[:, np.newaxis], np.zeros((20, 1))
     options = {"h": 0.1, "steps": 60, "save_every": 20, "count": 1}
-    found = stepper.deviations_ensemble(*start, **options, progress=done.append)
+    found = stepper.chaos_indicators_ensemble(*start, **options, progress=done.append)
     assert 2 < sum(found.status == "ok") < 15
     assert done[-1] == 20
-    same(found, alone.deviations_ensemble(*start, **options), 1e-12)
+    same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
 def test_steps_that_are_no_motion_are_refused_as_by_runs():
@@ -296,7 +300,7 @@ def test_steps_that_are_no_motion_are_refused_as_by_runs():
     before = failed.value.trajectory
     with pytest.raises(StepFailedError, match="spurious solution"):
         kepler.jacobian(before.q[-1], before.p[-1], 0.4)
-    found = kepler.deviations_ensemble([q], [p], h=0.4, steps=40, count=1)
+    found = kepler.chaos_indicators_ensemble([q], [p], h=0.4, steps=40, count=1)
     assert list(found.status) == ["strayed"]
     assert np.isnan(found.megno()[-1]).all()
 
@@ -305,10 +309,10 @@ def test_more_motions_than_go_along_together_are_told_apart(galaxy):
     """Those of a row of a map, and each of them alone, whatever the number of threads."""
     y = np.linspace(-0.2, 0.3, MOTIONS + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
-    both = [galaxy.deviations_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
+    both = [galaxy.chaos_indicators_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
     assert_array_equal(both[0].lengths, both[1].lengths)
     for j in (0, MOTIONS - 1, MOTIONS, MOTIONS + 4):
-        alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).deviations(1)
+        alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
         assert_allclose(both[0].lengths[-1, j], alone.lengths[-1], atol=1e-13)
 
 
@@ -320,7 +324,7 @@ def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):
     moved = run.tangent()[-1] @ Changes.checked(galaxy, 1, None).at(
         *map(np.array, CHAOTIC), 0.2, 0.0, run.parameters, None
     )
-    assert run.deviations(1).lengths[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
+    assert run.chaos_indicators(1).lengths[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
 
 
 @pytest.mark.full
@@ -346,7 +350,9 @@ def test_planets_are_regular_and_chaotic_where_rebound_says_so():
         q, v = (
             [c for p in known.particles for c in pair(p)] for pair in (lambda p: (p.x, p.y), lambda p: (p.vx, p.vy))
         )
-        found = stepper.deviations_ensemble([q], velocity=[v], h=0.15, steps=round(span / 0.15), count=1).megno()[-1, 0]
+        found = stepper.chaos_indicators_ensemble([q], velocity=[v], h=0.15, steps=round(span / 0.15), count=1).megno()[
+            -1, 0
+        ]
         known.init_megno(seed=1)
         known.integrate(span)
         if regular:
@@ -362,17 +368,17 @@ def test_what_is_refused(galaxy):
     with pytest.raises(StateError, match="whole steps"):
         galaxy.integrate(*REGULAR, h=0.2, steps=4, t_eval=[0.1, 0.3]).megno()
     with pytest.raises(StateError, match="number of changes must be at most 4, not 5"):
-        run.deviations(5)
+        run.chaos_indicators(5)
     with pytest.raises(StateError, match=r"shape \(4,\) or \(4, k\)"):
-        run.deviations(directions=[1.0, 2.0])
+        run.chaos_indicators(directions=[1.0, 2.0])
     with pytest.raises(StateError, match="give one of them"):
-        run.deviations(1, directions=[1.0, 0.0, 0.0, 0.0])
+        run.chaos_indicators(1, directions=[1.0, 0.0, 0.0, 0.0])
     with pytest.raises(StateError, match="finite, and not 0"):
-        run.deviations(directions=np.zeros(4))
+        run.chaos_indicators(directions=np.zeros(4))
     with pytest.raises(StateError, match="there are 2 changes here"):
-        run.deviations(2).gali(3)
+        run.chaos_indicators(2).gali(3)
     with pytest.raises(StateError, match="no multiple of save_every=3"):
-        galaxy.deviations_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
+        galaxy.chaos_indicators_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
 
 
 def test_steps_too_long_are_said_of_an_ensemble():
@@ -380,6 +386,6 @@ def test_steps_too_long_are_said_of_an_ensemble():
     starts = [[1.0, 0.0], [0.1, 0.0]], [[0.0, 1.0], [0.0, 19.0**0.5]]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        kepler.deviations_ensemble(*starts, h=0.005, steps=200)
+        kepler.chaos_indicators_ensemble(*starts, h=0.005, steps=200)
     with pytest.warns(AccuracyWarning, match=r"too long.*\(motion 0 of 2\)"):
-        kepler.deviations_ensemble(starts[0][::-1], starts[1][::-1], h=0.05, steps=200)
+        kepler.chaos_indicators_ensemble(starts[0][::-1], starts[1][::-1], h=0.05, steps=200)

@@ -138,7 +138,7 @@ def test_a_known_start_and_inputs_that_are_data():
         start=0.0,
         h=0.05,
         inputs=push,
-        state=False,
+        fit_initial_state=False,
         parameters={"m": 1.0, "k": 1.0},
     )
     assert found.names == ("m", "k")
@@ -239,7 +239,7 @@ def test_a_measurement_at_the_start_tells_the_state_alone():
     """No step is taken: the state is what was measured, and parameters are not told."""
     known = {"q": [0.7], "p": [0.2], "h": 0.1}
     with pytest.raises(FitError, match="do not tell delta: they do not depend on it"):
-        fit(oscillator(), [0.0], [0.5], unknown=["delta"], state=False, **known)
+        fit(oscillator(), [0.0], [0.5], unknown=["delta"], fit_initial_state=False, **known)
     found = fit(oscillator(), [0.0], [[0.5, 0.4]], observed=["x", "p_x"], unknown=[], **known)
     assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
 

@@ -47,7 +47,7 @@ def test_a_halo_orbit_is_the_published_one(restricted):
     """From a guess that is off in the third digit, to the tenth; its monodromy against differences by DOP853."""
     x, v, period = HALO
     guess = [1.001 * x[0], 0.0, x[2]], [0.0, 0.998 * v[1], 0.0]
-    orbit = periodic_orbit(restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, hold=["y", "z"])
+    orbit = periodic_orbit(restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, fixed=["y", "z"])
     assert_allclose(orbit.q, x, atol=1e-10)
     assert_allclose(restricted.velocity(orbit.q, orbit.p), v, atol=1e-10)
     assert orbit.period == pytest.approx(period, abs=1e-10)
@@ -90,7 +90,7 @@ def test_an_unstable_orbit_is_found_from_a_velocity_some_percent_off(restricted,
     """A Lyapunov orbit about L1: tangent vectors grow by 1190 in a period. The reference is shooting by DOP853."""
     x, speed, period = 0.8069, *_lyapunov_orbit(0.8069)
     guess = {"velocity": [0.0, (1.0 + error) * speed, 0.0], "period": period}
-    orbit = periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, hold=["x", "y"])
+    orbit = periodic_orbit(restricted, [x, 0.0, 0.0], **guess, steps=200, fixed=["x", "y"])
     assert restricted.velocity(orbit.q, orbit.p) == pytest.approx([0.0, speed, 0.0], abs=1e-9)
     assert orbit.period == pytest.approx(period, abs=1e-8)
     assert np.abs(orbit.stability_indices).max() == pytest.approx(594.2, abs=0.1)
@@ -116,12 +116,12 @@ def test_a_pendulum_swings_as_long_as_the_elliptic_integral_says():
     pendulum = compile_stepper(problem("planar-pendulum").system, SVI(8))
     values = {"m": 1.0, "l": 1.0, "g": 1.0}
     exact = 4 * ellipk(np.sin(0.5) ** 2)
-    amplitude = periodic_orbit(pendulum, [1.0], [0.1], period=7.0, steps=60, hold=["q"], parameters=values)
-    at_rest = periodic_orbit(pendulum, [1.0], [0.0], period=7.0, steps=60, hold=["q", "p_q"], parameters=values)
+    amplitude = periodic_orbit(pendulum, [1.0], [0.1], period=7.0, steps=60, fixed=["q"], parameters=values)
+    at_rest = periodic_orbit(pendulum, [1.0], [0.0], period=7.0, steps=60, fixed=["q", "p_q"], parameters=values)
     assert at_rest.period == pytest.approx(exact, rel=1e-12)
     assert amplitude.period > exact
     timed = periodic_orbit(
-        pendulum, [1.1], [0.0], period=exact, steps=60, hold=["p_q"], fixed_period=True, parameters=values
+        pendulum, [1.1], [0.0], period=exact, steps=60, fixed=["p_q"], fixed_period=True, parameters=values
     )
     assert timed.q[0] == pytest.approx(1.0, abs=1e-9)
     weighed = periodic_orbit(pendulum, [0.9], [0.05], period=6.5, steps=60, energy=-np.cos(1.0), parameters=values)
@@ -130,7 +130,7 @@ def test_a_pendulum_swings_as_long_as_the_elliptic_integral_says():
     assert weighed.stable
     assert_allclose(weighed.stability_indices, [1.0], atol=1e-10)
     over = periodic_orbit(
-        pendulum, [0.0], [2.5], period=3.0, steps=60, hold=["q", "p_q"], gain=[2 * np.pi], parameters=values
+        pendulum, [0.0], [2.5], period=3.0, steps=60, fixed=["q", "p_q"], gain=[2 * np.pi], parameters=values
     )
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
 
@@ -181,12 +181,12 @@ def test_what_is_no_orbit(galaxy):
     with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
         periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
     with pytest.raises(OrbitError, match="no orbit closes near here"):
-        periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, hold=["x", "y", "p_x", "p_y"])
+        periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, fixed=["x", "y", "p_x", "p_y"])
     losing = compile_stepper(problem("harmonic-oscillator").system, ExplicitEuler())
     with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
-        periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, hold=["q"])
-    with pytest.raises(StateError, match="no 'p_z' to hold; did you mean"):
-        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, hold=["p_z"])
+        periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
+    with pytest.raises(StateError, match="no 'p_z' to keep fixed; did you mean"):
+        periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
     with pytest.raises(StateError, match="give one of them"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
     with pytest.raises(StateError, match="a period is positive"):
@@ -217,7 +217,7 @@ def test_an_orbit_has_the_energy_that_is_asked_for():
     oscillator = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     stepper = compile_stepper(oscillator, SVI(3))
     with pytest.raises(OrbitError, match=r"has the energy 0\.5, not 0\.5001"):
-        periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, hold=["x", "p_x"], energy=0.5001)
+        periodic_orbit(stepper, [1.0], [0.0], period=2 * np.pi, steps=40, fixed=["x", "p_x"], energy=0.5001)
     found = periodic_orbit(stepper, [1.0], [0.1], period=2 * np.pi, steps=40, energy=5.0)
     assert found.energy == pytest.approx(5.0, rel=1e-12)
 
@@ -232,7 +232,7 @@ def test_no_input_is_taken_for_nothing_and_no_monitor_for_steps_of_one_length():
     with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
         periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
     with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
-        watched.deviations_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
+        watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 
 def test_names_of_a_state_are_each_its_own():
@@ -243,9 +243,9 @@ def test_names_of_a_state_are_each_its_own():
     stepper = compile_stepper(plane, SVI(3))
     assert stepper.interface.momenta == ("_p_x", "p_p_x")
     given = [0.9, 0.0], [0.3, 0.0]
-    along = periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["p_x", "p_p_x", "x"])
+    along = periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["p_x", "p_p_x", "x"])
     assert along.p[0] != 0.3
-    assert periodic_orbit(stepper, *given, period=6.0, steps=60, hold=["_p_x"]).p[0] == 0.3
+    assert periodic_orbit(stepper, *given, period=6.0, steps=60, fixed=["_p_x"]).p[0] == 0.3
 
 
 @pytest.mark.parametrize("q", [0.0, np.pi])
