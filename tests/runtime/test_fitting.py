@@ -178,8 +178,8 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"observed": ["x", "p_x"]}, r"measured has shape \(150, 2\) for x, p_x, not \(150,\)"),
         ({"deviations": -1.0}, "deviations are a positive number"),
         ({"start": 1.0}, "before the first measurement"),
-        ({"state": False}, "give p, or let the state be found"),
-        ({"state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
+        ({"fit_initial_state": False}, "give p, or let the state be found"),
+        ({"fit_initial_state": False, "velocity": None, "p": [0.0], "unknown": []}, "nothing to find"),
         ({"bounds": {"k": (0, 1)}}, "'k' is not among the unknowns"),
         ({"bounds": {"delta": (0.0, 0.1)}}, r"guess of delta, 0.3, is not between its bounds \(0.0, 0.1\)"),
         (
@@ -340,7 +340,7 @@ def test_segments_with_a_known_start_and_inputs():
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
     run = stepper.drive([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
     times = np.linspace(0.13, 7.9, 60)
-    known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "state": False}
+    known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "fit_initial_state": False}
     found = fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)
     assert found.names == ("m", "k")
     assert_allclose(found.values, [1.5, 2.0], rtol=1e-7)
