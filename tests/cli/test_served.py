@@ -25,7 +25,7 @@ MODELS = {
     "inputs": SWING
     + 'inputs = ["u"]\n[forces]\nq = "u"\n[inputs]\nu = { t = [0.0, 0.5, 1.0], values = [0.0, 1.0, 0.0] }\n'
     + START,
-    "sums over indices": '[system]\nname = "ring"\ncoordinates = ["q[N]"]\n'
+    "array systems": '[system]\nname = "ring"\ncoordinates = ["q[N]"]\n'
     'lagrangian = "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"\n'
     '[sizes]\nN = 8\n[initial]\nq = "sin(i)"\nq_dot = "0"\n',
 }
