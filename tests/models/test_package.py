@@ -15,7 +15,8 @@ from programs import needs
 
 from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import BuildError, PackageError, StateError
+from scvi_codegen.errors import BuildError, PackageError, StateError, StepFailedError
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import load_model
@@ -135,6 +136,43 @@ def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compil
     states = np.hstack([trajectory.q, trajectory.p])
     assert np.abs(table[:, 1:-1] - states).max() < 1e-8 * np.abs(states).max()
     assert np.abs(table[:, -1]).max() <= 2 * np.abs(trajectory.energy() - trajectory.energy()[0]).max() + 1e-13
+
+
+@pytest.mark.parametrize(
+    ("h", "solver", "reported"),
+    [
+        (0.5, "auto", ""),
+        (
+            0.5,
+            "fixed-point",
+            "the step from t = 0 failed: the iteration on the stage equations did not converge; use a smaller step",
+        ),
+        (1.5, "auto", "the step from t = 1.5 failed: the iteration converged to a spurious solution"),
+    ],
+)
+def test_a_loop_in_c_takes_newtons_iteration_where_the_fixed_point_fails(h, solver, reported, tmp_path):
+    """Two stiff springs with forces: omega h = 5 and more, where the fixed-point iteration diverges."""
+    needs("make", "cc")
+    system = LagrangianSystem.from_text(
+        name="springs",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + y_dot**2)/2 - 50*(x**2 + y**2) - x**2*y**2",
+        forces={"x": "-0.1*x_dot", "y": "cos(t) - 0.1*y_dot"},
+    )
+    model = Model(system=system, method="svi:2", q=(1.0, 0.5), velocity=(0.0, 0.0), h=h, steps=20)
+    folder = generate_package(model, tmp_path / "springs_svi", solver=solver)
+    command = ["make", "-s", "-C", str(folder), "run", f"CFLAGS={STRICT}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if reported:
+        assert result.returncode != 0
+        assert reported in result.stderr
+        return
+    assert result.returncode == 0
+    table = np.array([line.split() for line in result.stdout.splitlines() if line[0] != "#"], dtype=float)
+    run = compile_stepper(system, "svi:2", solver="newton").integrate(model.q, velocity=model.velocity, h=h, steps=20)
+    assert np.abs(table[:, 1:-1] - np.hstack([run.q, run.p])).max() < 1e-9
+    with pytest.raises(StepFailedError):
+        compile_stepper(system, "svi:2", solver="fixed-point").step(model.q, run.p[0], h)
 
 
 KINDS = """
