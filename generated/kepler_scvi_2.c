@@ -7,25 +7,25 @@
 #include <math.h>
 #include <string.h>
 
-#define NAME(word) kepler_scvi_2_##word /* begins every exported name */
+#define NAME(word) kepler_scvi_2_##word /* prefix of every exported name */
 #define STATUS(word) KEPLER_SCVI_2_##word
-#define TOLERANCE 2.220446049250313e-16 /* unless options say otherwise */
+#define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
   M = 2, /* coordinates */
   SITES = 2, /* coordinates, then the components of other unknowns */
-  B = 5, /* unknowns a site */
+  B = 5, /* unknowns per site */
   N = 10, /* unknowns */
-  POINTS = 5, /* most points of a family, or blocks */
-  POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
-  MOST_ITERATIONS = INT_MAX, /* whatever the options say */
-  MAX_ITERATIONS = 50, /* unless options say otherwise */
-  MAPS = 1, /* quantities that symmetries conserve */
+  POINTS = 5, /* largest number of points of a stage group, or of blocks */
+  POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
+  MOST_ITERATIONS = INT_MAX, /* whatever the options are */
+  MAX_ITERATIONS = 50, /* default */
+  MAPS = 1, /* first integrals from symmetries */
   SUMS = 1, /* integrals along the curve of a step */
-  BAND = 1, /* coordinates that meet are at most so many places apart */
-  MASS_ENTRIES = 2, /* of the Legendre transform that are not zero */
+  BAND = 1, /* largest distance of coupled coordinates in the ordering PLACE */
+  MASS_ENTRIES = 2, /* nonzero entries of the Legendre transform */
   MEMORY = 14, /* numbers kept from step to step */
-  SCRATCH = 64 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
+  SCRATCH = 64 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
 #include "support/double.h"
@@ -33,17 +33,17 @@ enum {
 #include "support/answers.h"
 #include "support/step.h"
 
-/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b]
- * v0 + MOMENTA[b] p0; h z_b is a length if MOVES[b]. */
+/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
+ * STRAIGHT[b] v0 + MOMENTA[b] p0; h z_b is a displacement if MOVES[b]. */
 static const double END_POSITION[5] = {1.0, 0.75, -0.25, 0.0, 0.0};
 static const double MOMENTUM_ROW[5] = {1.0, 0.75, -0.25, 0.0, 0.0};
 static const double STRAIGHT[5] = {1.0, 0.0, 0.0, 0.0, 0.0};
 static const double MOMENTA[5] = {0.0, 0.0, 0.0, 0.0, 0.0};
 static const double MOVES[5] = {1.0, 1.0, 1.0, 1.0, 1.0};
 
-/* Quadrature: 2 points. Gather tables have one row a
- * block and one column a point, scatter tables one row a point and one column a row of equations, a last one for p1.
- * {i, j}: slope d value_i / d u_j. */
+/* Quadrature: 2 points. Gather tables have one row
+ * per block and one column per point, scatter tables one row per point and one column per row of equations, the last
+ * one for p1. {i, j}: derivative d value_i / d u_j. */
 static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
 static const double QUADRATURE_GATHER_0[5][2] = {
     {0.21132486540518713, 0.7886751345948129},
@@ -66,9 +66,9 @@ static const double QUADRATURE_SCATTER_1[2][6] = {
 static const int QUADRATURE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
 
-/* Node: 2 points. Gather tables have one row a
- * block and one column a point, scatter tables one row a point and one column a row of equations, a last one for p1.
- * {i, j}: slope d value_i / d u_j. */
+/* Node: 2 points. Gather tables have one row
+ * per block and one column per point, scatter tables one row per point and one column per row of equations, the last
+ * one for p1. {i, j}: derivative d value_i / d u_j. */
 static const double NODE_WEIGHT[2] = {1.0, 1.0};
 static const double NODE_GATHER_0[5][2] = {{0.5, 1.0}, {0.3125, 0.75}, {-0.1875, -0.25}, {0.0, 0.0}, {0.0, 0.0}};
 static const double NODE_GATHER_1[5][2] = {{1.0, 1.0}, {0.75, 1.0}, {-0.25, 0.0}, {0.0, 0.0}, {0.0, 0.0}};
@@ -84,7 +84,7 @@ static const int NODE_SLOPE_2[2][2] = {{0, 0}, {1, 1}};
 static const int NODE_SLOPE_3[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
 
-/* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
+/* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int PLACE[SITES] = {0, 1};
 #define MASS_PLACE PLACE
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
@@ -236,7 +236,7 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 #include "support/gather.h"
 #include "support/stages.h"
 
-/* Quadrature points: their part of the rows, and of the Jacobian unless it is NULL. */
+/* Quadrature points: adds their part of the rows, and of the Jacobian unless it is NULL. */
 static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
     const band *shape)
 {
@@ -261,7 +261,7 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
       slope + 4, 6, jacobian, shape);
 }
 
-/* Node points: their part of the rows, and of the Jacobian unless it is NULL. */
+/* Node points: adds their part of the rows, and of the Jacobian unless it is NULL. */
 static void add_node(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
     const band *shape)
 {
@@ -296,8 +296,8 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
       shape);
 }
 
-/* The stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
- * cancellation; and the Jacobian, of the shape given, unless it is NULL. */
+/* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
+ * cancellation; and the Jacobian in the given shape, unless it is NULL. */
 static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
     double *jacobian, const band *shape)
 {
@@ -308,7 +308,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton.h"
 
-#define STAGE_POWER 1.5 /* of what is left unresolved, in the error of the end */
+#define STAGE_POWER 1.5 /* exponent from the curve's estimate to the error of the end */
 static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
 static const double STAGE_NEXT[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_BEND[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
@@ -400,7 +400,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #include "support/newton_fallback.h"
 #include "support/sweep_solver.h"
 
-/* How the error of a curve is found, and the power of it that the relative error of the end of its step goes with. */
+/* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
 #define KEPT_VELOCITIES 0
 #define KEPT_UNIT(i) (step->h)
@@ -438,7 +438,7 @@ static const double EXTRAPOLATION[5][5] = {
 #include "support/even_time.h"
 #include "support/run.h"
 
-/* Adds h^1 sum_n w_n lagrangian along the curve given by z. */
+/* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
 static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
 {
   const double h = step->h;

@@ -17,81 +17,82 @@ extern "C" {
 #define KEPLER_SVI_4_COORDINATES 2
 #define KEPLER_SVI_4_PARAMETERS 1
 #define KEPLER_SVI_4_UNKNOWNS 8
-/* Length, in doubles, of the workspace that the functions below ask for. */
+/* Length, in doubles, of the workspace of the functions below. */
 #define KEPLER_SVI_4_WORKSPACE 210
 
-/* What a function returns. A call that fails leaves its state untouched. */
+/* Status of a call. A call that fails leaves its state unchanged. */
 enum {
   KEPLER_SVI_4_OK = 0,
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
-  KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix has no inverse */
-  KEPLER_SVI_4_NOT_FINITE = 3, /* an infinity or a NaN turned up */
-  KEPLER_SVI_4_VANISHED = 4, /* steps that choose their length became as good as nothing */
-  KEPLER_SVI_4_STRAYED = 5 /* the equations of the step were solved by what is no motion */
+  KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix is singular */
+  KEPLER_SVI_4_NOT_FINITE = 3, /* a value is infinite or NaN */
+  KEPLER_SVI_4_VANISHED = 4, /* step size underflow of adaptive steps */
+  KEPLER_SVI_4_STRAYED = 5 /* converged to a spurious solution of the stage equations */
 };
 
-/* When the stage equations are solved. With absolute = 0 the update of the stages, relative to |q| + h|v|, and that of
- * the end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop shrinking at round-off level. With
- * absolute = 1 the largest update itself must fall below tolerance. */
+/* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and
+ * that of the end momentum, relative to |p| + h|L_q|, must fall below tolerance or stop decreasing at round-off level.
+ * With absolute = 1 the largest update itself must fall below tolerance. */
 typedef struct {
   double tolerance;
   int max_iterations;
   int absolute;
 } kepler_svi_4_options;
 
-/* What a call did. */
+/* Report of a call. */
 typedef struct {
   long long steps; /* completed */
   long long iterations; /* of the solver, over all steps */
   double change; /* the last update, measured as above */
   double t; /* start of the last step tried */
   double duration; /* of the last step: h */
-  long long stored; /* states, where steps choose their length */
+  long long stored; /* states stored, with adaptive steps */
 } kepler_svi_4_report;
 
-/* All memory of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries hold what
- * rounding cut off t, q and p; what is remembered of the stages of the last step is extrapolated to guess the next. */
+/* State of a run: copy it to save the run, copy it back to resume, bit for bit. t_low and the carries are the
+ * compensation terms (low words) of t, q and p; the stages of the last step are extrapolated to predict the next. */
 typedef struct {
   double t, t_low, h;
   long long step; /* completed */
   double q[2], p[2];
   double carry_q[2], carry_p[2];
   double memory[16];
-  long long guess; /* what memory holds of the steps before, 0 if nothing */
+  long long guess; /* what memory contains of the previous steps; 0: nothing */
   long long iterations; /* since the last stored state */
-  double error, error_t; /* the largest yet of what a step's curve left unresolved, and the time of that step */
-  double largest_q, largest_p; /* numbers yet of the states that were asked */
-  long long leaving; /* steps from an origin at rest in which error falls as the state grows */
+  double error, error_t; /* largest error estimate of a step so far, and the time of that step */
+  double largest_q, largest_p; /* largest numbers of the states examined so far */
+  long long leaving; /* steps after a start at rest in the origin, while the error is rescaled with the state */
 } kepler_svi_4_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */
 kepler_svi_4_options kepler_svi_4_default_options(void);
 
-/* Legendre transform at (q, v, t) and back, m numbers each; energy p.v - L. */
+/* Legendre transform at (q, v, t) and its inverse, m numbers each; energy p.v - L. On failure the result is
+ * unchanged. */
 int kepler_svi_4_momentum(double t, const double *q, const double *v, const double *parameters, double *p,
     double *workspace);
 int kepler_svi_4_velocity(double t, const double *q, const double *p, const double *parameters, double *v,
     double *workspace);
 int kepler_svi_4_energy(double t, const double *q, const double *p, const double *parameters, double *energy,
     double *workspace);
-/* The same at count states: t (count), q and p (count, m), energy (count). */
+/* Energies of count states: t (count), q and p (count, m), energy (count). */
 int kepler_svi_4_energies(long long count, const double *t, const double *q, const double *p, const double *parameters,
     double *energy, double *workspace);
 
-/* What symmetries of the system conserve, to round-off if nothing else is said, at count states, map and size
- * (count, 1), in this order:
+/* Momentum maps: first integrals from symmetries, conserved to round-off unless stated otherwise, of count states;
+ * map and size (count, 1), in this order:
  *   angular momentum = q1*p_q2 - q2*p_q1
- * size: root of the sum of the squares of the terms, beside which rounding is to be judged; may be NULL. */
+ * size: root of the sum of the squares of the terms, the reference for rounding errors; may be NULL. */
 int kepler_svi_4_momentum_maps(long long count, const double *t, const double *q, const double *p,
     const double *parameters, double *map, double *size);
 
-/* One step from (q0, p0) at t to (q1, p1) at t + h; depends on nothing but its arguments. h < 0 goes back. */
+/* One step from (q0, p0) at t to (q1, p1) at t + h; depends on nothing but its arguments. h < 0 integrates backward. On
+ * failure q1 and p1 are undefined. */
 int kepler_svi_4_step(double t, double h, const double *q0, const double *p0, const double *parameters,
     const kepler_svi_4_options *options, double *q1, double *p1, kepler_svi_4_report *report, double *workspace);
 
-/* A run with compensated sums and extrapolated guesses: start it, then advance it as often as wanted. Every `every`
- * steps counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored (k).
- * */
+/* Runs with compensated sums and predictors: start a run, then advance it any number of times. Every `every` steps,
+ * counted from its start, the state is stored: t (k), q (k, m), p (k, m), iterations since the last stored one (k). */
 void kepler_svi_4_start(kepler_svi_4_run *run, double t, double h, const double *q, const double *p);
 int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every, const double *parameters,
     const kepler_svi_4_options *options, double *t, double *q, double *p, int *iterations, kepler_svi_4_report *report,
@@ -102,7 +103,7 @@ int kepler_svi_4_advance(kepler_svi_4_run *run, long long steps, long long every
  * code for microcontrollers (single or double precision) with fixed step size, which leaves it out to save memory. */
 double kepler_svi_4_step_error(const kepler_svi_4_run *run);
 
-/* The discrete Lagrangian L_d(q0, q1) and its Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
+/* Discrete Lagrangian L_d(q0, q1) and its discrete Legendre transforms p0 = -D1 L_d (F-), p1 = D2 L_d (F+). */
 int kepler_svi_4_discrete_legendre(double t, double h, const double *q0, const double *q1, const double *parameters,
     const kepler_svi_4_options *options, double *p0, double *p1, double *action, kepler_svi_4_report *report,
     double *workspace);

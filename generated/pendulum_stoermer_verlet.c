@@ -6,17 +6,17 @@
 #include <math.h>
 #include <string.h>
 
-#define NAME(word) pendulum_stoermer_verlet_##word /* begins every exported name */
+#define NAME(word) pendulum_stoermer_verlet_##word /* prefix of every exported name */
 #define STATUS(word) PENDULUM_STOERMER_VERLET_##word
-#define TOLERANCE 2.220446049250313e-16 /* unless options say otherwise */
+#define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
   M = 1, /* coordinates */
-  MAX_ITERATIONS = 50, /* unless options say otherwise */
-  BAND = 0, /* coordinates that meet are at most so many places apart */
-  MASS_ENTRIES = 1, /* of the Legendre transform that are not zero */
+  MAX_ITERATIONS = 50, /* default */
+  BAND = 0, /* largest distance of coupled coordinates in the ordering PLACE */
+  MASS_ENTRIES = 1, /* nonzero entries of the Legendre transform */
   MEMORY = 1, /* numbers kept from step to step */
-  SCRATCH = 2 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
+  SCRATCH = 2 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
 #include "support/double.h"
@@ -24,7 +24,7 @@ enum {
 #include "support/answers.h"
 #include "support/step.h"
 
-/* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
+/* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int PLACE[M] = {0};
 #define MASS_PLACE PLACE
 static const int MASS_ENTRY[1][2] = {{0, 0}};

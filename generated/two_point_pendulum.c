@@ -7,24 +7,24 @@
 #include <math.h>
 #include <string.h>
 
-#define NAME(word) two_point_pendulum_##word /* begins every exported name */
+#define NAME(word) two_point_pendulum_##word /* prefix of every exported name */
 #define STATUS(word) TWO_POINT_PENDULUM_##word
-#define TOLERANCE 2.220446049250313e-16 /* unless options say otherwise */
+#define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
   M = 1, /* coordinates */
   SITES = 1, /* coordinates, then the components of other unknowns */
-  B = 1, /* unknowns a site */
+  B = 1, /* unknowns per site */
   N = 1, /* unknowns */
-  POINTS = 2, /* most points of a family, or blocks */
-  POINT = 0, /* numbers that say where a Jacobian that is kept was taken */
-  MOST_ITERATIONS = INT_MAX, /* whatever the options say */
-  MAX_ITERATIONS = 50, /* unless options say otherwise */
+  POINTS = 2, /* largest number of points of a stage group, or of blocks */
+  POINT = 0, /* numbers that describe where a reused Jacobian was evaluated */
+  MOST_ITERATIONS = INT_MAX, /* whatever the options are */
+  MAX_ITERATIONS = 50, /* default */
   SUMS = 1, /* integrals along the curve of a step */
-  BAND = 0, /* coordinates that meet are at most so many places apart */
-  MASS_ENTRIES = 1, /* of the Legendre transform that are not zero */
+  BAND = 0, /* largest distance of coupled coordinates in the ordering PLACE */
+  MASS_ENTRIES = 1, /* nonzero entries of the Legendre transform */
   MEMORY = 4, /* numbers kept from step to step */
-  SCRATCH = 12 /* arguments, values and slopes at all points, or the mass matrix with its slopes */
+  SCRATCH = 12 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
 #include "support/double.h"
@@ -32,8 +32,8 @@ enum {
 #include "support/answers.h"
 #include "support/step.h"
 
-/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r holds MOMENTUM_ROW[r] p0; the straight-line guess of z_b is STRAIGHT[b]
- * v0 + MOMENTA[b] p0; h z_b is a length if MOVES[b]. */
+/* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
+ * STRAIGHT[b] v0 + MOMENTA[b] p0; h z_b is a displacement if MOVES[b]. */
 static const double END_POSITION[1] = {1.0};
 static const double MOMENTUM_ROW[1] = {1.0};
 static const double STRAIGHT[1] = {1.0};
@@ -41,7 +41,7 @@ static const double MOMENTA[1] = {0.0};
 static const double MOVES[1] = {1.0};
 static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
 
-/* Place of each coordinate in the order in which those that meet stand near each other; {i, j}: d y_i / d x_j. */
+/* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int PLACE[SITES] = {0};
 #define MASS_PLACE PLACE
 static const int MASS_ENTRY[1][2] = {{0, 0}};
@@ -102,8 +102,8 @@ static void quadrature_points(const step_data *step, const double *z, double *u)
   u[3] = z[0];
 }
 
-/* The stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
- * cancellation; and the Jacobian, of the shape given, unless it is NULL. */
+/* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
+ * cancellation; and the Jacobian in the given shape, unless it is NULL. */
 static void evaluate(const step_data *step, const double *z, double *rows, double *size_p, double *size_q,
     double *jacobian, const band *shape)
 {
@@ -117,7 +117,8 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
       quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
   }
 
-  /* (34d), to be 0, where q1 = q0 + h sum_b END_POSITION[b] z_b, (34c). */
+  /* (34d) = 0, with q1 = q0 + h sum_b END_POSITION[b]
+   * z_b, (34c). */
   rows[0] = step->p0[0] + 0.7886751345948129 * (0.5 * h * value[0]) + 0.21132486540518713 * (0.5 * h * value[2]) -
       0.5 * value[1] - 0.5 * value[3];
   /* p1 - p0, (34e). */
@@ -190,7 +191,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/newton_fallback.h"
 #include "support/sweep_solver.h"
 
-/* How the error of a curve is found, and the power of it that the relative error of the end of its step goes with. */
+/* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
 #define KEPT_VELOCITIES 0
 #define KEPT_UNIT(i) (data->square * data->inverse_mass[i])
@@ -217,7 +218,7 @@ static const double EXTRAPOLATION[1][1] = {{1.0}};
 #include "support/even_time.h"
 #include "support/run.h"
 
-/* Adds h^1 sum_n w_n lagrangian along the curve given by z. */
+/* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
 static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
 {
   const double h = step->h;

@@ -1,9 +1,11 @@
-/* When a step is compared with two of half its length, and what their difference means. */
+/* Parameters of the comparison of a step with two steps of half its size. */
 
-#define COMPARED 512 /* steps, of which one is compared */
-#define FALLBACK_COMPARED 8 /* steps that sweeps did not solve, of which one is */
-#define DOUBTFUL REAL(4.0) /* times the largest error yet, squared as that of a curve: such a step is */
-#define RESOLVED_STEP REAL(1e-6) /* of the state: where halves differ by more, those of the first half are compared */
+#define COMPARED 512 /* one of so many steps is compared */
+#define FALLBACK_COMPARED 8 /* one of so many steps that the fixed-point iteration did not solve */
+#define DOUBTFUL REAL(4.0) /* steps whose error estimate exceeds the largest one so far by this factor (squared) are
+                            * compared */
+#define RESOLVED_STEP REAL(1e-6) /* relative to the state: if the halves differ by more, those of the first half are
+                                  * compared */
 #define MOST_HALVINGS 24
-#define GROSS_DIFFERENCE REAL(10.0) /* times the state: beyond it a step is no motion */
+#define GROSS_DIFFERENCE REAL(10.0) /* relative to the state: beyond it the step is a spurious solution */
 #define ROUNDING_OF_HALVES (64 * REAL_EPSILON)

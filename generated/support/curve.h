@@ -1,11 +1,11 @@
-/* Curves of a step given by initial velocities v0 and scaled accelerations z = h a at nodes. Before it:
+/* Collocation curve of a step: initial velocity v0 and scaled accelerations z = h a at the nodes. Requires:
  * one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
 typedef struct {
   double v0[M];
   lanes z[1][M];
 } curve_data;
 
-enum { CURVE_MEMORY = 2 * M * LANES + M }; /* z of the last step and of the one before, v0 */
+enum { CURVE_MEMORY = 2 * M * LANES + M }; /* z of the last two steps, then v0 */
 
 static void save_curve(curve_data *curve, history past)
 {
@@ -24,7 +24,7 @@ static inline double end_velocity(const curve_data *curve, int i)
   return curve->v0[i] + lanes_total(NODE_MASK * NODE_END * curve->z[0][i]);
 }
 
-/* The curve of the last steps continued, or a straight line. */
+/* Initial curve: extrapolation of the last steps, or a straight line. */
 static int first_curve(const step_data *step, const double *past, long long steps, curve_data *curve)
 {
   if (steps > 0) {

@@ -1,4 +1,4 @@
-/* Drifts with constant masses. Before it: step.h, the kernel mass. */
+/* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
 typedef struct {
   real inverse_mass[M];
 } solver_data;
@@ -10,7 +10,7 @@ static void prepare(const step_data *step, solver_data *data)
     data->inverse_mass[i] = 1 / data->inverse_mass[i];
 }
 
-/* A part of the step with the momenta p0 + dp. */
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
 static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
 {
   for (int i = 0; i < M; i++)

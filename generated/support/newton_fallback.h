@@ -1,4 +1,4 @@
-/* Where sweeps fail, Newton's iteration. Before it: newton.h, strays.h. */
+/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, strays.h. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)

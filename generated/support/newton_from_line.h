@@ -1,6 +1,6 @@
-/* Newton's iteration without former steps. Before it: newton.h. */
+/* Newton's method without previous steps. Requires: newton.h. */
 
-/* The guess that q moves on a straight line with its initial velocity. */
+/* Initial guess: q moves on a straight line with its initial velocity. */
 static int line_from(const step_data *step, const newton_data *data)
 {
   real v[M];
@@ -10,7 +10,7 @@ static int line_from(const step_data *step, const newton_data *data)
   return status;
 }
 
-/* Newton's iteration from that guess. */
+/* Newton's method from that guess. */
 static int newton_from_line(const step_data *step, const newton_data *data, real *dp, int *keep,
     const solver_options *options, solver_report *report)
 {

@@ -1,5 +1,5 @@
-/* A step by Newton's iteration alone. Before it: newton.h, the table EXTRAPOLATION: the guess from the step before is
- * sum_c EXTRAPOLATION[c][b] z_c; for multipliers the rows from B on. */
+/* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
+ * of the previous step; for multipliers the rows from B on. */
 typedef struct {
   int unused;
 } solver_data;
@@ -10,7 +10,7 @@ static void prepare(const step_data *step, solver_data *data)
   data->unused = 0;
 }
 
-/* The factors at a remembered point, made again, the same to the last bit; 0 if that fails. */
+/* Recomputes the factors at a stored point, bit for bit; returns 0 if that fails. */
 static int remake_factors(const step_data *step, const real *point, const newton_data *data)
 {
   const band shape = band_of(SITES, B);
@@ -24,16 +24,17 @@ static int remake_factors(const step_data *step, const real *point, const newton
   return linearise(&then, data, &shape);
 }
 
-/* The unknowns of the step before, extrapolated. */
+/* Extrapolates the unknowns of the previous step. */
 static void guess_from(const real *memory, const newton_data *data)
 {
   gather(EXTRAPOLATION[0], B, 1, memory, M, data->z, 1, B);
   gather(EXTRAPOLATION[SITES > M ? B : 0], B, 1, memory + M * B, SITES - M, data->z + M * B, 1, B);
 }
 
-/* The increments by RATTLE where a step is one, else by Newton's iteration, from the stages of the step before,
- * extrapolated, and from the straight line if there are none or they lead nowhere. Memory holds the stages, and where
- * factors go from step to step the point of the factors; guess says whether the first (1) or both (2) are of use. */
+/* Computes the increments by RATTLE if applicable, else by Newton's method from the extrapolated stages of the previous
+ * step, and from the straight line if there are none or the iteration fails. memory contains the stages and, if factors
+ * are reused, the point of the factors; guess is 1 if the stages are valid, 2 if both are. On failure the increments
+ * are undefined and memory and guess are unchanged. */
 static int solve(const step_data *step, const solver_data *unused, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {

@@ -1,6 +1,7 @@
-/* A step by sweeps of a shooting-based variational method. Before it: curve_points.h, the tables, the kernels
+/* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
+ * stationary form, with multipliers of the collocation equations). Requires: curve_points.h, the tables, the kernels
  * node_lanes and action_lanes. */
-#define ROUNDING_MARGIN 0.25 /* once all has rested for a sweep, what moves little is rounding and never shrinks */
+#define ROUNDING_MARGIN 0.25 /* after one converged iteration, small changes are rounding errors and do not decrease */
 
 typedef struct {
   lanes weight; /* h w */
@@ -40,8 +41,8 @@ static inline void evaluate_points(const step_data *step, const curve_data *curv
   action_lanes(u, step->t + step->h * POINT_TIME, step->parameters, action);
 }
 
-/* The increments of one step. Accelerations, momentum, initial velocity and multipliers m are corrected in turn until
- * all rest. */
+/* Computes the increments of one step: accelerations, momentum, initial velocity and multipliers m are corrected in
+ * turn until all converge. On failure the increments are undefined. */
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, double *dq, double *dp,
     const solver_options *options, solver_report *report)
 {
@@ -98,7 +99,7 @@ HOT int sweep(const step_data *step, const sweep_data *data, history past, long 
         curve.z[0][i] += STIR * corrected[i];
     if (settled && now.status == 0) {
       now.status = comes_to_rest(total, last, before, options, ROUNDING_MARGIN);
-    } else if (now.status > 0 && !settled) { /* once more: the rate of contraction shows late */
+    } else if (now.status > 0 && !settled) { /* one more iteration: the convergence rate is known late */
       settled = 1;
       now.status = 0;
     }

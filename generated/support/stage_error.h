@@ -1,9 +1,10 @@
-/* What the curve of the stages of Newton's iteration leaves unresolved, as curve_error.h says. Before it: stages.h, the
- * tables STAGE_HIGHEST, STAGE_NEXT, STAGE_BEND and STAGE_OTHER_BEND; STAGE_POWER. */
+/* Error estimate of a step by Newton's method from the leading coefficient of its curve, as in curve_error.h. Requires:
+ * stages.h, the tables STAGE_HIGHEST, STAGE_NEXT, STAGE_BEND and STAGE_OTHER_BEND; STAGE_POWER. */
 
-#define CURVE_NOISE (SITES > M ? 16 * REAL_EPSILON : 0) /* constraints are met to rounding, however short the step */
+#define CURVE_NOISE (SITES > M ? 16 * REAL_EPSILON : 0) /* constraints are satisfied to rounding, however short the
+                                                         * step */
 
-/* z: unknowns of the stages. */
+/* Returns the estimate from the unknowns z of the stages, or `least` if that is larger. */
 static real stage_error(const step_data *step, const real *z, const real *dq, real share, real decay, real least)
 {
   real largest = 0;

@@ -1,9 +1,9 @@
-/* Whether what Newton's iteration found is no motion. Before it: stage_error.h, where the stages tell their error. */
+/* Detection of spurious solutions of Newton's method. Requires: stage_error.h if the stages have an error estimate. */
 
-#define MOST_ERROR 1.0 /* of a step, relative to the state: beyond it another solution of the equations may be found */
-#define NEARLY_LINEAR 8 /* iterations: what so few solve, rounding included, has one solution near, however stiff */
+#define MOST_ERROR 1.0 /* of a step, relative to the state: beyond it the solution may be a spurious one */
+#define NEARLY_LINEAR 8 /* iterations: equations solved by so few have one solution nearby, however stiff */
 
-/* Whether stages that solve their equations, after so many iterations, are far from any motion. */
+/* Returns 1 if converged stages, after so many iterations, have an inadmissible error estimate. */
 static SELDOM int strays(const step_data *step, const real *z, const real *dq, long long iterations)
 {
 #ifdef STAGE_POWER

@@ -1,4 +1,4 @@
-"""A generated integrator: ``stepper`` steps and integrates it; README.md says how. Yours to use as you like."""
+"""Generated integrator: ``stepper`` performs steps and runs; see README.md. Yours to use as you like."""
 
 from pathlib import Path
 

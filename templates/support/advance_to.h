@@ -1,5 +1,9 @@
-/* Runs to a time, by steps that choose their own length. Before it: a controller: what a trial of a step is,
- * begin_trials, find_step, confirm_step, and take_step, which makes the step found the state. */
+/* Adaptive integration to a given time t_end.
+ *
+ * Stores every `every`-th state and the one at t_end, and returns after at most `steps` steps. On failure the run is
+ * left at the last completed step and the status of the failed one is returned.
+ * Requires a controller: trial, begin_trials, find_step, confirm_step, and take_step, which adds the increments to the
+ * state. */
 
 int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,

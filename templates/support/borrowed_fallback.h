@@ -1,13 +1,13 @@
-/* Where sweeps fail, Newton's iteration of another library, once it was lent: until then the step is not done, and asks
- * for it. Before it: fallback.h. */
-static const fallback *borrowed; /* set once, before the calls that need it are made again */
+/* Fallback to the Newton solver of another library, which is loaded on demand. Until it is set, a step whose
+ * fixed-point iteration fails returns NEEDED, is not performed, and has to be repeated. Requires: fallback.h. */
+static const fallback *borrowed; /* set once, before the calls that need it are repeated */
 
 void NAME(borrow_fallback)(const void *lent)
 {
   borrowed = lent;
 }
 
-/* The error of the step is left in the workspace. */
+/* Solves the step by the fallback library, which leaves its error estimate in the workspace. */
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)
 {

@@ -1,13 +1,14 @@
-/* Vectors over steps that sweeps solve, STEPS_AT_ONCE at a time: first these, each continued from the one before, then
- * the vectors, in either direction. Before it: carry_by_newton.h, which takes all of them where sweeps fail on one; a
- * sweep, and how its steps change: keep_step, slopes_of_step, push_swept, pull_swept. */
+/* Tangent and adjoint vectors over steps that are solved by fixed-point iteration. Blocks of STEPS_AT_ONCE steps are
+ * solved first, each with a predictor from the previous one; then the vectors are propagated, forward or backward.
+ * Requires: carry_by_newton.h, which takes over where an iteration fails; sweep, keep_step, slopes_of_step, push_swept
+ * and pull_swept, the iteration and its linearisation. */
 
 static double *kept_of(const carriage *over, long long k)
 {
   return over->workspace + LINEARISED + k * KEPT_OF_STEP;
 }
 
-/* The increments by sweeps continued from the steps before, or afresh. */
+/* Solves the step with the predictor, then without it. Returns 1 on success. */
 static int solve_by_sweeps(carriage *over, const step_data *step, const sweep_data *data, double *dq, double *dp)
 {
   for (int tries = over->guess > 0 ? 2 : 1; tries > 0; tries--) {
@@ -18,13 +19,13 @@ static int solve_by_sweeps(carriage *over, const step_data *step, const sweep_da
   return 0;
 }
 
-/* Solves these steps; 0 if sweeps do not solve one of them. */
+/* Solves steps first <= k < end; returns 0 if the iteration fails for one of them. */
 static int solve_steps(carriage *over, long long first, long long end)
 {
   const double nothing[M] = {0.0};
   for (long long k = first; k < end; k++) {
     const step_data step = step_of(over, k, nothing);
-    double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low parts */
+    double dq[2 * M] = {0.0}, dp[2 * M] = {0.0}; /* increments, then their low words */
     sweep_data data;
     prepare_sweep(&step, &data);
     over->report->t = step.t;
@@ -39,7 +40,7 @@ static int solve_steps(carriage *over, long long first, long long end)
   return 1;
 }
 
-/* Over a solved step, vector by vector; how many were carried until sweeps came to no end. */
+/* Propagates the vectors over a solved step; returns the number propagated before an iteration failed. */
 static int carry_by_sweeps(carriage *over, long long k, const double *kept)
 {
   const double nothing[M] = {0.0}, *from = vectors_from(over, k);
@@ -60,7 +61,7 @@ static int carry_by_sweeps(carriage *over, long long k, const double *kept)
   return over->count;
 }
 
-/* Over the steps from the first until before `end`. */
+/* Propagates the vectors over steps first <= k < end. */
 static int carry_steps(carriage *over, long long first, long long end)
 {
   int swept, status = OK;

@@ -1,14 +1,14 @@
-/* Vectors over steps whose equations Newton's iteration solves. Before it: push_and_pull.h. */
+/* Tangent and adjoint vectors over steps solved by Newton's method. Requires: push_and_pull.h. */
 
-/* Steps and what is carried over them: vectors (steps + 1, count, GIVEN). */
+/* Steps and the vectors propagated over them, of shape (steps + 1, count, GIVEN). */
 typedef struct {
   const real *t, *h, *q, *p, *parameters;
   const solver_options *options;
   int back, count;
   real *vectors, *q1, *p1, *workspace;
   solver_report *report;
-  long long guess; /* from how many steps the next is continued, where there are sweeps */
-  int look; /* and which sweep of these changes is the first to be looked at */
+  long long guess; /* number of previous steps that the predictor uses (fixed-point iteration only) */
+  int look; /* first iteration of the linearised equations whose convergence is tested */
 } carriage;
 
 static step_data step_of(const carriage *over, long long k, const real *nothing)
@@ -18,7 +18,7 @@ static step_data step_of(const carriage *over, long long k, const real *nothing)
   return step;
 }
 
-/* What is carried to step k, and where to. */
+/* Vectors at the side of step k where the propagation starts; vectors_to: where it ends. */
 static const real *vectors_from(const carriage *over, long long k)
 {
   return over->vectors + (k + over->back) * over->count * GIVEN;
@@ -29,7 +29,7 @@ static real *vectors_to(const carriage *over, long long k)
   return over->vectors + (k + !over->back) * over->count * GIVEN;
 }
 
-/* The vectors from number `first` on over step k. */
+/* Propagates the vectors from index `first` on over step k. */
 static int carry_by_newton(carriage *over, long long k, int first)
 {
   const real nothing[M] = {0};

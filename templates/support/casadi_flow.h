@@ -1,5 +1,5 @@
-/* The flow of FLOW_STEPS steps, states kept after every FLOW_EVERY, as CasADi finds external functions with their
- * derivatives: by names. Before it: flow.h, EXTERNAL, which makes these. */
+/* Flow of FLOW_STEPS steps with a state stored every FLOW_EVERY steps, and its derivatives, under the names by which
+ * CasADi finds external functions. Requires: flow.h; EXTERNAL, which forms these names. */
 
 typedef long long casadi_int;
 
@@ -7,13 +7,13 @@ enum {
   FLOW_COLUMNS = FLOW_STEPS / FLOW_EVERY + 1
 };
 
-/* Shapes, (rows, columns, 1), and of values that a derivative does not need, without entries. */
+/* Sparsity patterns: dense (rows, columns, 1), or empty for arguments that a derivative does not depend on. */
 static const casadi_int GIVEN_SHAPE[] = {GIVEN, 1, 1};
 static const casadi_int STATES_SHAPE[] = {FLOW_STATE, FLOW_COLUMNS, 1};
 static const casadi_int JACOBIAN_SHAPE[] = {FLOW_STATE * FLOW_COLUMNS, GIVEN, 1};
 static const casadi_int NO_STATES_SHAPE[2 + FLOW_COLUMNS + 1] = {FLOW_STATE, FLOW_COLUMNS};
 
-/* What is found is not asked for where there is no room; what is not given is 0. */
+/* Calls the flow. A NULL result is not computed; a NULL argument counts as 0. */
 static int external_flow(flow_part part, int count, const double *x, const double *given, double *found)
 {
   flow_way way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = count};
@@ -47,7 +47,7 @@ const casadi_int *EXTERNAL(, _sparsity_out)(casadi_int i)
   return i == 0 ? STATES_SHAPE : NULL;
 }
 
-/* The Jacobian, column by column: each is what becomes of a change of one number that is given. */
+/* Jacobian, by columns: the JVPs of the unit vectors. */
 int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
   double each[GIVEN * GIVEN] = {0};
@@ -78,7 +78,7 @@ const casadi_int *EXTERNAL(jac_, _sparsity_out)(casadi_int i)
   return i == 0 ? JACOBIAN_SHAPE : NULL;
 }
 
-/* Slopes by what is given, from slopes by the states. */
+/* Gradient with respect to the inputs from the adjoint variables of the states (VJP). */
 int EXTERNAL(adj1_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
   (void)iw, (void)w, (void)mem;

@@ -1,12 +1,11 @@
-/* The Jacobian of the adjoint of a flow, as CasADi finds it: second derivatives, exact. Before it: casadi_flow.h,
- * flow_second.h. */
+/* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. Requires: casadi_flow.h, flow_second.h. */
 
 static const casadi_int NO_GIVEN_SHAPE[2 + 1 + 1] = {GIVEN, 1};
 static const casadi_int HESSIAN_SHAPE[] = {GIVEN, GIVEN, 1};
 static const casadi_int NO_JACOBIAN_SHAPE[2 + FLOW_STATE * FLOW_COLUMNS + 1] = {GIVEN, FLOW_STATE * FLOW_COLUMNS};
 static const casadi_int TRANSPOSED_SHAPE[] = {GIVEN, FLOW_STATE * FLOW_COLUMNS, 1};
 
-/* The slopes, and how they change with each number that is given, column by column. */
+/* Derivatives of the adjoint with respect to the inputs (Hessian-vector products of the unit vectors), by columns. */
 static int external_hessian(const double *x, const double *slopes, double *found)
 {
   enum { VALUES = FLOW_STATE * FLOW_COLUMNS };
@@ -24,7 +23,7 @@ static int external_hessian(const double *x, const double *slopes, double *found
   return status;
 }
 
-/* The transposed Jacobian, column by column: each is what the slope of one value makes of all that is given. */
+/* Transposed Jacobian, by columns: the VJPs of the unit vectors. */
 static int external_transposed(const double *x, double *found)
 {
   enum { VALUES = FLOW_STATE * FLOW_COLUMNS };

@@ -1,18 +1,18 @@
-/* When sweeps of changes are at rest. Before it: contraction.h. */
+/* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors. Requires: contraction.h. */
 
-#define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: what a sweep moves by rounding alone */
-#define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* what is left to come */
+#define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
+#define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
 
-#define LEAST_SIZE 1e-250 /* squared: of less, changes underflow */
+#define LEAST_SIZE 1e-250 /* squared size below which vectors underflow */
 
-/* Changes of two sweeps, squared and relative, infinite where there were none. */
+/* Squared relative changes of the last two iterations; infinite if there were none. */
 typedef struct {
   double last, before;
 } sweep_changes;
 
-/* Whether a sweep that moved changes by so much of their size, both squared, was the last: 1; 0: go on; -1: they do
- * not contract, or their squares overflow or underflow. Changes are looked at from sweep *look on: one before the last
- * of the time before, as all steps of a run are much alike. */
+/* Returns 1 if the iteration has converged after a change `moved` of vectors of size `size` (both squared), 0 if it
+ * must continue, -1 if it does not converge or the squares overflow or underflow. Convergence is tested from iteration
+ * *look on: one before the last iteration of the previous call, since successive steps of a run are similar. */
 static inline int changes_rest(double moved, double size, sweep_changes *past, int k, int *look)
 {
   const double last = past->last, before = past->before, relative = size > 0.0 ? moved / size : moved;

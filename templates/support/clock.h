@@ -1,7 +1,7 @@
-/* Time where it is an integral along the curve, and h the step of the variable that it is transformed to. Before it: a
- * solver, integrals, of which the first is time, and the kernel integrands. */
+/* Duration of a step of a time-transformed system, dt = g dtau: h is the step in tau, and time is the first integral
+ * along the curve. Requires: a solver, integrals, the kernel integrands. */
 
-/* How long the step that was solved lasts; not a number where time does not go forward. */
+/* Duration of the solved step; NaN if time does not increase. */
 static real duration(const step_data *step, const solver_data *data, const real *memory, long long guess,
     real *workspace)
 {
@@ -13,7 +13,7 @@ static real duration(const step_data *step, const solver_data *data, const real 
 int NAME(rates)(long long count, const real *q, const real *p, const real *parameters, real *rate)
 {
   for (long long k = 0; k < count; k++) {
-    real u[3 * M] = {0}, value[INTEGRALS]; /* q, velocities, which do not occur, and p */
+    real u[3 * M] = {0}, value[INTEGRALS]; /* q, velocities (unused), p */
     memcpy(u, q + k * M, sizeof(real) * M);
     memcpy(u + 2 * M, p + k * M, sizeof(real) * M);
     integrands(u, 0, parameters, value);

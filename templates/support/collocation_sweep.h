@@ -1,8 +1,8 @@
-/* A step by sweeps for collocation. Before it: curve.h, the ends of curves, the table NODE_TIME, the kernel
- * applied_force_lanes. */
+/* Step of a collocation method by fixed-point iteration. Requires: curve.h, the momenta at the ends of a curve, the
+ * table NODE_TIME, the kernel applied_force_lanes. */
 
-/* The increments of one step. Accelerations, and initial velocity where it is unknown, are corrected in turn until they
- * rest. */
+/* Computes the increments of one step. Each iteration corrects the accelerations at the nodes and, where it is unknown,
+ * the initial velocity. On failure the increments are undefined. */
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, double *dq, double *dp,
     const solver_options *options, solver_report *report)
 {

@@ -1,12 +1,16 @@
-/* States on the constraints g(q, t) = 0, or A v + b = 0 (their g is 0, that their rate), and the multipliers that keep
- * them there. Before it: legendre.h, newton.h, the kernels constraints and constrained_motion, and CONSTRAINT_ENTRY,
- * the places of the slopes G = g_q, or A. */
+/* Projection onto holonomic constraints g(q, t) = 0 or linear velocity constraints A(q, t) v + b = 0, and Lagrange
+ * multipliers. For the latter, g = 0 and A v + b is the constraint rate.
+ *
+ * Positions: Gauss-Newton iteration in the metric of the mass matrix; momenta: p -= G^T y with G H_pp G^T y = rate
+ * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, newton.h, the kernels
+ * constraints and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
 
-#define MOST_PROJECTIONS 100 /* steps of Gauss and Newton: where so many do not lead, no state is near */
-#define MOMENTUM_PROJECTIONS 3 /* one is enough but for rounding and for kinetic energies that are not quadratic */
-#define SETTLED REAL(1e-6) /* of a state, what an update may still want that rounding does not let come nearer */
+#define MOST_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
+#define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies */
+#define SETTLED REAL(1e-6) /* relative to the state: accepted size of the last update where rounding prevents a smaller
+                            * residual */
 
-/* Factors of the matrix [L_vv, G^T; G, 0] of a state, and room for a right-hand side. */
+/* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
   real *matrix, *pivot, *x;
 } saddle;
@@ -21,7 +25,7 @@ static saddle saddle_in(real *workspace)
   return at;
 }
 
-/* The factors at u = (q, v), and g. */
+/* Factorises the matrix at u = (q, v) and computes g. */
 static int factorise_saddle(real t, const real *u, const real *parameters, const saddle *at, real *g)
 {
   const band shape = band_of(SITES, 1);
@@ -41,7 +45,7 @@ static int factorise_saddle(real t, const real *u, const real *parameters, const
   return factorise(at->matrix, &shape, at->pivot) ? OK : SINGULAR;
 }
 
-/* x and y with L_vv x + G^T y = a (0 if NULL), G x = b. */
+/* Solves L_vv x + G^T y = a (0 if NULL), G x = b. */
 static void solve_saddle(const saddle *at, const real *a, const real *b, real *x, real *y)
 {
   const band shape = band_of(SITES, 1);
@@ -64,7 +68,7 @@ static real largest_of(const real *x)
   return largest;
 }
 
-/* g and the rates G v + .. at a state, and the velocity. */
+/* Computes g, its rate G v + g_t, and the velocity u + M of a state. */
 static int constrained(real t, const real *q, const real *p, const real *parameters, real *u, real *g, real *rate,
     real *workspace)
 {
@@ -92,7 +96,7 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
   return OK;
 }
 
-/* The sum of squares of g; infinity where it is not finite. */
+/* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
 {
   real slope[CONSTRAINT_ENTRIES], sum = 0;
@@ -102,8 +106,8 @@ static real misfit(real t, const real *q, const real *parameters, real *g)
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
 }
 
-/* q moved to g = 0 by steps of Gauss and Newton in the metric of the masses at u = (q, v), halved while they do not
- * lead nearer, until rounding moves it no nearer. */
+/* Projects q onto g = 0 by Gauss-Newton steps in the metric of the mass matrix at u = (q, v). An update is halved while
+ * it does not reduce |g|; the iteration ends when rounding prevents a reduction. */
 static int project_position(real t, real *u, const real *parameters, const saddle *at)
 {
   real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
@@ -138,7 +142,7 @@ static int project_position(real t, real *u, const real *parameters, const saddl
   return NOT_CONVERGED;
 }
 
-/* p less what leaves the tangent space. */
+/* Projects p onto the cotangent space of the constraints. */
 static int project_momentum(real t, const real *q, real *p, const real *parameters, const saddle *at, real *workspace)
 {
   real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], slope[CONSTRAINT_ENTRIES];
@@ -158,7 +162,7 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
   return all_finite(p, M) ? OK : NOT_FINITE;
 }
 
-/* The nearest state that meets the constraints. */
+/* Nearest state that satisfies the constraints; on failure q1 and p1 are unchanged. */
 int NAME(project)(real t, const real *q0, const real *p0, const real *parameters, real *q1, real *p1, real *workspace)
 {
   const saddle at = saddle_in(workspace);
@@ -185,7 +189,7 @@ static void times_mass(const real *mass, const real *x, real *y)
     y[MASS_ENTRY[e][0]] += mass[e] * x[MASS_ENTRY[e][1]];
 }
 
-/* How far x[0] is from x[1], as a part of their size: lengths squared are x times y, what a metric makes of x. */
+/* Distance of x[0] and x[1] relative to the larger norm, in the metric for which y is the dual vector of x. */
 static real part_of(real (*x)[M], real (*y)[M])
 {
   real apart = 0, one = 0, other = 0;
@@ -198,7 +202,7 @@ static real part_of(real (*x)[M], real (*y)[M])
   return one > 0 ? MATH(sqrt)(MATH(fabs)(apart) / one) : 0;
 }
 
-/* That of momenta is by the inverse masses: what they add to the velocities. */
+/* Relative distances of two states: positions in the metric of the mass matrix, momenta in that of its inverse. */
 int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const real *p1, const real *parameters,
     real *apart, real *workspace)
 {
@@ -229,7 +233,8 @@ int NAME(apart)(real t, const real *q0, const real *p0, const real *q1, const re
   return all_finite(apart, 2) ? OK : NOT_FINITE;
 }
 
-/* lambda of d/dt L_v = L_q + f + G^T lambda at states: L_vv a - G^T lambda = F, G a = - what rates grow by. */
+/* Lagrange multipliers of d/dt L_v = L_q + f + G^T lambda, from L_vv a - G^T lambda = F, G a = -(remaining terms of the
+ * second derivative of g). */
 int NAME(multipliers)(long long count, const real *t, const real *q, const real *p, const real *parameters,
     real *multiplier, real *workspace)
 {

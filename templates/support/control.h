@@ -1,13 +1,14 @@
-/* What makes the step that was found the state of few coordinates. Before it: trials.h, halves.h. After it:
- * advance_to.h. */
+/* Acceptance of adaptive steps of systems with few coordinates: comparison with half steps and update of the state.
+ * Requires: trials.h, halves.h. Include before advance_to.h. */
 
-#define ALLOWED_TO_HALVES 100 /* times the error allowed to a step, what its halves may differ from it by */
-#define SPURIOUS REAL(1e-8) /* of the state: by less than that other solutions of the equations differ not */
+#define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
+#define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
 
 #define SMALL_PART REAL(0.1)
-#define DOUBTED 16 /* steps that are compared after one that was shortened because of it */
+#define DOUBTED 16 /* steps that are compared after one that was shortened by a comparison */
 
-/* Whether momenta change by a small part of the largest: so they do where forces that are not smooth shorten a step. */
+/* Returns 1 if the momenta change by a small part of the largest one, as they do where nonsmooth forces shorten a
+ * step. */
 static SELDOM int changes_little(const trial *now)
 {
   real change = 0, size = 0;
@@ -18,16 +19,16 @@ static SELDOM int changes_little(const trial *now)
   return change < SMALL_PART * size;
 }
 
-/* Whether a step is compared in momenta, too: where its size fell by an octave or more although little changes, and
- * after a step that was wrong. Where forces are not smooth, as at a singular time, the coefficients of a curve do not
- * decay, so that they do not show its error; and steps are so short that momenta have most of it. Not by Newton's
- * iteration, whose steps may leave vibrations of stiff systems unresolved. */
+/* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
+ * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
+ * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
+ * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
 static inline int is_doubted(const run_memory *run, const trial *now)
 {
   return SHORT_STEPS_FAIL && (run->doubted > 0 || (now->change <= -OCTAVE && changes_little(now)));
 }
 
-/* Compares a step with its halves, and shortens it while it is wrong by far more than its curve estimates. */
+/* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
 static SELDOM int compare_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const int doubted = is_doubted(run, now);
@@ -58,13 +59,13 @@ static SELDOM int compare_step(run_memory *run, trial *now, const solver_options
   }
 }
 
-/* Compares the first step, later few, and those in doubt. */
+/* Compares the first step, one of COMPARED later, and those in doubt. */
 static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   return run->step % COMPARED == 0 || is_doubted(run, now) ? compare_step(run, now, options, report) : OK;
 }
 
-/* Makes the step that was found the state. */
+/* Adds the increments of the accepted step to the state. */
 static inline void take_step(run_memory *run, trial *now)
 {
   add_compensated(now->at.q, now->at.carry_q, now->dq);

@@ -1,5 +1,5 @@
-/* Trials of steps that choose their length, by Newton's iteration. Before it: run.h, newton_solver.h, stage_error.h.
- * After it: rungs.h. */
+/* Trial of an adaptive step by Newton's method. Requires: run.h, newton_solver.h, stage_error.h. Include before
+ * rungs.h. */
 #define HOT static
 #define SHORT_STEPS_FAIL 0
 
@@ -8,8 +8,8 @@ static inline real smaller(real a, real b)
   return a < b ? a : b;
 }
 
-/* Increments, and what their curve leaves unresolved, if more than `least`; infinity where there are none. Afresh:
- * without a guess, which only a step as long as the one before has. */
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. afresh: without the predictor, which requires the step size of the previous step. */
 static real attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess, real *dq,
     real *dp, real decay, real least, const solver_options *options, solver_report *report)
 {

@@ -1,9 +1,9 @@
-/* Trials of steps that choose their length, by sweeps. Before it: run.h, a sweep with curve_error.h, rungs.h,
+/* Trial of an adaptive step by fixed-point iteration. Requires: run.h, a sweep with curve_error.h, rungs.h,
  * ladder_tables.h. */
-#define SHORT_STEPS_FAIL 1 /* their changes are held against velocities that are hardly more than rounding */
+#define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
-/* Increments, and what their curve leaves unresolved, if more than `least`; infinity where there are none. Afresh:
- * without a guess. */
+/* Computes the increments; returns the error estimate of the curve if it exceeds `least`, or infinity if the step
+ * failed. afresh: without the predictor. */
 static inline double attempt(run_memory *run, step_data *step, const solver_data *data, int afresh, long long *guess,
     double *dq, double *dp, double decay, double least, const solver_options *options, solver_report *report)
 {

@@ -1,4 +1,4 @@
-/* Corrections of velocities by residual momenta r, forces and momenta taken for what they were. Before it: places.h,
+/* Velocity corrections mass^-1 r from residual momenta r, with forces and momenta frozen. Requires: places.h,
  * point_weights.h, a mass, the kernel force_lanes. */
 enum { VALUES = 2 * M }; /* of point_lanes: forces, momenta */
 
@@ -10,7 +10,7 @@ static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes
     solve_mass(mass[n], r[n]);
 }
 
-/* Forces where the velocities z came to rest, after the last correction r of them. */
+/* Forces at the converged velocities z, after the last correction r. */
 static inline void forces_at_rest(const step_data *step, const sweep_data *data, lanes (*value)[VALUES], lanes (*z)[M],
     lanes (*r)[M], lanes (*F)[M])
 {

@@ -1,11 +1,11 @@
-/* How a step by coupled_sweep.h changes with what it starts from, and the transpose, by sweeps again. With A and W the
- * tables that make positions of velocities and momenta of forces, the changes x, v, f, p of all these at the points
- * are
+/* Derivatives of a step solved by coupled_sweep.h and their transpose, by fixed-point iteration. With the tables A
+ * (positions from velocities) and W (momenta from forces), the variations x, v, f, p of positions, velocities, forces
+ * and momenta at the points satisfy
  *   x = x0 + h A v,        f = L_qq x + L_qv v,        p = p0 + h W f,        v = L_vv^-1 (p - L_vq x),
- * and the slopes of a number by them, the other way, are the same but for transposes, with y for f, z for x, w for p:
+ * and the adjoint variables y, z, w of f, x, p satisfy the transposed equations
  *   y = y0 + h W^T w,      z = L_qq y - L_qv w,        v = v0 + h A^T z,      w = L_vv^-1 (v + L_vq y).
- * All are exact: those of the map which the equations define. Before it: coupled_sweep.h, changes_at_rest.h;
- * CHANGE_POSITION, A, and CHANGE_MOMENTUM, W, and with _BACK their transposes; the kernels point_slopes, by_slopes,
+ * The derivatives are those of the exact solution of the stage equations. Requires: coupled_sweep.h, changes_at_rest.h;
+ * CHANGE_POSITION (A), CHANGE_MOMENTUM (W) and their transposes with _BACK; the kernels point_slopes, by_slopes,
  * BY_SLOPES_BACK; POINT_GIVEN and given_slopes. */
 
 enum {
@@ -13,8 +13,9 @@ enum {
   GIVEN_T = GIVEN - 2
 };
 
-/* A solved step: its increments, how its points stand from (q0, p0), room for x and v and behind it the slopes of
- * forces and momenta by these; those by what is given; factors of masses. */
+/* Linearisation of a solved step: its increments, displacements D, E of the points from (q0, p0), x and v followed by
+ * the derivatives of forces and momenta with respect to them, derivatives with respect to parameters and time, and
+ * factors of the mass matrices. */
 typedef struct {
   const step_data *step;
   const double *dq, *dp;
@@ -22,7 +23,7 @@ typedef struct {
   weight end_position[GROUPS], end_momentum[GROUPS];
 } swept_step;
 
-/* What is told of a step from its increments and the velocities it keeps. */
+/* Stores the velocities and increments of a step, from which slopes_of_step linearises it. */
 static void keep_step(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
     const double *dp, double *to)
 {
@@ -60,8 +61,8 @@ static __attribute__((noinline)) void slopes_of_step(const step_data *step, cons
   }
 }
 
-/* The changes of positions by those of velocities v (back: of forces by those of momenta), from x0; what both make of
- * the next, f and a part of p. */
+/* Computes the variations of positions from those of velocities v and from x0 (back: adjoints of forces from those of
+ * momenta), then the terms f and part of p that follow from both. */
 static inline void place_changes(swept_step *at, int back, lanes (*x0)[M], lanes (*v)[M], lanes (*f)[2 * M])
 {
   const step_data *step = at->step;
@@ -74,8 +75,8 @@ static inline void place_changes(swept_step *at, int back, lanes (*x0)[M], lanes
   }
 }
 
-/* f and v from their first parts, x0 and p0 (back: z and w from y0 and v0); x and v (y and w) stand in u, f behind.
- * Measured by the masses, as are kinetic energies: whatever the units of coordinates. */
+/* Solves for f and v from the initial terms x0 and p0 (back: z and w from y0 and v0); leaves x and v (y and w) in u,
+ * and f. The change is measured in the metric of the mass matrices, independent of the units of the coordinates. */
 static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M], lanes (*f)[2 * M], int *look)
 {
   const lanes *table = back ? CHANGE_POSITION_BACK : CHANGE_MOMENTUM;
@@ -109,7 +110,7 @@ static inline int settle(swept_step *at, int back, lanes (*x0)[M], lanes (*p0)[M
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
-/* The changes of forces and momenta, points held. */
+/* Variations of forces and momenta at fixed points, by those of parameters and time. */
 static inline void given_changed(const swept_step *at, const double *v, lanes (*F)[2 * M])
 {
   memset(F, 0, sizeof(lanes) * GROUPS * 2 * M);
@@ -121,7 +122,7 @@ static inline void given_changed(const swept_step *at, const double *v, lanes (*
     }
 }
 
-/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+/* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
 static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *look)
 {
   const double h = at->step->h, dh = v[GIVEN_T + 1] / h;
@@ -149,7 +150,7 @@ static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *
   return OK;
 }
 
-/* What slopes by forces and momenta, in u, come to, by what else these depend on: added to v. */
+/* Adds to v the gradient with respect to parameters and time from the adjoint variables of forces and momenta in u. */
 static inline void given_back(const swept_step *at, double *v)
 {
   lanes by[GIVEN - 2 * M][GROUPS];
@@ -166,7 +167,7 @@ static inline void given_back(const swept_step *at, double *v)
     v[2 * M + j] += points_total(by[j]);
 }
 
-/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
+/* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). */
 static __attribute__((noinline)) int pull_swept(swept_step *at, double *v, int *look)
 {
   double by_h = 0.0;

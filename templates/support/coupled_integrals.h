@@ -1,6 +1,6 @@
-/* Integrals along a step that sweeps solved. Before it: coupled_sweep.h, the kernel integrand_lanes. */
+/* Integrals along a step solved by fixed-point iteration. Requires: coupled_sweep.h, the kernel integrand_lanes. */
 
-/* By the quadrature of the momenta, at the points where the velocities came to rest, which memory holds. */
+/* Quadrature of the momenta at the converged velocities, which `memory` contains. */
 static inline void integrals_of_sweep(const step_data *step, const sweep_data *data, const double *memory, double *sum)
 {
   lanes z[GROUPS][M], scaled[GROUPS][M], u[2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];

@@ -1,8 +1,9 @@
-/* A step by sweeps for any regular Lagrangian. Before it: points.h or trajectories.h with what follows them,
- * point_weights.h, a mass, places.h, corrections of velocities, the tables, the kernel point_lanes. */
+/* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
+ * require, point_weights.h, a mass, places.h, velocity corrections, the tables, the kernel point_lanes. */
 
-/* The increments of one step. The velocities z are corrected by mass^-1 (P - L_v) until they rest; the increments are
- * made from the forces at the points they rest at. The velocities are kept. */
+/* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
+ * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
+ * On failure the increments are undefined. */
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, number *dq, number *dp,
     const solver_options *options, solver_report *report)
 {

@@ -1,5 +1,5 @@
-/* Runs of many trajectories with compensated sums. Before it: many_trajectories.h, time.h, and prepare_sweep and sweep
- * of a solver, which give the increments of a step. */
+/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, time.h, and
+ * prepare_sweep and sweep of a solver, which compute the increments of a step. */
 
 void NAME(start)(block_memory *block, double t, double h)
 {
@@ -22,7 +22,7 @@ void NAME(set)(block_memory *block, int lane, const double *q, const double *p, 
   block->active[lane] = 1.0;
 }
 
-/* What a step changes, at hand while a call lasts. */
+/* The part of the state that a step changes, in local memory during a call. */
 typedef struct {
   lanes q[M], p[M], carry_q[M], carry_p[M];
 } state;
@@ -43,7 +43,7 @@ static void save_state(const state *now, block_memory *block)
   memcpy(block->carry_p, now->carry_p, sizeof now->carry_p);
 }
 
-/* x + carry += increment with its low part in active lanes, in twice the precision. */
+/* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
 static void add_compensated(lanes *x, lanes *carry, const lanes *increment, const double *active)
 {
   for (int i = 0; i < M; i++) {
@@ -60,7 +60,7 @@ static void add_compensated(lanes *x, lanes *carry, const lanes *increment, cons
   }
 }
 
-/* Lanes whose next states are not numbers become inactive. */
+/* Deactivates lanes whose next state is not finite. */
 static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, double *active)
 {
   lane_view sum = {lanes_of(0.0)};
@@ -70,7 +70,7 @@ static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, do
     active[j] = sum.lane[j] == 0.0 ? active[j] : 0.0;
 }
 
-/* The states of the first `count` trajectories, a row each. */
+/* Stores the states of the first `count` trajectories, one row each. */
 static void store_states(const state *now, int count, double *q, double *p)
 {
   for (int i = 0; i < M; i++) {
@@ -90,7 +90,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   sweep_data data;
   solver_report report = {block->active, 0};
   lanes parameters[P + 1], memory[2][S][M];
-  lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low parts */
+  lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
   step_data step = {block->t, block->h, now.q, now.p, now.carry_q, now.carry_p, parameters};
   load_state(block, &now);
   memcpy(parameters, block->parameters, sizeof(lanes) * P);

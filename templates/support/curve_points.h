@@ -1,4 +1,4 @@
-/* Quadrature points on a curve. Before it: curve.h, NODES, the tables POINT_POSITION, POINT_VELOCITY. */
+/* Quadrature points on a collocation curve. Requires: curve.h, NODES, the tables POINT_POSITION, POINT_VELOCITY. */
 
 /* Positions and velocities at the quadrature points. */
 static inline void place_points(const step_data *step, const curve_data *curve, lanes *u)
@@ -10,7 +10,7 @@ static inline void place_points(const step_data *step, const curve_data *curve, 
   }
 }
 
-/* v0 -= mass^-1 misfit, the mean over the nodes; how much it moved, relative and squared. */
+/* v0 -= mass^-1 misfit, averaged over the nodes; returns the squared relative change. */
 static inline double correct_velocity(const lanes *mass, const double *misfit, const double *inverse_size, double *v0)
 {
   lanes r[M];

@@ -1,9 +1,9 @@
-/* Uniform damping at points that are lanes, or of trajectories that are: see damping.h. Before it: points.h or
+/* Uniform damping at points that are SIMD lanes, or of trajectories that are; see damping.h. Requires: points.h or
  * trajectories.h, the table ABSCISSA, the kernel damping. */
 #define DAMPED
 
-/* What the steps of a run share: e^(gamma c_n h), by which L_q, L_v and L_vv grow at the points; e^(-gamma h), and it
- * less 1. */
+/* Constants of a step size: e^(gamma c_n h), the factor of L_q and L_v at the points; e^(-gamma h), and e^(-gamma h) -
+ * 1. */
 typedef struct {
   lanes grown[GROUPS];
   number shrunk, loss;

@@ -1,6 +1,6 @@
-/* Uniform damping at a rate gamma: points weigh e^(gamma c_n h) times as much as without, c_n h the time since the step
- * began, and what the sums give for p1 is e^(gamma h) p1. Nothing grows from step to step. Before it: real, M, step.h,
- * the kernel damping. */
+/* Uniform damping at a rate gamma, from the Lagrangian e^(gamma t) L: point n is weighted by e^(gamma c_n h), c_n h the
+ * time since the step began, and the sums then give e^(gamma h) p1. Since time is measured from the start of each step,
+ * no factor grows from step to step. Requires: real, M, step.h, the kernel damping. */
 #define DAMPED
 
 /* gamma h. */
@@ -11,7 +11,7 @@ static inline real growth_of(const step_data *step)
   return rate * step->h;
 }
 
-/* The weights of points. */
+/* Weights of the points with the damping factor. */
 static inline void grown_weights(const step_data *step, int points, const real *abscissa, const real *weight,
     real *grown)
 {

@@ -1,20 +1,20 @@
-/* Steps of one length tau in a time with dt = g dtau: h = tau / rho, where the density of steps rho = 1/g is carried
- * along by its own equation of motion, drho/dtau = -d(log g)/dt, from the middle of one step to that of the next. So
- * the steps are the same backward, if the method's are (Hairer and Soederlind's integrating controller, SIAM J. Sci.
- * Comput. 26, 2005). A step that ends at a given time is a part of tau, and takes the density on by as much.
- * Before it: run.h, prepare and solve of a solver, the kernel density: 1/g and -d(log g)/dt. After it: advance_to.h. */
+/* Fixed steps tau in a transformed time dt = g dtau, h = tau / rho. The step density rho = 1/g is integrated by its own
+ * equation drho/dtau = -d(log g)/dt from the middle of one step to that of the next, so that the step sequence is
+ * time-reversible if the method is (integrating controller; Hairer & Soederlind, SIAM J. Sci. Comput. 26, 2005). A step
+ * that ends at a prescribed time is a part of tau and advances the density by as much. Requires: run.h, prepare and
+ * solve of a solver, the kernel density, (1/g, -d(log g)/dt). Include before advance_to.h. */
 
-#define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
+#define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
 
-/* What the trials of a step share. */
+/* Data shared by the trials of a step. */
 typedef struct {
   state at;
   step_data step;
   solver_data data;
-  real t_end, tau, density, part, growth; /* growth: of the density, in half of a whole step */
-  real dq[2 * M], dp[2 * M]; /* increments, then their low parts */
-  int last; /* whether the step ends at t_end */
-  int turned; /* whether the run goes back on what it came */
+  real t_end, tau, density, part, growth; /* growth: change of the density in half of a whole step */
+  real dq[2 * M], dp[2 * M]; /* increments, then their low words */
+  int last; /* 1 if the step ends at t_end */
+  int turned; /* 1 if the run reverses its direction */
 } trial;
 
 static void begin_trials(run_memory *run, trial *now, real tau, solver_options *standard)
@@ -24,7 +24,7 @@ static void begin_trials(run_memory *run, trial *now, real tau, solver_options *
   now->turned = (real)run->direction * ((now->t_end - run->t) - run->t_low) < 0;
 }
 
-/* The density in the middle of the next step, if it is a whole one: where the run turns, of the last one. */
+/* Density in the middle of the next step, if it is a whole one; if the run reverses, of the previous one. */
 static int next_density(const run_memory *run, trial *now)
 {
   const real half = (real)run->direction * now->tau / 2, halves = now->turned ? 1 - run->part : 1 + run->part;
@@ -38,7 +38,7 @@ static int next_density(const run_memory *run, trial *now)
   return now->density > 0 && 0 * now->density == 0 ? OK : NOT_FINITE;
 }
 
-/* The step that the run is at. */
+/* Computes the increments of the next step. */
 static int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real rest = (now->t_end - now->at.t) - now->at.t_low;
@@ -56,7 +56,7 @@ static int find_step(run_memory *run, trial *now, const solver_options *options,
     now->part = MATH(fabs)(rest) * now->density / now->tau;
   }
   prepare(&now->step, &now->data);
-  run->guess = 0; /* that of a step of another length */
+  run->guess = 0; /* the predictor belongs to another step size */
   return solve(&now->step, &now->data, run->memory, &run->guess, now->dq, now->dp, options, report,
       now->step.scratch + SCRATCH);
 }
@@ -67,7 +67,7 @@ static int confirm_step(run_memory *run, trial *now, const solver_options *optio
   return observe_error(run, &now->step, &now->data, now->dq, now->dp, options, now->step.scratch + SCRATCH);
 }
 
-/* Makes the step that was found the state. */
+/* Adds the increments to the state. */
 static void take_step(run_memory *run, trial *now)
 {
   add_compensated(now->at.q, now->at.carry_q, now->dq);

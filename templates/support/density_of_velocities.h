@@ -1,4 +1,4 @@
-/* What the density of steps is a function of: positions and velocities. Before it: legendre.h. */
+/* Arguments of the step density: positions and velocities. Requires: legendre.h. */
 static int density_arguments(const step_data *step, real *u)
 {
   memcpy(u, step->q0, sizeof(real) * M);

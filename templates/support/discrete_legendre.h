@@ -1,5 +1,6 @@
-/* The discrete Lagrangian and its Legendre transforms. Before it: newton.h, and sums_along, which sums the Lagrangian
- * along the curve given by z. */
+/* Discrete Lagrangian L_d(q0, q1) and its discrete Legendre transforms p0 = -D1 L_d, p1 = D2 L_d (Marsden & West, Acta
+ * Numerica 2001, sec. 1.3). On failure p0, p1 and the action are undefined. Requires: newton.h; sums_along, which sums
+ * the Lagrangian along the curve z. */
 
 SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)

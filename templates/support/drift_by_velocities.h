@@ -1,4 +1,4 @@
-/* Drifts with velocities that are functions of the momenta. Before it: step.h, the kernel drift_velocity. */
+/* Drift of splitting methods with velocities v(p, t): dq += h part v. Requires: step.h, the kernel drift_velocity. */
 typedef struct {
   int unused;
 } solver_data;
@@ -9,7 +9,7 @@ static void prepare(const step_data *step, solver_data *data)
   data->unused = 0;
 }
 
-/* A part of the step with the momenta p0 + dp. */
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
 static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
 {
   real p[M], v[M];

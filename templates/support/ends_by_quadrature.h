@@ -1,5 +1,5 @@
-/* Momenta at both ends of a curve by quadrature; the first gives the initial velocity. Before it: curve_points.h, the
- * tables of what the points give to p0 and p1, the kernel action_lanes. */
+/* Momenta at both ends of a curve by quadrature of the action; p0 determines the initial velocity. Requires:
+ * curve_points.h, the tables of the contributions of the points to p0 and p1, the kernel action_lanes. */
 typedef struct {
   lanes start, end; /* h times the weights of forces */
 } sweep_data;
@@ -18,7 +18,7 @@ static inline void act(const step_data *step, const curve_data *curve, lanes *ac
   action_lanes(u, step->t + step->h * POINT_TIME, step->parameters, action);
 }
 
-/* Corrects the initial velocity; how much it moved, relative and squared. */
+/* Corrects the initial velocity; returns the squared relative change. */
 static inline double correct_start(const step_data *step, const sweep_data *data, const lanes *mass,
     const double *inverse_size, curve_data *curve)
 {

@@ -1,5 +1,5 @@
-/* The momentum at the end of a curve is that of its velocity there; the initial velocity is known. Before it: curve.h.
- * */
+/* Momentum at the end of a curve by the Legendre transform of the velocity there; the initial velocity is known.
+ * Requires: curve.h. */
 typedef struct {
   int unused;
 } sweep_data;
@@ -17,7 +17,7 @@ static inline double correct_start(const step_data *step, const sweep_data *data
   return 0.0;
 }
 
-/* p1 - p0, p1 the momentum at the end of a curve that has moved by dq. */
+/* p1 - p0, with p1 the momentum at the end of a curve with the increment dq; NaN if it is undefined. */
 static void momentum_increment(const step_data *step, const sweep_data *data, const curve_data *curve, const double *dq,
     double *dp)
 {

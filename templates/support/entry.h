@@ -1,6 +1,6 @@
-/* An entry of the Jacobian. Before it: real, SITES, PLACE, band.h. */
+/* Entry of the Jacobian of the stage equations. Requires: real, SITES, PLACE, band.h. */
 
-/* That in row (i, r), column (j, b), sites first. */
+/* Address of the entry in row (i, r), column (j, b): sites i, j, blocks r, b. */
 static inline real *entry(real *jacobian, const band *shape, int i, int r, int j, int b)
 {
   const int blocks = shape->rows / SITES;

@@ -1,4 +1,4 @@
-/* Velocities that functions of events are given, and how long a part h of a step lasts. Before it: answers.h. */
+/* Velocities as arguments of event functions, and the duration of a part h of a step. Requires: answers.h. */
 static int event_velocity(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
 {
   return NAME(velocity)(t, q, p, parameters, v, workspace);

@@ -1,5 +1,5 @@
-/* Velocities that functions of events are given, dq/dt where an integrator has dq/dtau, and how long a part h of a step
- * in tau lasts in time. Before it: answers.h. */
+/* Velocities dq/dt as arguments of event functions of a time-transformed system, whose integrator has dq/dtau, and the
+ * duration of a part h of a step in tau. Requires: answers.h. */
 static int event_velocity(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
 {
   real rate;

@@ -1,21 +1,26 @@
-/* The search for zero crossings, by nothing of an integrator but its public functions. Before it: numbers.h,
- * event_velocity, the kernel event_functions, EVENTS, EVENT_DEGREE, EVENTS_USE_VELOCITIES, EVENT_NODES: where on a part
- * of a step functions are evaluated, as fractions of it, EVENT_COEFFICIENTS: from values there to coefficients of x^k,
- * with x from -1 to 1 on the part, and EVENT_DOUBTS: what part of the last two of these is in doubt. */
+/* Location of zero crossings of event functions, by the public functions of the integrator alone.
+ *
+ * A step is sampled at Chebyshev nodes; the interpolating polynomial separates the crossings, which are then enclosed
+ * by a secant iteration on partial steps. Requires: numbers.h, event_velocity, the kernel event_functions, EVENTS,
+ * EVENT_DEGREE, EVENTS_USE_VELOCITIES; EVENT_NODES, the nodes as fractions of a part of a step; EVENT_COEFFICIENTS,
+ * from values there to coefficients of x^k, -1 <= x <= 1; EVENT_DOUBTS, the factors of the last two coefficients in the
+ * error estimate. */
 enum {
-  EVENT_SPLITS = 6, /* a step is split into parts at most so many times over */
-  EVENT_TRIALS = 200, /* at most so many states are tried for one crossing: bisection takes 52 */
-  EVENT_BISECTIONS = 30, /* of the place of an extremum: a misplacement of 2^-30 changes the extremum by 2^-60 */
-  EVENT_FIRST_PROBE = 40, /* 2^-40 of a step is the first state looked at after a start at a zero */
+  EVENT_SPLITS = 6, /* greatest depth of subdivision of a step */
+  EVENT_TRIALS = 200, /* largest number of states evaluated for one crossing; bisection takes 52 */
+  EVENT_BISECTIONS = 30, /* for the abscissa of an extremum: an error of 2^-30 changes the extremum by 2^-60 */
+  EVENT_FIRST_PROBE = 40, /* after a start at a zero, the first state tested is 2^-40 of a step later */
   EVENT_LAST_PROBE = 4,
   EVENT_NO_ROOM = -1
 };
 
-#define EVENT_TIE 0x1p-30 /* of a step: crossings nearer to each other may be one */
-#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* of the range of a function on a step: what the search for a zero leaves */
-#define EVENT_AT_REST (4.0 * DBL_EPSILON) /* of the range of a function on a step: a change that may be rounding */
-#define EVENT_SMALL_PART 0.03 /* a polynomial in doubt by less than this part of its range follows its function */
-#define EVENT_STEEPNESS 8.0 /* a zero is simple where the slope is more than so many doubts */
+#define EVENT_TIE 0x1p-30 /* relative to the step: closer crossings may coincide */
+#define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a step: residual of a located
+                                            * zero */
+#define EVENT_AT_REST (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
+                                           * rounding */
+#define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
+#define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
 
 typedef NAME(watch) event_watch;
 typedef NAME(crossing) event_crossing;
@@ -34,12 +39,12 @@ int NAME(event_values)(real t, const real *q, const real *p, const real *paramet
   return all_finite(value, EVENTS) ? OK : NOT_FINITE;
 }
 
-/* The state at a fraction of a step, and the functions there. */
+/* State at a fraction of a step, and the event functions there. */
 typedef struct {
   real fraction, t, g[EVENTS], q[M], p[M];
 } event_sample;
 
-/* A step whose inside is searched, and where its crossings go. */
+/* A step that is searched, and the array for its crossings. */
 typedef struct {
   real t, h;
   const real *q, *p, *parameters;
@@ -51,7 +56,8 @@ typedef struct {
   real *workspace;
 } event_step;
 
-/* The functions at the state of a sample; says which is not finite. */
+/* Evaluates the functions at the state of a sample; watch->undefined is 1 + the index of the first that is not
+ * finite. */
 static int evaluate_functions(const event_step *step, event_sample *sample)
 {
   const int status = NAME(event_values)(sample->t, sample->q, sample->p, step->parameters, sample->g, step->workspace);
@@ -62,7 +68,7 @@ static int evaluate_functions(const event_step *step, event_sample *sample)
   return status;
 }
 
-/* The sample after a fraction of the step, which is a step of its own. */
+/* Computes the sample at a fraction of the step by one step of that size. */
 static int take_sample(const event_step *step, real fraction, event_sample *sample)
 {
   solver_report own;
@@ -89,7 +95,7 @@ static real polynomial(const real *c, int degree, real x)
   return sum;
 }
 
-/* Where c changes sign in -1 < x < 1, ascending: once at most between neighbouring extrema. */
+/* Zeros of c in -1 < x < 1, ascending; at most one between neighbouring extrema. Returns their number. */
 static int polynomial_crossings(const real *c, int degree, real *x)
 {
   real derivative[EVENT_DEGREE + 1] = {0.0}, ends[EVENT_DEGREE + 2];
@@ -118,8 +124,8 @@ static int polynomial_crossings(const real *c, int degree, real *x)
   return count;
 }
 
-/* The polynomial through values at the nodes; how far it is in doubt (its last two Chebyshev coefficients), and how far
- * it moves away from its value in the middle. */
+/* Coefficients of the interpolating polynomial, its error estimate `doubt` from the last two Chebyshev coefficients,
+ * and the range of its deviation from the value in the middle. */
 static void interpolate(const real *g, real *c, real *doubt, real *range)
 {
   *range = 0.0;
@@ -137,8 +143,8 @@ static real nearer_middle(real a, real b)
   return fabs(a) < fabs(b) ? a : b;
 }
 
-/* Where the sign of the polynomial c, or whether it crosses zero but once, is in doubt (of such places that nearest to
- * the middle), or 2; its extrema, ascending. */
+/* Abscissa, nearest to the middle, where the sign of the polynomial c or the simplicity of a zero is uncertain, or 2 if
+ * there is none; also returns the extrema, ascending. */
 static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
 {
   real derivative[EVENT_DEGREE], zeros[EVENT_DEGREE], place = 2.0;
@@ -155,13 +161,13 @@ static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
   return place;
 }
 
-/* Narrows a change of sign down to neighbouring fractions; high is the later end. After a secant the end that it moved
- * is followed by states beyond it, twice as far each time, until one lies on the other side. */
+/* Narrows a sign change to neighbouring fractions; high is the later end. After a secant step the end that it moved is
+ * advanced by steps of doubling size until the sign changes. */
 static int enclose_crossing(const event_step *step, int e, event_sample low, event_sample *high)
 {
   const real least = 2.0 * DBL_EPSILON;
   real moved = 0.0;
-  int beyond = 0; /* 1: low is followed, -1: high is */
+  int beyond = 0; /* 1: low is advanced, -1: high is */
   for (int k = 0; k < EVENT_TRIALS && high->g[e] != 0.0 && high->fraction - low.fraction > 2.0 * least; k++) {
     const real width = high->fraction - low.fraction, leap = fmin(2.0 * moved, 0.5 * width);
     real fraction = low.fraction + low.g[e] / (low.g[e] - high->g[e]) * width;
@@ -186,7 +192,7 @@ static int enclose_crossing(const event_step *step, int e, event_sample low, eve
   return OK;
 }
 
-/* Adds the crossing between two samples, if its direction is wanted. */
+/* Adds the crossing between two samples if its direction is requested. */
 static int add_crossing(const event_step *step, int e, const event_sample *from, const event_sample *to)
 {
   const int direction = from->g[e] < 0.0 ? 1 : -1;
@@ -210,7 +216,7 @@ static int add_crossing(const event_step *step, int e, const event_sample *from,
   return OK;
 }
 
-/* The crossings of one function from one sample to another, with samples at the extrema between them. */
+/* Adds the crossings of one function between two samples, with samples at the extrema between them. */
 static int add_crossings(const event_step *step, int e, const event_sample *left, const event_sample *right,
     const real *extrema, int count)
 {
@@ -230,9 +236,9 @@ static int add_crossings(const event_step *step, int e, const event_sample *left
   return OK;
 }
 
-/* The crossings of one function on a part of a step, from its values at the inner nodes if they are known. The part is
- * split in the middle if the polynomial through them does not follow the function, and where it has an extremum so near
- * zero that its sign is in doubt. */
+/* Searches a part of a step for crossings of one function; `known` are its values at the inner nodes, or NULL. The part
+ * is split in the middle if the polynomial does not approximate the function, and at an extremum so near zero that its
+ * sign is uncertain. */
 static int search_part(const event_step *step, int e, const event_sample *left, const event_sample *right,
     const real *known, int splits)
 {
@@ -272,7 +278,7 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   return status == OK ? search_part(step, e, &sample, right, NULL, splits - 1) : status;
 }
 
-/* By how much a function changes if each coordinate changes by an ulp: what rounding of the state makes of it. */
+/* Change of a function if each coordinate changes by one ulp: the effect of rounding of the state. */
 static int rounding_of(const event_step *step, int e, const event_sample *at, real *noise)
 {
   *noise = 0.0;
@@ -288,7 +294,7 @@ static int rounding_of(const event_step *step, int e, const event_sample *at, re
   return OK;
 }
 
-/* The central difference of a function along (q, p, t), divided by the size of the change. */
+/* Central difference of a function along (q, p, t), divided by the size of the change. */
 static int difference(const event_step *step, int e, const event_sample *at, const real *dq, const real *dp, real dt,
     real size, real *found)
 {
@@ -309,8 +315,8 @@ static int difference(const event_step *step, int e, const event_sample *at, con
   return OK;
 }
 
-/* dg = (g_q v + g_p p_dot + g_t) h, by which a function would change in a step at its first rate, and how uncertain it
- * is. Differences along q are as long as rounding of q demands, beside which p and t may change faster. */
+/* dg = (g_q v + g_p p_dot + g_t) h, the change of a function in a step at its initial rate, and its uncertainty. The
+ * difference along q is as long as rounding of q requires; those along p and t may be shorter. */
 static int first_change(const event_step *step, int e, const event_sample *at, real noise, real *change, real *doubt)
 {
   const real none[M] = {0.0}, little = 0x1p-10;
@@ -336,11 +342,11 @@ static int first_change(const event_step *step, int e, const event_sample *at, r
   return status;
 }
 
-/* Where the search of a first step begins. A run that was ended at a zero and starts from there again, thrown back, may
- * stand on the side from which it came to that zero by a rounding, or exactly on it; if it leaves to the other side and
- * returns within the step, no sign tells. States behind the start, each four times as far as the one before, are looked
- * at until one is beyond rounding, then for the return. If it returns before the first of these,
- * crossings accumulate. */
+/* Start of the search in a first step. A run that ended at a zero and restarts there, e.g. after a rebound, may be on
+ * the near side of the zero by a rounding error, or exactly on it; if it leaves to the other side and returns within
+ * the step, the signs at both ends do not reveal the crossing. States after the start, each four times as far as the
+ * previous one, are tested until one is beyond rounding, then until the function returns. If it returns before the
+ * first of these states, crossings accumulate (Zeno) and NOT_CONVERGED is returned. */
 static int leave_zero(const event_step *step, int e, const event_sample *left, real range, event_sample *from)
 {
   event_sample next;
@@ -351,7 +357,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   if (status == OK)
     status = first_change(step, e, left, noise, &change, &doubt);
   if (status != OK) {
-    step->watch->undefined = 0; /* not on the motion: no rate is known */
+    step->watch->undefined = 0; /* the rate is not defined at this state */
     return OK;
   }
   sign = change > 0.0 ? 1 : -1;
@@ -377,7 +383,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
   return OK;
 }
 
-/* The crossings of all functions on a step, in no order. */
+/* Finds the crossings of all functions on a step, in no particular order. */
 static int search_step(const event_step *step, const event_sample *left, const event_sample *right)
 {
   real inner[EVENTS][EVENT_DEGREE - 1];
@@ -406,7 +412,7 @@ static int search_step(const event_step *step, const event_sample *left, const e
   return OK;
 }
 
-/* Counts a crossing; whether it ends the search. */
+/* Counts a crossing; returns 1 if it ends the search. */
 static int ends_search(event_watch *watch, const event_crossing *crossing)
 {
   int *remaining = watch->remaining + crossing->function;
@@ -414,8 +420,8 @@ static int ends_search(event_watch *watch, const event_crossing *crossing)
   return watch->ended;
 }
 
-/* After the crossing that ends the search, those of other functions that have their new signs at its state already:
- * met there, too, they would not be found from there on. */
+/* After the crossing that ends the search, keeps those of other functions that have already changed sign at its state:
+ * a search from there would not find them. */
 static int keep_ties(const event_step *step, long long last)
 {
   const long long filled = *step->filled;
@@ -439,8 +445,8 @@ static int keep_ties(const event_step *step, long long last)
   return status;
 }
 
-/* Crossings of one step in order of their fractions, as times may tie; those after the one that ends the search are
- * dropped. */
+/* Sorts the crossings of one step by their fractions, as times may coincide, and drops those after the one that ends
+ * the search. */
 static int settle_crossings(const event_step *step, long long first)
 {
   for (long long i = first + 1; i < *step->filled; i++)

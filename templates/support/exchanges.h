@@ -1,5 +1,5 @@
-/* What forces give in a step: energy, and momenta along symmetries. Before it: newton_from_line.h, and sums_along,
- * which integrates along the curve given by z. */
+/* Work and impulse of the generalised forces in one step: the change of the energy, and of the momentum maps. Requires:
+ * newton_from_line.h, and sums_along, which integrates along the curve z. */
 
 SELDOM int NAME(exchanges)(real t, real h, const real *q0, const real *p0, const real *parameters,
     const solver_options *options, real *q1, real *p1, real *given, solver_report *report, real *workspace)

@@ -1,5 +1,5 @@
-/* The discrete Lagrangian of a kick, a drift and a kick, and its Legendre transforms: the drift has the velocity
- * (q1 - q0) / h, so that there is nothing to solve. Before it: splitting.h, energy. */
+/* Discrete Lagrangian of the kick-drift-kick scheme (Stoermer-Verlet) and its discrete Legendre transforms. The drift
+ * has the velocity (q1 - q0) / h, so that no equations are solved. Requires: splitting.h, energy. */
 
 SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q1, const real *parameters,
     const solver_options *options, real *p0, real *p1, real *action, solver_report *report, real *workspace)

@@ -1,7 +1,7 @@
-/* Newton's iteration as one library lends it to another, which has sweeps alone. Before it: step.h. */
+/* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
 
-/* What a step is made from, its increments with their low parts, and the relative error of its end, as far as the
- * stages tell it; else not a number. */
+/* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,
+ * otherwise NaN. */
 typedef struct {
   int (*step)(const step_data *step, double *dq, double *dp, const solver_options *options, solver_report *report,
       double *error);

@@ -1,13 +1,14 @@
-/* Real numbers are binary32, for processors whose registers hold 32 bits. */
+/* Real numbers in single precision (binary32), for processors with 32-bit floating-point registers. */
 typedef float real;
 
-#define MATH(function) function##f /* of libm */
-#define REAL(literal) literal##f /* a number */
+#define MATH(function) function##f /* function of libm */
+#define REAL(literal) literal##f /* floating-point literal */
 #define REAL_EPSILON FLT_EPSILON
 #define REAL_MIN FLT_MIN
-#define NEGLIGIBLE 5e-4f /* of displacements relative to the state: rounding leaves no curve of them */
-#define EACH REAL_EPSILON /* of the largest coordinate: what each counts as, where each is to be exact by itself */
-#define ALL 1 /* and where the state is to be exact as a whole */
-#define DECAY 0.1f /* from a coefficient of a curve to the next, where the curve is resolved to some digits */
-#define VANISHING 1e-10f /* beside the time, which has two of them: a motion with such steps ends in a singularity */
-#define ROUNDOFF_LEVEL 1e-4f /* updates of this relative size may be rounding: a thousand times what a sum leaves */
+#define NEGLIGIBLE 5e-4f /* relative to the state: rounding leaves no resolvable curve of smaller displacements */
+#define EACH REAL_EPSILON /* share of the largest coordinate in each size, if each coordinate is to be accurate by
+                           * itself */
+#define ALL 1 /* the same if the state is to be accurate as a whole */
+#define DECAY 0.1f /* ratio of successive coefficients of a curve that is resolved to some digits */
+#define VANISHING 1e-10f /* relative to t, which has two words: steps below it indicate a singularity of the motion */
+#define ROUNDOFF_LEVEL 1e-4f /* relative updates below it may be rounding errors: 1000 times those of a sum */

@@ -1,28 +1,29 @@
-/* Many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every so many
- * steps, and what carries changes and slopes along it. Before it: run.h, push_and_pull.h. */
+/* Flow of many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every
+ * `every` steps, with JVPs and VJPs along it. Requires: run.h, push_and_pull.h. */
 #include <stdlib.h>
 
-#define FLOW_SAME_STATE 1e-6 /* beside the largest number of it and of that before: another solution is farther away */
+#define FLOW_SAME_STATE 1e-6 /* relative to the largest number of this state and the previous one: a spurious solution
+                              * is farther away */
 
 enum {
   FLOW_STATE = 2 * M,
-  FLOW_PIECE = 64, /* steps whose vectors there is room for at a time */
+  FLOW_PIECE = 64, /* steps per chunk, for whose vectors there is memory */
   FLOW_NO_MEMORY = 6
 };
 
-/* Its values; changes of them by changes of what is given; slopes by what is given from slopes by the values. */
+/* Results of a flow: states; tangent vectors of the states (JVP); gradients with respect to the inputs (VJP). */
 typedef enum {
   FLOW_STATES,
   FLOW_PUSH,
   FLOW_PULL
 } flow_part;
 
-/* What a row is computed by, and room for it. */
+/* Parameters of the evaluation of a row, and its memory. */
 typedef struct {
   long long steps, every;
-  int count; /* changes, or slopes, at a time */
-  real *states; /* (steps + 1, FLOW_STATE), all of them */
-  real *t, *h, *q, *p, *q1, *p1; /* of the steps of a piece */
+  int count; /* tangent or adjoint vectors at a time */
+  real *states; /* (steps + 1, FLOW_STATE) */
+  real *t, *h, *q, *p, *q1, *p1; /* of the steps of a chunk */
   real *vectors; /* (FLOW_PIECE + 1, count, GIVEN) */
   real *workspace;
 } flow_way;
@@ -32,7 +33,8 @@ static long long kept_states(const flow_way *way)
   return way->steps / way->every + 1;
 }
 
-/* Room for all of a way, to be freed at its workspace; of states alone there are no steps between. */
+/* Allocates the memory, to be freed at way->workspace; returns 0 if there is none. Intermediate states are stored only
+ * for derivatives. */
 static int make_way(flow_way *way)
 {
   const size_t work = STATUS(LINEARISED_WORKSPACE), piece = (size_t)FLOW_PIECE * (2 + 4 * M);
@@ -51,7 +53,8 @@ static int make_way(flow_way *way)
   return place != NULL;
 }
 
-/* The states after every `every` steps from x, itself first. */
+/* Computes the states after every `every` steps from x, starting with x itself. On failure returns the status of the
+ * step, and report->steps is the number of completed ones. */
 static int follow(const flow_way *way, const real *x, long long every, real *states, solver_report *report)
 {
   run_memory run;
@@ -79,7 +82,7 @@ static real largest(const real *x, int n)
   return found;
 }
 
-/* The first step of a piece that, solved anew, does not lead where it led, or how many there are. */
+/* Index of the first step of a chunk whose recomputation does not reproduce its end, or the number of steps. */
 static int first_stray(const flow_way *way, const real *states, int length)
 {
   for (int k = 0; k < length; k++, states += FLOW_STATE) {
@@ -94,13 +97,13 @@ static int first_stray(const flow_way *way, const real *states, int length)
   return length;
 }
 
-/* How many steps a piece behind those done has. */
+/* Number of steps of the chunk after those done. */
 static int piece_after(const flow_way *way, long long done)
 {
   return (int)(way->steps - done < FLOW_PIECE ? way->steps - done : FLOW_PIECE);
 }
 
-/* Where the steps of a piece behind those done start. */
+/* Fills in the start states of the steps of a chunk. */
 static void place_piece(const flow_way *way, const real *x, long long done, int length)
 {
   const real *states = way->states + done * FLOW_STATE;
@@ -112,7 +115,7 @@ static void place_piece(const flow_way *way, const real *x, long long done, int 
   }
 }
 
-/* Carries the vectors over so many steps behind those done. */
+/* Propagates the vectors over a chunk of steps; STRAYED if a recomputed step differs. */
 static int carry_piece(const flow_way *way, const real *x, long long done, int length, int back, solver_report *report)
 {
   int status, stray;
@@ -131,7 +134,8 @@ static int carry_piece(const flow_way *way, const real *x, long long done, int l
   return stray < length ? STATUS(STRAYED) : OK;
 }
 
-/* Where a step ends in a kept state: its place among (count, kept states, FLOW_STATE) numbers for the c-th, else -1. */
+/* Offset of the state at the end of a step in an array (count, kept states, FLOW_STATE) for vector c; -1 if that state
+ * is not stored. */
 static long long place_of(const flow_way *way, long long step, int c)
 {
   return step % way->every ? -1 : (c * kept_states(way) + step / way->every) * FLOW_STATE;
@@ -151,7 +155,8 @@ static void add_slopes(const flow_way *way, long long step, const real *slopes, 
       vectors[c * GIVEN + i] += slopes[place_of(way, step, c) + i];
 }
 
-/* (count, GIVEN) changes at the start to (count, kept states, FLOW_STATE) changes. */
+/* From (count, GIVEN) tangent vectors of the inputs to (count, kept states, FLOW_STATE) tangent vectors of the
+ * states. */
 static int push_along(const flow_way *way, const real *x, const real *changes, real *kept, solver_report *report)
 {
   const long long across = (long long)way->count * GIVEN;
@@ -169,7 +174,8 @@ static int push_along(const flow_way *way, const real *x, const real *changes, r
   return status;
 }
 
-/* (count, kept states, FLOW_STATE) slopes by these to (count, GIVEN) slopes by what was given. */
+/* From (count, kept states, FLOW_STATE) adjoint vectors of the states to (count, GIVEN) gradients with respect to the
+ * inputs. */
 static int pull_along(const flow_way *way, const real *x, const real *kept, real *slopes, solver_report *report)
 {
   const long long across = (long long)way->count * GIVEN;
@@ -188,7 +194,8 @@ static int pull_along(const flow_way *way, const real *x, const real *kept, real
   return status;
 }
 
-/* A part of the flow of each of so many rows x, (GIVEN): of what is given for it to what is found. */
+/* Evaluates the flow or its derivatives for each of `rows` rows x of GIVEN inputs. On failure returns the status of the
+ * failed step, or FLOW_NO_MEMORY; later results are undefined. */
 static int flow_rows(flow_part part, flow_way *way, long long rows, const real *x, const real *given,
     real *found, solver_report *report)
 {

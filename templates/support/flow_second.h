@@ -1,9 +1,8 @@
-/* How the slopes that go back along a flow change where what it starts from does. Before it: flow.h,
- * second_derivatives.h. */
+/* Second derivatives of a flow: tangent vectors of its VJP. Requires: flow.h, second_derivatives.h. */
 
-/* (count, kept states, FLOW_STATE) slopes of as many functions, each with one of (count, GIVEN) changes of what is
- * given: to (count, GIVEN) changes of its slopes by what is given. Room is for (steps + 1, count, GIVEN) changes and
- * (FLOW_PIECE + 1, 2, count, GIVEN) slopes with theirs. */
+/* Computes from (count, kept states, FLOW_STATE) adjoint vectors, each with one of (count, GIVEN) tangent vectors of
+ * the inputs, the (count, GIVEN) derivatives of the gradients along them. `room` is for (steps + 1, count, GIVEN)
+ * tangent vectors and (FLOW_PIECE + 1, 2, count, GIVEN) adjoint vectors with their derivatives. */
 static int bend_along(const flow_way *way, const real *x, const real *kept, const real *changes, real *found,
     real *room, solver_report *report)
 {
@@ -34,7 +33,7 @@ static int bend_along(const flow_way *way, const real *x, const real *kept, cons
   return status;
 }
 
-/* The same of each of so many rows x, (GIVEN). */
+/* bend_along for each of `rows` rows x of GIVEN inputs. */
 static int bend_rows(flow_way *way, long long rows, const real *x, const real *slopes, const real *changes,
     real *found, solver_report *report)
 {

@@ -1,12 +1,12 @@
-/* Instances of an FMU and the modes in which they are. Before it: the integrator's header, that of FMI, and NAME,
- * STATUS, WORKSPACE, TOKEN, STEP, M, PARAMETERS, BY_VELOCITY, and the values at the start. */
+/* Instances of an FMU and their modes (FMI 3.0, co-simulation). Requires: the integrator's header, the FMI header, and
+ * NAME, STATUS, WORKSPACE, TOKEN, STEP, M, PARAMETERS, BY_VELOCITY, and the start values. */
 
 enum { LONGEST_MESSAGE = 240 };
 
 typedef NAME(run) run_memory;
 typedef NAME(report) run_report;
 
-/* References of variables: t, positions, velocities, momenta, the energy, parameters. */
+/* Value references: t, positions, velocities, momenta, energy, parameters. */
 enum {
   TIME = 0,
   POSITIONS = 1,
@@ -15,7 +15,7 @@ enum {
   ENERGY = MOMENTA + M,
   FIRST_PARAMETER = ENERGY + 1,
   REFERENCES = FIRST_PARAMETER + PARAMETERS,
-  MOVING = BY_VELOCITY ? VELOCITIES : MOMENTA /* given at the start */
+  MOVING = BY_VELOCITY ? VELOCITIES : MOMENTA /* the initial values that can be set */
 };
 
 typedef enum {
@@ -25,11 +25,11 @@ typedef enum {
   TERMINATED
 } fmu_mode;
 
-/* All that changes: copy it to keep the state of an instance, copy it back to go on from there, bit for bit. */
+/* The complete state of an instance: a copy restores it bit for bit. */
 typedef struct {
-  char token[sizeof TOKEN]; /* of the FMU that it belongs to */
+  char token[sizeof TOKEN]; /* of the FMU that the state belongs to */
   fmu_mode mode;
-  bool behind; /* whether what follows from other values is not up to date */
+  bool behind; /* 1 if dependent values are out of date */
   double values[REFERENCES];
   NAME(run)
   run;
@@ -38,14 +38,14 @@ typedef struct {
 typedef struct {
   fmu_state now;
   NAME(run)
-  before; /* the last step, to go back to */
+  before; /* before the last step, to restore after a failure */
   fmi3InstanceEnvironment environment;
   fmi3LogMessageCallback log;
   bool logs_discards;
   double workspace[WORKSPACE];
 } fmu;
 
-/* Says why a call fails, where somebody listens; gives its status. */
+/* Logs the reason of a failed call if there is a logger; returns `status`. */
 static fmi3Status failed(const fmu *one, fmi3Status status, const char *format, ...)
 {
   char message[LONGEST_MESSAGE];
@@ -64,7 +64,7 @@ static fmi3Status not_now(const fmu *one, const char *call)
   return failed(one, fmi3Error, "%s is not allowed in this mode", call);
 }
 
-/* The answers of the integrator in words. */
+/* Description of a status of the integrator. */
 static const char *reason(int status)
 {
   switch (status) {
@@ -91,7 +91,7 @@ static void set_start(fmu_state *now)
   memcpy(now->values + FIRST_PARAMETER, START_PARAMETERS, sizeof(double) * PARAMETERS);
 }
 
-/* What follows from other values: momenta where velocities are given, else velocities; the energy. */
+/* Updates the dependent values: momenta if velocities are given, otherwise velocities; the energy. */
 static fmi3Status follow(fmu *one, fmi3Status otherwise)
 {
   double *x = one->now.values;

@@ -1,5 +1,5 @@
-/* What FMI 3.0 wants every FMU to have and this one has no use for: variables of other types, events, clocks,
- * derivatives, model exchange, scheduled execution. Each is an error. Before it: fmu.h. */
+/* Functions that FMI 3.0 requires and this FMU does not support: variables of other types, events, clocks, derivatives,
+ * model exchange, scheduled execution. Each returns an error. Requires: fmu.h. */
 
 #if defined(__GNUC__) || defined(__clang__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"

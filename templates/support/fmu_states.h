@@ -1,6 +1,6 @@
-/* States of an FMU, kept, set, and as bytes. Before it: fmu.h. */
+/* States of an FMU: get, set, serialise. Requires: fmu.h. */
 
-/* The same state in memory of the importer's, made if there is none. */
+/* Copies the state to the importer's memory, which is allocated if there is none. */
 static fmi3Status keep_state(const fmu *one, const void *state, fmi3FMUState *kept)
 {
   *kept = *kept ? *kept : malloc(sizeof(fmu_state));

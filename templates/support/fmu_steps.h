@@ -1,11 +1,13 @@
-/* From one communication point to the next. Before it: fmu.h, and PROJECT, which puts a state on constraints. */
+/* Integration from one communication point to the next. Requires: fmu.h, and PROJECT, the projection onto
+ * constraints. */
 
-#define NO_STEP 1e-9 /* of a step: what is left that is not worth one, as where inputs are tables */
-#define TIME_ROUNDING (4 * DBL_EPSILON) /* of a time, what sums of steps may be off */
-#define MISTAKEN 1e3 /* so many times what a time may be off: a step from elsewhere, not rounding */
-#define FAR_OFF 1e-2 /* the constraints, relative to the positions: an initial state that is not meant */
+#define NO_STEP 1e-9 /* relative to a step: remaining time that needs no step, e.g. with tabulated inputs */
+#define TIME_ROUNDING (4 * DBL_EPSILON) /* relative to a time: error of a sum of steps */
+#define MISTAKEN 1e3 /* relative to the slack of a time: a larger difference is a wrong start time, not rounding */
+#define FAR_OFF 1e-2 /* violation of the constraints, relative to the positions, that is an error of the initial
+                      * state */
 
-/* In the place of PROJECT where there is nothing to project on. */
+/* PROJECT of a system without constraints. */
 static inline int no_constraints(double t, const double *q0, const double *p0, const double *parameters, double *q1,
     double *p1, double *workspace)
 {
@@ -15,7 +17,7 @@ static inline int no_constraints(double t, const double *q0, const double *p0, c
   return STATUS(OK);
 }
 
-/* The initial state put on the constraints; from then on momenta are what is known. */
+/* Projects the initial state onto the constraints; from then on the momenta are the independent values. */
 static fmi3Status put_on_constraints(fmu *one)
 {
   double *x = one->now.values, q[M], p[M], size = 0, moved = 0;
@@ -51,14 +53,14 @@ FMI_EXPORT fmi3Status FMI(ExitInitializationMode)(fmi3Instance instance)
   return fmi3OK;
 }
 
-/* How exactly a time is known, and has to be met. */
+/* Admissible error of a communication point. */
 static double slack_at(double t)
 {
   return NO_STEP * STEP + TIME_ROUNDING * fabs(t);
 }
 
-/* The number of steps that lead to the next communication point, and their length: STEP where that fits, that of the
- * steps before where that does, else an equal part of the way. */
+/* Number of steps to the next communication point, and their size: STEP if it fits, else that of the previous steps if
+ * it fits, else an equal part of the interval. */
 static long long plan(NAME(run) * run, double end)
 {
   const double left = end - run->t, slack = slack_at(end), count = fmax(1, ceil((left - slack) / STEP));

@@ -1,6 +1,7 @@
-/* Variables of an FMU by their references. Before it: fmu.h, INPUTS, INPUT_PARTS, INPUT_PLACE. */
+/* Variables of an FMU by value reference. Requires: fmu.h, INPUTS, INPUT_PARTS, INPUT_PLACE. */
 
-/* Whether a reference is one of the description: what an input is made of beside its value is not. */
+/* Returns true if the model description has the reference; the internal parts of an input other than its value are
+ * hidden. */
 static bool is_known(fmi3ValueReference reference)
 {
   const int64_t place = (int64_t)reference - FIRST_PARAMETER;
@@ -15,7 +16,7 @@ static bool is_among(fmi3ValueReference reference, fmi3ValueReference first)
   return reference >= first && reference < first + M;
 }
 
-/* Parameters and inputs at any time, the state before the first step. */
+/* Parameters and inputs can be set at any time, the state before the first step. */
 static bool is_settable(fmi3ValueReference reference, fmu_mode mode)
 {
   if (reference >= FIRST_PARAMETER)

@@ -1,8 +1,8 @@
-/* Corrections of velocities by residual momenta r, forces and momenta following them to first order. Before it:
+/* Velocity corrections from residual momenta r, with forces and momenta linearised in the correction. Requires:
  * places.h, point_weights.h, a mass. */
-enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q, row by row */
+enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q by rows */
 
-/* A row of a matrix, times x. */
+/* Product of a matrix row and x. */
 static inline lanes row_times(const lanes *row, const lanes *x)
 {
   lanes sum = row[0] * x[0];
@@ -11,7 +11,7 @@ static inline lanes row_times(const lanes *row, const lanes *x)
   return sum;
 }
 
-/* How the forces F follow the changes r of the velocities, and, less that, the residual momenta are the momenta. */
+/* First-order changes of the forces, F, and of the momenta at fixed velocity, P, by velocity changes r. */
 static inline void forces_follow(const sweep_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M],
     lanes (*P)[M])
 {
@@ -28,8 +28,8 @@ static inline void forces_follow(const sweep_data *data, lanes (*value)[VALUES],
   }
 }
 
-/* r = mass^-1 r at all points; then once more, less what follows. A sweep contracts as two do, and calls no function
- * more. */
+/* r = mass^-1 r at all points, then once more with the residual of the linearised equations: one iteration converges
+ * like two without further evaluations. */
 static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
 {
   lanes first[GROUPS][M], force[GROUPS][M], impulse[GROUPS][M], momentum[GROUPS][M];
@@ -45,7 +45,7 @@ static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes
   }
 }
 
-/* Forces where the velocities z came to rest, after the last correction r of them, which is small. */
+/* Forces at the converged velocities z, linearised at the last correction r, which is small. */
 static inline void forces_at_rest(const step_data *step, const sweep_data *data, lanes (*value)[VALUES], lanes (*z)[M],
     lanes (*r)[M], lanes (*F)[M])
 {

@@ -1,8 +1,8 @@
-/* Mass matrices in every lane, in their lower triangles. Before it: points.h or trajectories.h. */
+/* Full mass matrices in every lane, in their lower triangles. Requires: points.h or trajectories.h. */
 enum { DIAGONAL = 0,
   MASS = M * M };
 
-/* L D L^T of the mass, without pivoting, 1 / D on the diagonal; a vanishing pivot gives NaN. */
+/* L D L^T factors of the mass matrix without pivoting, 1 / D on the diagonal; a zero pivot gives NaN. */
 static inline void factor_mass(lanes *mass)
 {
   for (int j = 0; j < M; j++) {
@@ -18,7 +18,7 @@ static inline void factor_mass(lanes *mass)
   }
 }
 
-/* r = mass^-1 r, with the factors of the mass. */
+/* r = mass^-1 r with the factors. */
 static inline void solve_mass(const lanes *mass, lanes *r)
 {
   for (int j = 0; j < M; j++) {

@@ -1,6 +1,7 @@
-/* Unknowns z to values at points. Before it: real, B, POINTS. Unknown b of site i is z[i B + b]. */
+/* Interpolation from the unknowns z to values at points. Requires: real, B, POINTS. Unknown b of site i is z[i B +
+ * b]. */
 
-/* scale sum_b table[b][n] z_b for so many sites i from z on and every point n, into u[n * across + i * along]. */
+/* u[n * across + i * along] = scale sum_b table[b][n] z_b for sites i from z on and every point n. */
 static inline void gather(const real *table, int points, real scale, const real *z, int sites, real *u, int across,
     int along)
 {

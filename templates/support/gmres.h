@@ -1,22 +1,21 @@
-/* Linear systems that are known by their products alone: GMRES, restarted (Y. Saad, Iterative Methods for Sparse Linear
- * Systems, 2003, algorithm 9.5: preconditioned from the right), on vectors over all points of all coordinates. Before
- * it: linear_vectors.h; linear_system with count, state, basis, residual, correction and product; multiply,
- * precondition and reconsider. */
+/* Restarted GMRES with right preconditioning (Y. Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm
+ * 9.5) on vectors over all points of all coordinates. Requires: linear_vectors.h; linear_system with count, state,
+ * basis, residual, correction and product; multiply, precondition and reconsider. */
 
 enum {
-  BASIS = 16, /* vectors until it begins anew */
-  MOST_CYCLES = 30 /* then Newton goes on with what there is */
+  BASIS = 16, /* basis vectors before a restart */
+  MOST_CYCLES = 30 /* then Newton's method continues with the correction so far */
 };
 
-#define LINEAR_TOLERANCE 1e-6 /* of a system, relative: so much an iteration of Newton's gains */
-#define LINEAR_GRAIN (DBL_EPSILON / 4) /* and beside the state: less is rounding of what is solved for */
+#define LINEAR_TOLERANCE 1e-6 /* relative residual: reduction per Newton iteration */
+#define LINEAR_GRAIN (DBL_EPSILON / 4) /* relative to the state: a smaller residual is rounding */
 
-/* The triangle that Givens' rotations make of the products of the basis with itself, and what they make of the norm. */
+/* Triangular factor of the Hessenberg matrix by Givens rotations, and the rotated right-hand side. */
 typedef struct {
   double column[BASIS][BASIS + 1], cosine[BASIS], sine[BASIS], rest[BASIS + 1];
 } triangle;
 
-/* Column k after the rotations before it and one of its own; returned is the norm of what the basis leaves over. */
+/* Applies the previous rotations and a new one to column k; returns the norm of the residual. */
 static double rotate(triangle *of, int k)
 {
   double *column = of->column[k], length;
@@ -34,7 +33,7 @@ static double rotate(triangle *of, int k)
   return fabs(of->rest[k + 1]);
 }
 
-/* The basis of one cycle, until what it leaves over is small enough; how many vectors it has. */
+/* Builds the Arnoldi basis of one cycle until the residual is below `enough`; returns its size. */
 static int build_basis(linear_system *of, triangle *all, double enough, solver_report *report)
 {
   for (int k = 0; k < BASIS; k++) {
@@ -59,7 +58,7 @@ static int build_basis(linear_system *of, triangle *all, double enough, solver_r
   return BASIS;
 }
 
-/* Adds what a basis of so many vectors gives to the correction. */
+/* Adds the solution in a basis of `size` vectors to the correction. */
 static void add_combination(linear_system *of, triangle *all, int size)
 {
   lanes *sum = of->basis + size * of->count;
@@ -75,8 +74,8 @@ static void add_combination(linear_system *of, triangle *all, int size)
   add_multiple(of, of->correction, 1.0, of->product);
 }
 
-/* The correction whose product is the residual, as nearly as LINEAR_TOLERANCE or LINEAR_GRAIN; returned is the size of
- * what it leaves, of which there is too much where cycles no longer help. */
+/* Solves for the correction to LINEAR_TOLERANCE or LINEAR_GRAIN; returns the norm of the residual, which is larger if
+ * further cycles do not reduce it. */
 static double find_correction(linear_system *of, solver_report *report)
 {
   const double size = sqrt(inner_product(of, of->residual, of->residual));

@@ -1,11 +1,11 @@
-/* A step compared with two of half its length: what its curve cannot tell, where it has too few points, where forces
- * pass through zero at them, or where it is another solution of the stage equations. Before it: comparison.h, prepare
- * and solve of a solver, duration. */
+/* Comparison of a step with two steps of half its size. It detects errors that the curve of the step does not show: too
+ * few points, forces that vanish at them, or a spurious solution of the stage equations. Requires: comparison.h,
+ * prepare and solve of a solver, duration. */
 
 static real duration(const step_data *step, const solver_data *data, const real *memory, long long guess,
     real *workspace);
 
-/* Solves a step without a guess; the increments without their low parts are added to those given. */
+/* Solves a step without a predictor and adds its increments, without their low words, to dq and dp. */
 static SELDOM int add_part(step_data *part, const solver_options *options, real *dq, real *dp)
 {
   real memory[MEMORY], own_q[2 * M] = {0}, own_p[2 * M] = {0};
@@ -52,7 +52,7 @@ static SELDOM int solve_halves(const step_data *step, real h, const solver_optio
   return add_part(&part, options, dq, dp);
 }
 
-/* The difference of the increments of x, relative to the state that `halves` lead to; 0 where it may be rounding. */
+/* Largest difference of the increments of x relative to the state after the half steps; 0 if it may be rounding. */
 static real difference(const real *x, const real *whole, const real *halves)
 {
   real largest = 0, most = 0;
@@ -65,10 +65,10 @@ static real difference(const real *x, const real *whole, const real *halves)
   return most > ROUNDING_OF_HALVES ? most : 0;
 }
 
-/* By how much the end of a step is wrong, relative to the state, as its halves tell. Both may leave forces at the start
- * out, as those near a centre: so where they differ much the first half is compared with its own halves, as long as
- * these differ by more. Momenta are compared too, of the whole step, unless dp is NULL. Not OK where halves have no
- * solution, or differ by far more than the state. */
+/* Computes the error of the end of a step relative to the state. Since the step and its halves may both miss forces
+ * near the start, e.g. near a centre, a large difference is followed by comparing the first half with its own halves as
+ * long as the difference grows. Momenta of the whole step are compared unless dp is NULL. Returns STRAYED if the half
+ * steps have no solution or differ by far more than the state. */
 static SELDOM int compare_with_halves(const step_data *step, const real *dq, const real *dp,
     const solver_options *options, real *error)
 {

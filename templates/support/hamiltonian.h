@@ -1,5 +1,5 @@
-/* Momenta, velocities and energies of a system given by its Hamiltonian. Before it: legendre.h, the kernel hamiltonian.
- * Where H is linear in p, velocities say nothing of momenta: there are no slopes. */
+/* Momenta, velocities and energies of a Hamiltonian system. If H is linear in p, MASS_ENTRIES is 0 and velocities do
+ * not determine momenta: `momentum` returns SINGULAR. Requires: legendre.h, the kernel hamiltonian. */
 
 int NAME(velocity)(real t, const real *q, const real *p, const real *parameters, real *v, real *workspace)
 {

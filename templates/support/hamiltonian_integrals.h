@@ -1,6 +1,6 @@
-/* Integrals along a step that sweeps solved. Before it: hamiltonian_sweep.h, the kernel integrand_lanes. */
+/* Integrals along a step solved by fixed-point iteration. Requires: hamiltonian_sweep.h, the kernel integrand_lanes. */
 
-/* By the quadrature of the momenta, at the points where velocities and forces came to rest, which memory holds. */
+/* Quadrature of the momenta at the converged velocities and forces, which `memory` contains. */
 static inline void integrals_of_sweep(const step_data *step, const sweep_data *data, const double *memory, double *sum)
 {
   lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];

@@ -1,7 +1,7 @@
-/* A step by sweeps for any Hamiltonian. Before it: one_trajectory.h, point_weights.h, the tables, the kernels
- * velocity_lanes and force_lanes. */
+/* Fixed-point iteration of a step for any Hamiltonian (Li, Wu & Leok, eq. (35)). Requires: one_trajectory.h,
+ * point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
 
-/* Positions at the points of the curve whose velocities are z. */
+/* Positions at the points of the curve with velocities z. */
 static inline void place(const step_data *step, const sweep_data *data, lanes (*z)[M], lanes (*u)[2 * M])
 {
   lanes scaled[GROUPS][M];
@@ -11,7 +11,7 @@ static inline void place(const step_data *step, const sweep_data *data, lanes (*
       u[n][i] = step->q0[i] + (step->carry_q[i] + apply(POSITION, n, scaled, i));
 }
 
-/* Momenta there from the forces. */
+/* Momenta at the points from the forces. */
 static inline void push(const step_data *step, const sweep_data *data, lanes (*force)[M], lanes (*u)[2 * M])
 {
   lanes scaled[GROUPS][M];
@@ -36,8 +36,9 @@ static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*forc
     force_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
 }
 
-/* The increments of one step. Forces, momenta and velocities follow each other until momenta and velocities rest; the
- * increments are made from the forces where they do. Velocities and forces are kept. */
+/* Computes the increments of one step: forces, momenta and velocities are updated in turn until momenta and velocities
+ * converge; the increments follow from the forces there. Velocities and forces are stored for the predictor. On failure
+ * the increments are undefined. */
 HOT int sweep(const step_data *step, const sweep_data *data, history past, long long *steps, double *dq, double *dp,
     const solver_options *options, solver_report *report)
 {

@@ -1,7 +1,7 @@
-/* Constraints at every element of loops. Before it: indexed.h. */
+/* Output of the kernels of constraints in loops. Requires: indexed.h. */
 
-/* Where what is found at the next element goes: g, g_t and the slopes of g, or the first of its entries and on which
- * coordinates they act. */
+/* Destinations of the next constraint: g, g_t and the derivatives of g, or the index of its first entry and the
+ * coordinates of the entries. */
 typedef struct {
   double *g, *rate, *slope;
   int *first, *place;

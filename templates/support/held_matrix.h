@@ -1,17 +1,16 @@
-/* The matrix G M^-1 G^T of constraints, and systems with it by conjugate gradients, preconditioned by its incomplete
- * factors L D L^T without fill. Of a chain or a tree whose rods are given from an end on these are the whole ones.
- * Where constraints say a thing twice the matrix is singular, which is refused. Before it: held_pattern.h.
- *
- * J. A. Meijerink, H. A. van der Vorst, Math. Comp. 31 (1977). */
+/* Systems with the constraint matrix G M^-1 G^T by conjugate gradients, preconditioned by the incomplete factorisation
+ * L D L^T without fill (J. A. Meijerink & H. A. van der Vorst, Math. Comp. 31, 1977). For a chain or a tree whose
+ * constraints are ordered from an end the factors are exact. Redundant constraints make the matrix singular, which is
+ * an error. Requires: held_pattern.h. */
 
-#define LEAST_PIVOT 1e-3 /* beside the diagonal: less is what incomplete factors have lost */
-#define DEPENDENT 1e-13 /* of the matrix beside L D L^T: what is as good as 0 in a direction */
-#define GRAINS 4096.0 /* of rounding: what may be left where positions rest */
-#define SPARE_PRODUCTS 100 /* beyond as many as there are constraints, for rounding */
+#define LEAST_PIVOT 1e-3 /* relative to the diagonal: a smaller pivot was lost by the incomplete factorisation */
+#define DEPENDENT 1e-13 /* of the matrix relative to L D L^T: curvature that counts as 0 */
+#define GRAINS 4096.0 /* multiple of the rounding error that may remain at converged positions */
+#define SPARE_PRODUCTS 100 /* iterations beyond the number of constraints, to allow for rounding */
 
-/* The parts of held: a number a constraint each (g, g_t, multipliers, and of a system its right-hand side, which
- * becomes the residual, its solution, three directions, its rounding, the diagonals of the matrix and of D
- * inverted), a number an entry (slopes at the state and at another), and one a pair (the matrix, L). */
+/* Arrays of the constraints: one number per constraint (g, g_t, multipliers; right-hand side and residual, solution,
+ * three directions of a system, rounding error, diagonal of the matrix and inverted D), per entry (derivatives at the
+ * state and at another one), and per pair (the matrix, L). */
 typedef struct {
   pattern of;
   long long count, entries;
@@ -35,7 +34,7 @@ static held held_of(const run_memory *run, long long n)
   return found;
 }
 
-/* The row of a constraint: products of slopes on the same coordinates. */
+/* Computes the row of a constraint: products of derivatives with respect to the same coordinates. */
 static void find_products(const held *held, const double *inverse_mass, int k)
 {
   const pattern *of = &held->of;
@@ -59,7 +58,7 @@ static void find_products(const held *held, const double *inverse_mass, int k)
   }
 }
 
-/* The row of L, by those above; 0 where the diagonal is not positive. */
+/* Computes a row of L from the rows above; returns 0 if the diagonal is not positive. */
 static int factorise_row(const held *held, int k)
 {
   const pattern *of = &held->of;
@@ -83,7 +82,7 @@ static int factorise_row(const held *held, int k)
   return held->diagonal[k] > 0.0 && held->diagonal[k] < INFINITY;
 }
 
-/* The matrix of the slopes at the state; 0 where a constraint has none. */
+/* Assembles and factorises the matrix of the derivatives at the state; returns 0 if a constraint has none. */
 static int assemble(const held *held, const double *inverse_mass)
 {
   int sound = 1;
@@ -124,7 +123,7 @@ static void precondition(const held *held, const double *x, double *y)
       y[of->column[m]] -= held->factor[m] * y[k];
 }
 
-/* In four sums, one behind the other in time, not in what they wait for. */
+/* Inner product in four independent sums, which do not wait for each other. */
 static double product_of(const double *x, const double *y, long long n)
 {
   double sum[4] = {0.0, 0.0, 0.0, 0.0};
@@ -137,7 +136,7 @@ static double product_of(const double *x, const double *y, long long n)
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-/* What rounding may make of so many times G x, a constraint each. */
+/* Bound of the rounding error of scale G x, per constraint. */
 static void find_grain(const held *held, const double *slope, const double *x, double scale)
 {
   for (long long k = 0; k < held->count; k++) {
@@ -148,7 +147,7 @@ static void find_grain(const held *held, const double *slope, const double *x, d
   }
 }
 
-/* Whether some of what is left on the right is more than its grain. */
+/* Returns 1 if some residual exceeds its rounding error. */
 static int is_beyond_grain(const held *held)
 {
   int found = 0;
@@ -157,7 +156,7 @@ static int is_beyond_grain(const held *held)
   return found;
 }
 
-/* right -= step image and change += step way; returned is the size of what is left, squared. */
+/* change += step way, right -= step image; returns the squared norm of the residual. */
 static double move_on(const held *held, double step)
 {
   for (long long k = 0; k < held->count; k++) {
@@ -167,11 +166,13 @@ static double move_on(const held *held, double step)
   return product_of(held->right, held->right, held->count);
 }
 
-/* change = (G M^-1 G^T)^-1 right, but for that part of right, or its grain; OK, or why there is more left. */
+/* Solves (G M^-1 G^T) change = right to the relative tolerance or to rounding. Returns OK, NOT_CONVERGED, SINGULAR or
+ * NOT_FINITE. */
 static int solve_held(const held *held, double tolerance, solver_report *report)
 {
   const long long n = held->count;
-  double size = product_of(held->right, held->right, n), slope, length; /* of the way, by L D L^T, squared */
+  double size = product_of(held->right, held->right, n), slope, length; /* squared length of the search direction in the
+                                                                         * metric of L D L^T */
   const double least = tolerance * tolerance * size;
   memset(held->change, 0, sizeof(double) * (size_t)n);
   if (!(size < INFINITY))
@@ -192,7 +193,7 @@ static int solve_held(const held *held, double tolerance, solver_report *report)
     precondition(held, held->right, held->near);
     slope = product_of(held->right, held->near, n);
     again = slope / last;
-    length = slope + again * again * length; /* what is left is at right angles to the way */
+    length = slope + again * again * length; /* the residual is orthogonal to the direction */
     for (long long i = 0; i < n; i++)
       held->way[i] = held->near[i] + again * held->way[i];
   }

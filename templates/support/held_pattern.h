@@ -1,9 +1,9 @@
-/* Which constraints act on the same coordinates: the pattern of G M^-1 G^T below its diagonal, row by row. Before it:
+/* Sparsity pattern of G M^-1 G^T below its diagonal, by rows: which constraints act on the same coordinates. Requires:
  * held.h, find_places. */
 
-/* Of constraints the first of their entries, of entries their coordinate and their constraint; of coordinates the first
- * of their entries, which are listed with ascending constraints; of rows their first pair, of pairs their column; and
- * where the columns of a row are while it is worked on, -1 of others. */
+/* For each constraint its first entry; for each entry its coordinate (place) and constraint (owner); for each
+ * coordinate its first entry (at) in `list`, ordered by constraint; for each row its first pair, for each pair its
+ * column; `where` is the index of each column in the row being processed, -1 if absent. */
 typedef struct {
   int *first, *place, *owner, *list, *at, *where, *row, *column;
 } pattern;
@@ -33,7 +33,7 @@ static void list_entries(const pattern *of, long long count, long long entries, 
       of->owner[e] = (int)k;
       of->list[of->at[of->place[e]]++] = e;
     }
-  for (long long i = n; i > 0; i--) /* each was moved on to the first of the next */
+  for (long long i = n; i > 0; i--) /* each was advanced to the first of the next */
     of->at[i] = of->at[i - 1];
   of->at[0] = 0;
 }
@@ -49,7 +49,7 @@ static void sort_ascending(int *numbers, long long count)
   }
 }
 
-/* The columns of a row behind so many pairs; returned is the number of pairs with these. */
+/* Finds the columns of a row, stored from index `pairs` on; returns the total number of pairs. */
 static long long find_row(const pattern *of, int k, long long pairs)
 {
   const long long begin = pairs;

@@ -1,10 +1,11 @@
-/* States and constraints: the nearest state that meets them, how far one is off, what holds it. Before it: held_step.h,
+/* Projection onto the constraints, their values, and their Lagrange multipliers. Requires: held_step.h,
  * indexed_run.h. */
 
 #define REFINEMENTS 3
-#define REFINED 1e-6 /* what each is to leave of what was left */
+#define REFINED 1e-6 /* reduction of the residual per refinement */
 
-/* Positions on to g = 0, the nearest in the metric of the masses: q0 + M^-1 G^T lambda with the slopes there. */
+/* Projects the positions onto g = 0: the nearest state in the metric of the masses, q0 + M^-1 G^T lambda with G
+ * there. */
 static int project_positions(const held_run *of)
 {
   const held *held = &of->held;
@@ -79,7 +80,8 @@ void NAME(constraint_values)(run_memory *run, const problem *given, double *g, d
     }
 }
 
-/* By G M^-1 (F + G^T lambda) = - d^2 g / dt^2 of a straight motion; what the next step begins with stays. */
+/* Multipliers from G M^-1 (F + G^T lambda) = -d^2 g / dt^2 at constant velocity. The predictor of the next step is not
+ * changed. */
 int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
 {
   solver_report report = {0};

@@ -1,10 +1,11 @@
-/* A step that constraints hold: parts of RATTLE. Before it: increments.h, add_forces, find_conditions, held_matrix.h,
- * indexed_iteration.h, PARTS of a step, PART and where they end, PART_END. */
+/* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
+ * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: increments.h, add_forces,
+ * find_conditions, held_matrix.h, indexed_iteration.h, PARTS of a step, PART and their ends, PART_END. */
 
-#define NEAR_ENOUGH 1e-3 /* of a system: corrections are to make what is left less than that */
+#define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */
 
-/* The parts of work: sizes of what is rounded; forces; increments of positions and
- * momenta; reactions; increments to be tried, and where they lead. */
+/* Parts of `work`: magnitudes for rounding errors; forces; increments of positions and momenta; constraint forces;
+ * trial increments, and the positions they lead to. */
 typedef struct {
   double *X, *F, *dq, *dp, *R, *D, *Y;
 } parts_of_work;
@@ -16,7 +17,7 @@ static parts_of_work divide(const run_memory *run, long long n)
   return parts;
 }
 
-/* What the parts of a step have in common. */
+/* Data shared by the substeps. */
 typedef struct {
   run_memory *run;
   const problem *given;
@@ -49,7 +50,7 @@ static void find_forces(const held_run *of, const double *X, double t, double *F
   add_forces(of->run, of->given, X, t, 1.0, F);
 }
 
-/* Forces, slopes and their matrix at the state. */
+/* Computes forces, constraint derivatives and their matrix at the state. */
 static int begin(const held_run *of)
 {
   find_forces(of, of->run->q, of->run->t, of->parts.F);
@@ -57,8 +58,8 @@ static int begin(const held_run *of)
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
-/* The increments that reactions lead to, the positions, and sizes of what these are sums of; returned is the size of
- * the coordinates, squared. */
+/* Computes the trial increments due to the constraint forces, the positions, and the magnitudes of their terms; returns
+ * the squared size of the coordinates. */
 static double lead(const held_run *of, double h)
 {
   const run_memory *run = of->run;
@@ -75,7 +76,7 @@ static double lead(const held_run *of, double h)
   return size;
 }
 
-/* x += by y; returned is the size of M^-1 y, squared. */
+/* x += by y; returns the squared size of M^-1 y. */
 static double push(double *x, const double *y, double by, const double *inverse_mass, long long n)
 {
   double size = 0.0;
@@ -87,8 +88,8 @@ static double push(double *x, const double *y, double by, const double *inverse_
   return size;
 }
 
-/* What is said of corrections that came to an end; constraints that are not met where positions rest contradict each
- * other. */
+/* Status of a finished iteration. Constraints that are violated at converged positions contradict each other:
+ * SINGULAR. */
 static int end_of(const iteration *now, const held *held)
 {
   const double left = product_of(held->right, held->right, held->count);
@@ -98,7 +99,8 @@ static int end_of(const iteration *now, const held *held)
   return left <= GRAINS * GRAINS * grain ? OK : SINGULAR;
 }
 
-/* Reactions at the beginning that lead to g = 0 at the end, and the slopes there; increments are to be tried. */
+/* Solves for the multipliers at the start that give g = 0 at the end; leaves trial increments and the derivatives
+ * there. */
 static int meet(const held_run *of, double h, double t, double *size)
 {
   const held *held = &of->held;
@@ -125,7 +127,7 @@ static int meet(const held_run *of, double h, double t, double *size)
   }
 }
 
-/* right = - so many times (rate + G x). */
+/* right = -scale (rate + G x). */
 static void find_right(const held *held, const double *rate, const double *x, double scale)
 {
   for (long long k = 0; k < held->count; k++) {
@@ -136,8 +138,8 @@ static void find_right(const held *held, const double *rate, const double *x, do
   }
 }
 
-/* Momenta on to G M^-1 p + g_t = 0, by reactions that push by so much; velocities are judged in units of the size. X
- * has sizes of what these are sums of. */
+/* Projects the momenta onto G M^-1 p + g_t = 0 by constraint forces of weight `by`; the change of the velocities times
+ * `unit` is compared with `size`. X contains the magnitudes of their terms. */
 static int turn(const held_run *of, double by, double unit, double size)
 {
   const held *held = &of->held;
@@ -161,7 +163,7 @@ static int turn(const held_run *of, double by, double unit, double size)
   }
 }
 
-/* A part of a step, of h to t. */
+/* Performs one substep of size h that ends at t. */
 static int hold(const held_run *of, double h, double t)
 {
   const parts_of_work *parts = &of->parts;
@@ -188,7 +190,8 @@ static int hold(const held_run *of, double h, double t)
   return turn(of, h / 2, h, size);
 }
 
-/* Increments begin with what rounding cut off the state; a step that fails leaves the state, and begins anew. */
+/* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state
+ * unchanged and discards the predictor. */
 static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {

@@ -1,4 +1,4 @@
-/* Sums of vectors. Before it: nothing. */
+/* Sums of vectors. Requires: nothing. */
 
 static void add_to(double *restrict x, const double *restrict y, double by, long long n)
 {
@@ -6,7 +6,7 @@ static void add_to(double *restrict x, const double *restrict y, double by, long
     x[i] += by * y[i];
 }
 
-/* x += y, and what rounding cuts off (Knuth). */
+/* x += y, with the rounding error in rest (two-sum; Knuth, TAOCP vol. 2, sec. 4.2.2). */
 static void add_all(double *restrict x, const double *restrict y, double *restrict rest, long long n)
 {
   for (long long i = 0; i < n; i++) {

@@ -1,4 +1,4 @@
-/* Runs of any number of coordinates to a time, by steps that choose their length. Before it: trials.h. */
+/* Adaptive integration of indexed systems to a given time. Requires: trials.h. */
 
 static void take_trial(run_memory *run, trial *now)
 {

@@ -1,4 +1,4 @@
-/* The diagonal of F' preconditions, coordinate by coordinate. Before it: linear_vectors.h. */
+/* Preconditioner for Newton-GMRES from the diagonal of F'. Requires: linear_vectors.h. */
 
 enum { SPARE_VECTORS = 0 }; /* of work */
 
@@ -14,5 +14,5 @@ static void find_inverses(linear_system *of)
 
 static void reconsider(linear_system *of, double left)
 {
-  (void)of, (void)left; /* there are no others */
+  (void)of, (void)left; /* there is no alternative */
 }

@@ -1,8 +1,8 @@
-/* A step of any number of coordinates compared with two of half its length, as halves.h compares one of few. These are
- * solved where the step was, of which F is lost; forces of former steps stay. Before it: comparison.h, HALVES_VECTORS,
- * solve and go_on of a solver. */
+/* Comparison of a step of an indexed system with two steps of half its size, as in halves.h. The half steps are solved
+ * in place, so that F of the step is lost; forces of former steps are preserved. Requires: comparison.h,
+ * HALVES_VECTORS, solve and go_on of a solver. */
 
-/* The last parts of work: the state at the start of a step; increments of positions by it, and by its first half. */
+/* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half. */
 typedef struct {
   double *q, *p, *carry_q, *carry_p, *whole, *first;
 } state_at_start;
@@ -14,7 +14,7 @@ static state_at_start state_in(const run_memory *run, long long n)
   return kept;
 }
 
-/* Copies of this thread's coordinates. */
+/* Copies the coordinates of this thread. */
 static void copy_state(const state_at_start *from, const state_at_start *to, section own)
 {
   const size_t size = sizeof(double) * (size_t)(own.end - own.first);
@@ -35,7 +35,7 @@ static void note_increments(const run_memory *run, const state_at_start *kept, d
     increments[i] = increment_of(run, kept, i);
 }
 
-/* A step without a guess. */
+/* Performs a step without a predictor. */
 static int make_part(run_memory *run, const problem *given, long long n, const solver_options *options)
 {
   const struct guess_tables tables = {NULL, NULL, NULL};
@@ -50,7 +50,7 @@ static int make_part(run_memory *run, const problem *given, long long n, const s
   return OK;
 }
 
-/* Two steps of h/2; the increments by the first of them are noted. */
+/* Performs two steps of h/2; stores the increments of the first. */
 static int make_halves(run_memory *run, const problem *given, long long n, double h, const state_at_start *kept,
     const solver_options *options)
 {
@@ -63,7 +63,7 @@ static int make_halves(run_memory *run, const problem *given, long long n, doubl
   return make_part(run, given, n, options);
 }
 
-/* The difference of the increments, relative to the state that the halves lead to; 0 where it may be rounding. */
+/* Largest difference of the increments relative to the state after the half steps; 0 if it may be rounding. */
 static double difference(const run_memory *run, const state_at_start *kept, long long n)
 {
   double largest, most;
@@ -93,7 +93,7 @@ static double difference(const run_memory *run, const state_at_start *kept, long
   return most > ROUNDING_OF_HALVES ? most : 0.0;
 }
 
-/* By how much the end of the step that was solved is wrong, as halves.h finds it, at the same state and time after. */
+/* Computes the error of the solved step as in halves.h; state and time are restored. */
 static SELDOM int compare_with_halves(run_memory *run, const problem *given, long long n,
     const solver_options *options, double *error)
 {

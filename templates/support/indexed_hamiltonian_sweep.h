@@ -1,9 +1,8 @@
-/* A step of any number of coordinates by sweeps, for any Hamiltonian: positions and momenta y at the points follow
- * their rates there until they rest. Before it: points.h, contraction.h, the tables, coefficients.h, forces, which
- * gives the slopes G at X: -H_q, by which momenta change, and behind it H_p, by which positions do. Momenta stand
- * behind positions. */
+/* Fixed-point iteration of a step of an indexed Hamiltonian system: positions and momenta y at the points are updated
+ * from their rates until they converge. Requires: points.h, contraction.h, the tables, coefficients.h, forces, which
+ * computes the rates G at X: -H_q of the momenta, then H_p of the positions. Momenta follow positions in memory. */
 
-/* The parts of work, group after group of points: y there, and slopes in this step, the last and the one before. */
+/* Parts of work, by groups of points: y there, and rates in this step, the last one and the one before. */
 typedef struct {
   lanes *X, *G, *last, *before;
 } parts_of_work;
@@ -19,7 +18,7 @@ static parts_of_work divide(const run_memory *run, long long n)
   return parts;
 }
 
-/* Slopes continued from former steps, or none. */
+/* Extrapolates the rates from former steps, or sets them to 0. */
 static void continue_slopes(const run_memory *run, const parts_of_work *parts, long long n,
     const struct guess_tables *tables, long long guess)
 {
@@ -38,8 +37,8 @@ static void continue_slopes(const run_memory *run, const parts_of_work *parts, l
       }
 }
 
-/* A block of y from `first` on by its rates, of which a table and weights make increments; returned is the sum of the
- * squares of what that changes, and that of its sizes. */
+/* Updates a block of y from index `first` on from its rates, by a table and weights; returns the sum of the squared
+ * changes and adds the squared sizes to *size. */
 static double improve_block(const run_memory *run, lanes *X, const lanes *rates, const lanes *table,
     const lanes *weights, long long first, long long n, section here, double *size)
 {
@@ -63,7 +62,8 @@ static double improve_block(const run_memory *run, lanes *X, const lanes *rates,
   return lanes_total(total);
 }
 
-/* The same of n places; the sum of the squares over that of their sizes if these are not absolute. */
+/* Updates n elements; returns the sum of the squared changes, relative to that of the sizes unless these are
+ * absolute. */
 static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
     long long first, long long n, const solver_options *options)
 {
@@ -78,7 +78,7 @@ static double improve(const run_memory *run, lanes *X, const lanes *rates, const
   return beside_state(sum_of(&all, 0), sum_of(&all, 1), options);
 }
 
-/* Whether all slopes are finite. */
+/* Returns 1 if all rates are finite. */
 static int finite_slopes(const run_memory *run, const lanes *G, long long n)
 {
   sums all;
@@ -94,13 +94,13 @@ static int finite_slopes(const run_memory *run, const lanes *G, long long n)
   return sum_of(&all, 0) == 0.0;
 }
 
-/* About how far a coordinate moves in a step. */
+/* Approximate displacement of a coordinate in a step. */
 static inline double moved_by(const run_memory *run, const lanes *velocity, long long n, long long i)
 {
   return fabs(run->h * at_point(&velocity[i], 2 * n, KEPT / 2));
 }
 
-/* The largest coordinate, and how far it moves. */
+/* Largest sum of a coordinate and its displacement. */
 static double largest_yet(const run_memory *run, const lanes *velocity, long long n)
 {
   sums all;
@@ -115,9 +115,9 @@ static double largest_yet(const run_memory *run, const lanes *velocity, long lon
   return largest_of(&all, 0);
 }
 
-/* What the highest coefficient of the velocities at the points moves a coordinate of a block by, squared, over what
- * they bend it by: the largest of these, everything as a part of the largest coordinate. That coefficient is taken for
- * at least `decay` times the one below (coefficients.h). */
+/* Largest value in a block of (displacement due to the leading coefficient of the velocities)^2 / (displacement due to
+ * the curvature), all relative to the largest coordinate. The coefficient is at least `decay` times the next lower one
+ * (coefficients.h). */
 static double unresolved_of_block(const run_memory *run, const lanes *velocity, long long n, double decay,
     double largest, section here)
 {
@@ -135,7 +135,7 @@ static double unresolved_of_block(const run_memory *run, const lanes *velocity, 
   return least;
 }
 
-/* The same of all. */
+/* Error estimate of a step: the maximum over all blocks. */
 static double unresolved(const run_memory *run, const lanes *velocity, long long n, double decay)
 {
   const double largest = largest_yet(run, velocity, n);
@@ -147,7 +147,7 @@ static double unresolved(const run_memory *run, const lanes *velocity, long long
   return largest_of(&all, 0);
 }
 
-/* The end of the step, of n places from `first` on. */
+/* Advances n elements from index `first` on to the end of the step. */
 static void move(run_memory *run, const lanes *rates, const lanes *end, const lanes *weights, long long first,
     long long n)
 {
@@ -160,9 +160,9 @@ static void move(run_memory *run, const lanes *rates, const lanes *end, const la
   }
 }
 
-/* Sweeps until the points rest. Errors of positions become errors of momenta in a sweep, and back in the next: changes
- * are judged in pairs. The tables continue so many steps; then `guess` is how many are best continued into the next,
- * and `error` what the curve leaves unresolved. */
+/* Iterates until the points converge. Errors of positions become errors of momenta in one iteration and back in the
+ * next, so that changes are judged in pairs. The tables extrapolate from *guess steps. On success *guess is the number
+ * of steps for the next predictor, and *error the error estimate. */
 static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
     long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
@@ -187,7 +187,7 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   return OK;
 }
 
-/* On to the end of the step that was solved. */
+/* Advances the state to the end of the solved step. */
 static void go_on(run_memory *run, long long n)
 {
   const lanes *G = divide(run, n).G;

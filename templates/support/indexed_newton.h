@@ -1,19 +1,20 @@
-/* The points of a step of any number of coordinates, by Newton's iteration: (1 - h^2 A F' / m) dX = what a sweep would
- * change, where A is PRODUCT and F' the derivative of the forces at the points, of which only products with vectors are
- * made, family by family. Before it: indexed_sweep.h; products and diagonals of F'. */
+/* Linear systems of Newton's method for the points of a step of an indexed system: (1 - h^2 A F' / m) dX = the change
+ * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
+ * multiplied by vectors, term group by term group. Requires: indexed_sweep.h; products and diagonals of F'. */
 
 typedef struct {
   const run_memory *run;
   const problem *given;
   lengths by;
-  long long n, count; /* coordinates, and vectors over all points */
+  long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
-  double state; /* the size of the coordinates */
+  double state; /* size of the coordinates */
   const lanes *X;
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;
-  int by_waves, tried; /* whether the inverses are those of waves; how many ways one cycle was too few for */
-  double left; /* by the first of them */
+  int by_waves, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
+                        * cycle was not enough */
+  double left; /* reduction of the residual by the first of them */
 } linear_system;
 
 /* y = x - h^2 A F' x / m. */
@@ -28,7 +29,7 @@ static void multiply(const linear_system *of, const lanes *x, lanes *y)
   }
 }
 
-/* y = what the inverses make of x, coordinate by coordinate; x may be y. */
+/* y = the inverses times x, per coordinate; x may be y. */
 static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, section here)
 {
   for (long long i = here.first; i < here.end; i++) {
@@ -40,7 +41,7 @@ static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, se
   }
 }
 
-/* The inverse of a matrix by columns, in its place (Gauss and Jordan, with pivots). */
+/* Inverse of a matrix stored by columns, which is overwritten (Gauss-Jordan elimination with pivoting). */
 static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
 {
   for (int j = 0; j < POINTS; j++)
@@ -67,7 +68,7 @@ static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
   }
 }
 
-/* So many times the inverse of 1 - slope A, as that of a coordinate; of a slope that is not stable 1. */
+/* Stores `by` times the inverse of 1 - slope A for a coordinate; a positive (unstable) slope counts as 0. */
 static void keep_inverse(linear_system *of, long long i, double slope, double by)
 {
   double matrix[POINTS][POINTS], inverse[POINTS][POINTS];
@@ -82,7 +83,7 @@ static void keep_inverse(linear_system *of, long long i, double slope, double by
   memcpy(of->inverse + i * POINTS * GROUPS, inverse, sizeof inverse);
 }
 
-/* h^2 x / m of a coordinate, where x is the mean over the points. */
+/* h^2 x / m of a coordinate, x averaged over the points. */
 static double slope_of(const linear_system *of, const lanes *x, long long i)
 {
   double mean = 0.0;
@@ -91,7 +92,7 @@ static double slope_of(const linear_system *of, const lanes *x, long long i)
   return of->by.square * of->run->inverse_mass[i] * mean;
 }
 
-/* 1 - h^2 A F'_ii / m of every coordinate inverted. */
+/* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
   diagonals(of->run, of->given, of->X, of->forces, of->n);

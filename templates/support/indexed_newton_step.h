@@ -1,9 +1,10 @@
-/* Newton's iteration for the points of a step of any number of coordinates. Before it: indexed_newton.h, gmres.h. */
+/* Newton's method for the points of a step of an indexed system. Requires: indexed_newton.h, gmres.h. */
 
-#define REFRESHED 1e-6 /* the inverses are made again while points move by more than 1e-3 of the state */
-#define UNSOLVED 1e-10 /* of the state: more than this is not left by rounding */
+#define REFRESHED 1e-6 /* squared: the preconditioner is recomputed while points change by more than 1e-3 of the
+                        * state */
+#define UNSOLVED 1e-10 /* relative to the state: a larger residual is not due to rounding */
 
-/* The parts of work behind those of sweeps. */
+/* Parts of work behind those of the fixed-point iteration. */
 static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
 {
   const long long count = GROUPS * n;
@@ -26,7 +27,7 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
   return of;
 }
 
-/* What a sweep would change at points X with forces F; of every thread its own coordinates. */
+/* Residual: the change by one fixed-point iteration at points X with forces F, for the coordinates of this thread. */
 static void find_residual(linear_system *of, const lanes *X, const lanes *F)
 {
   const run_memory *run = of->run;
@@ -42,7 +43,7 @@ static void find_residual(linear_system *of, const lanes *X, const lanes *F)
   }
 }
 
-/* The size of the coordinates in the step, squared. */
+/* Squared size of the coordinates in the step. */
 static double size_of_state(const linear_system *of, const lanes *X)
 {
   const run_memory *run = of->run;
@@ -62,8 +63,8 @@ static double size_of_state(const linear_system *of, const lanes *X)
   return sum_of(&all, 0);
 }
 
-/* The points as former steps are continued, or at rest, whichever a sweep would change less: the forces of a stiff
- * motion are no curve that could be continued. */
+/* Starts from the extrapolated points or from points at rest, whichever has the smaller residual: the forces of a stiff
+ * system have no curve that could be extrapolated. */
 static void start_nearer(linear_system *of, const parts_of_work *parts)
 {
   const run_memory *run = of->run;
@@ -82,8 +83,8 @@ static void start_nearer(linear_system *of, const parts_of_work *parts)
   scale(of, parts->F, 1.0, of->forces);
 }
 
-/* Until the points rest. The tables continue so many steps; then `guess` is how many are best continued into the next,
- * and `error` what the curve leaves unresolved. */
+/* Iterates until the points converge. The tables extrapolate from *guess steps. On success *guess is the number of
+ * steps for the next predictor, and *error the error estimate. */
 static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
     long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
@@ -97,7 +98,7 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   while (now.status == 0) {
     double change, size, left;
     find_residual(&of, parts.X, parts.F);
-    if (now.last > REFRESHED) /* as before the first */
+    if (now.last > REFRESHED) /* also before the first iteration */
       find_inverses(&of);
     left = find_correction(&of, report);
     add_multiple(&of, parts.X, 1.0, of.correction);
@@ -106,7 +107,8 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
     size = size_of_state(&of, parts.X);
     of.state = sqrt(size);
     judge(&now, beside_state(change, size, options), options, report);
-    if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* no correction is small for want of a solution */
+    if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
+                                                           * correction */
       now.status = -1, now.last = left;
   }
   if (now.status < 0)

@@ -1,12 +1,12 @@
-/* A step of any number of coordinates by kicks of h KICK[n] F, each followed by a drift of h DRIFT[n] v. Before it:
+/* Splitting step of an indexed system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
  * increments.h, add_forces, LEAPS, CHUNK, the tables. */
 
-/* The parts of work: where forces are taken, forces at the end of a step, increments of positions and momenta. */
+/* Parts of work: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
 typedef struct {
   double *X, *F, *dq, *dp;
 } parts_of_work;
 
-/* Increments by a drift, and where they lead. */
+/* Adds a drift to the increments; X are the positions afterwards. */
 static void drift_by(double by, const double *restrict inverse_mass, const double *restrict p,
     const double *restrict dp, const double *restrict q, double *restrict dq, double *restrict X, section own)
 {
@@ -30,13 +30,13 @@ static int all_sums_finite(const run_memory *run, const parts_of_work *parts, lo
   return sum_of(&all, 0) == 0.0;
 }
 
-/* Whether the last kick of a step is at its end: its forces are those of the first of the next. */
+/* Returns 1 if the last kick is at the end of a step: its forces are those of the first kick of the next step. */
 static int ends_with_a_kick(void)
 {
   return KICK[0] != 0.0 && KICK[LEAPS - 1] != 0.0 && DRIFT[LEAPS - 1] == 0.0;
 }
 
-/* A kick of a thread's own momenta; forces that the next step begins with are kept. */
+/* Kicks the momenta of this thread; stores forces that the next step can reuse. */
 static void kick_by(const run_memory *run, const problem *given, const parts_of_work *parts, int k, section own)
 {
   const double by = run->h * KICK[k], t = run->t + KICK_ABSCISSA[k] * run->h;
@@ -51,7 +51,7 @@ static void kick_by(const run_memory *run, const problem *given, const parts_of_
     add_forces(run, given, parts->X, t, by, parts->dp);
 }
 
-/* Increments begin with what rounding cut off the state. */
+/* Performs a step. The increments start with the compensation terms of the state. */
 static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
@@ -72,7 +72,7 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   report->iterations++;
   run->error = NAN;
   if (!all_sums_finite(run, &parts, n)) {
-    run->guess = 0; /* the forces that are kept are those of no state */
+    run->guess = 0; /* the stored forces belong to no accepted state */
     return NOT_FINITE;
   }
   add_all(run->q + own.first, parts.dq + own.first, run->carry_q + own.first, (long long)size);

@@ -1,20 +1,20 @@
-/* A trial of a step of any number of coordinates. Before it: rungs.h, ladder_tables.h, indexed_step.h. */
+/* Trial of an adaptive step of an indexed system. Requires: rungs.h, ladder_tables.h, indexed_step.h. */
 #define HOT static
-#define SHORT_STEPS_FAIL 1 /* their changes are held against velocities that are hardly more than rounding */
+#define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
-/* What the trials of a step share. */
+/* Data shared by the trials of a step. */
 typedef struct {
   const problem *given;
-  long long n, guess, change; /* the last: of rungs, from the step before */
+  long long n, guess, change; /* change: of the step-size level, from the previous step */
   struct {
     double t, t_low;
   } at;
   error_limits limits;
   double t_end, error;
-  int last; /* whether the step ends at t_end */
+  int last; /* 1 if the step ends at t_end */
 } trial;
 
-/* One trial of the step that the run is at: its curve, and what that leaves unresolved; infinity without one. */
+/* Performs one trial of the next step: its curve and error estimate, infinite if it failed. */
 static void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
 {
   struct guess_tables tables = {NULL, NULL, NULL};

@@ -1,11 +1,12 @@
-/* What the mean over a lattice of F' preconditions, wave by wave: with the same springs everywhere it is diagonal in
- * Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9 (1988), 766), and ends are few. Or the diagonal of F' where
- * that does better. Before it: lattice_answers.h. */
+/* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
+ * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings are
+ * uniform and boundaries few; otherwise the diagonal of F' is used. Requires: lattice_answers.h. */
 
 enum { SPARE_VECTORS = 2 }; /* of work */
-#define COUPLED 0.1 /* of its own answer, what is worth waves */
+#define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
 
-/* The lattices and where their roots are; 0 where one cannot be transformed, or has no room for a comb. */
+/* Describes the lattices and the location of their roots of unity; returns 0 if one cannot be transformed or is too
+ * small for stencil probing. */
 static int find_lattices(const linear_system *of, lattice *all)
 {
   double *next = of->roots;
@@ -22,7 +23,7 @@ static int find_lattices(const linear_system *of, lattice *all)
   return sound;
 }
 
-/* exp(-2 pi i k / size) of all axes. */
+/* exp(-2 pi i k / size) for all axes. */
 static void find_roots(const linear_system *of, const lattice *all)
 {
   double *next = of->roots;
@@ -39,7 +40,7 @@ static void find_roots(const linear_system *of, const lattice *all)
     }
 }
 
-/* Along all axes of a lattice, from x to x; y is scratch. */
+/* Fourier transform along all axes of a lattice, in place in x; y is scratch. */
 static void transform_lattice(const linear_system *of, const lattice *one, complex_lanes *x, complex_lanes *y)
 {
   long long inner = one->components, outer = places_of(one);
@@ -50,7 +51,7 @@ static void transform_lattice(const linear_system *of, const lattice *one, compl
   }
 }
 
-/* The coordinates of a lattice that are this thread's, in Fourier space. */
+/* The Fourier modes of a lattice that belong to this thread. */
 static section waves_of(const linear_system *of, const lattice *one)
 {
   section own = share_of(of->run, places_of(one) * one->components);
@@ -58,7 +59,7 @@ static section waves_of(const linear_system *of, const lattice *one)
   return own;
 }
 
-/* Inverses, wave by wave, of the mean answers; 0 where these are nearly those of each place alone. */
+/* Computes the inverses of the Fourier modes of the mean stencil; returns 0 if couplings are negligible. */
 static int find_waves(linear_system *of, const lattice *all)
 {
   find_roots(of, all);
@@ -79,7 +80,7 @@ static int find_waves(linear_system *of, const lattice *all)
   return 1;
 }
 
-/* What the inverses make of the waves of a lattice; those of the real part are in the first arrays again. */
+/* Applies the inverses to the Fourier modes of a lattice and transforms back; the result is in the real parts. */
 static void filter_waves(const linear_system *of, const lattice *one, complex_lanes x, complex_lanes y)
 {
   const section own = waves_of(of, one);
@@ -88,7 +89,7 @@ static void filter_waves(const linear_system *of, const lattice *one, complex_la
   apply_inverses(of, x.re, x.re, own);
   apply_inverses(of, x.im, x.im, own);
   wait_for_others(of->run);
-  turned.re = x.im, turned.im = x.re; /* backwards: with real and imaginary parts exchanged */
+  turned.re = x.im, turned.im = x.re; /* inverse transform: real and imaginary parts exchanged */
   scratch.re = y.im, scratch.im = y.re;
   transform_lattice(of, one, &turned, &scratch);
 }
@@ -110,7 +111,7 @@ static void precondition(const linear_system *of, const lanes *x, lanes *y)
   }
 }
 
-/* At the first of the points that a step is sought from waves, where places are coupled. */
+/* Computes the preconditioner, at the first points of a step the Fourier one if coordinates are coupled. */
 static void find_inverses(linear_system *of)
 {
   lattice all[LATTICES];
@@ -124,7 +125,8 @@ static void find_inverses(linear_system *of)
     find_own_inverses(of);
 }
 
-/* After a cycle that left such a part: where waves did not suffice the diagonal is given one, then the better stays. */
+/* Called with the reduction of the residual by a cycle: if the Fourier preconditioner did not suffice, tries the
+ * diagonal for one cycle, then keeps the better one. */
 static void reconsider(linear_system *of, double left)
 {
   if (of->tried == 0 && of->by_waves) {

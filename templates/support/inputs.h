@@ -1,11 +1,12 @@
-/* Inputs: functions of time that are data. A run ends a step at their breakpoints and goes on with the parameters of
- * the next pieces. Before it: step.h, and INPUT_PLACE, where the parameters of each begin. */
+/* Inputs: piecewise polynomials of time. A run ends a step at their breakpoints and continues with the parameters of
+ * the next pieces. Requires: step.h, and INPUT_PLACE, the indices of the parameters of each input. */
 
-#define NO_STEP (sizeof(real) < sizeof(double) ? 1e-3 : 1e-9) /* of a step: what is left that is not worth one */
+#define NO_STEP (sizeof(real) < sizeof(double) ? 1e-3 : 1e-9) /* relative to a step: a shorter remaining interval needs
+                                                               * no step */
 
 typedef NAME(input) input_data;
 
-/* The piece in which t lies; the search begins where the last one ended, next to it as time goes on. */
+/* Index of the piece that contains t; the search begins at the last one. */
 static int piece_at(const input_data *input, real t)
 {
   int k = input->piece;
@@ -16,7 +17,7 @@ static int piece_at(const input_data *input, real t)
   return k;
 }
 
-/* The first breakpoint of an input between a time and an end that is farther than slack; the end if there is none. */
+/* First breakpoint of an input between t and end that is farther than slack; end if there is none. */
 static real breakpoint_before(const input_data *input, real t, real end, real slack)
 {
   const int way = end < t ? -1 : 1;

@@ -1,5 +1,5 @@
-/* Integrals along the step that was solved, by sweeps or by Newton's iteration, which leaves no guess but its unknowns.
- * Before it: integrals_of_sweep, integrals_along, newton.h. */
+/* Integrals along a step solved by fixed-point iteration, or by Newton's method, which leaves guess = 0 and its
+ * unknowns in the workspace. Requires: integrals_of_sweep, integrals_along, newton.h. */
 static void integrals(const step_data *step, const solver_data *data, const double *memory, long long guess,
     double *workspace, double *sum)
 {

@@ -1,4 +1,4 @@
-/* Integrals along the step that was solved. Before it: integrals_along. */
+/* Integrals along a step solved by Newton's method. Requires: integrals_along. */
 static void integrals(const step_data *step, const solver_data *data, const real *memory, long long guess,
     real *workspace, real *sum)
 {

@@ -1,4 +1,4 @@
-/* Integrals along the step that was solved. Before it: integrals_of_sweep. */
+/* Integrals along a step solved by fixed-point iteration. Requires: integrals_of_sweep. */
 static void integrals(const step_data *step, const solver_data *data, const double *memory, long long guess,
     double *workspace, double *sum)
 {

@@ -1,4 +1,4 @@
-/* The initial velocity of a curve is that of p0. Before it: HAMILTONIAN, whether a Hamiltonian is given. */
+/* Initial velocity of a curve from p0. Requires: HAMILTONIAN, 1 for Hamiltonian systems. */
 static int nearby_velocity(const step_data *step, double *v0)
 {
   double u[2 * M];

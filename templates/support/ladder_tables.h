@@ -1,13 +1,13 @@
-/* Which tables continue former steps into one of another length. Before it: LADDER_ALONE, LADDER_LAST, LADDER_BEFORE.
+/* Predictor tables for steps of different sizes. Requires: LADDER_ALONE, LADDER_LAST, LADDER_BEFORE.
  *
- * Steps are roots of 2 to the power of a rung, so that a guess continues the curve of former steps by one of few
- * tables: from the last step, for each change of rung into the next; from the last two, for each pair of changes. */
+ * Step sizes are roots of 2 to the power of a level, so that few tables extrapolate the curve of former steps: from the
+ * last step, one for each change of level; from the last two, one for each pair of changes. */
 enum {
   CHANGES = sizeof LADDER_ALONE / sizeof *LADDER_ALONE,
   REACH = CHANGES / 2
 };
 
-/* The tables that continue the steps before into the next; whether there are any. */
+/* Selects the tables for the next step; returns 0 if there are none. */
 static inline int choose_tables(const run_memory *run, struct guess_tables *tables)
 {
   const long long last = run->change_before + REACH, next = run->change + REACH;

@@ -1,16 +1,17 @@
-/* How a lattice answers where one place is moved, in the mean over places. Those of a comb are moved at a time, so far
- * apart that no two answers meet, and none goes around. Before it: lattice_transform.h, describe_lattices; FARTHEST,
- * how far an answer goes on an axis, and COMPONENTS, of all lattices. */
+/* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
+ * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
+ * describe_lattices; FARTHEST, the stencil radius on an axis, and COMPONENTS, the number of components of all
+ * lattices. */
 
 enum { SPACING = 2 * FARTHEST + 1 };
 
-/* On each axis places from the first on, so many, so far apart. */
+/* Probes: on each axis the first index, their distance and number. */
 typedef struct {
   const lattice *one;
   long long first[AXES], apart[AXES], count[AXES], component, all;
 } comb;
 
-/* That of a component, the so-manieth of all. */
+/* Probes of a component, which is number `turn` of all. */
 static comb comb_of(const lattice *one, long long component, long long turn)
 {
   comb of = {.one = one, .component = component, .all = 1};
@@ -24,7 +25,8 @@ static comb comb_of(const lattice *one, long long component, long long turn)
   return of;
 }
 
-/* Around tooth k of a comb a coordinate, the so-manieth of a box; and where that of the first place would stand. */
+/* Coordinate number `turn` of the box around probe k, and the corresponding coordinate in the stencil of the first
+ * place. */
 static long long beside_tooth(const comb *of, long long k, long long turn, long long *beside_first)
 {
   long long place = 0, around = 0, apart = of->one->components;
@@ -38,7 +40,7 @@ static long long beside_tooth(const comb *of, long long k, long long turn, long 
   return of->one->first + of->component + place;
 }
 
-/* How many coordinates an answer may reach; the tooth itself is in the middle of the box. */
+/* Number of coordinates in a stencil box, in the middle of which is the probe. */
 static long long box_of(const lattice *one)
 {
   long long size = 1;
@@ -47,7 +49,7 @@ static long long box_of(const lattice *one)
   return size;
 }
 
-/* 1 at the teeth, which are not many. */
+/* Sets x to 1 at the probes. */
 static void move_teeth(const linear_system *of, const comb *teeth, lanes *x)
 {
   const long long middle = box_of(teeth->one) / 2;
@@ -59,7 +61,7 @@ static void move_teeth(const linear_system *of, const comb *teeth, lanes *x)
   }
 }
 
-/* The mean answer, h^2 F' / m, to the first place of the lattice alone. */
+/* Averages the responses h^2 F' / m of the probes into the stencil of the first place of the lattice. */
 static void find_mean(const linear_system *of, const comb *teeth, const lanes *answer, lanes *mean)
 {
   for (long long b = box_of(teeth->one) - 1; b >= 0; b--) {
@@ -72,7 +74,7 @@ static void find_mean(const linear_system *of, const comb *teeth, const lanes *a
   }
 }
 
-/* The mean answers of all lattices in `mean`; x is overwritten. */
+/* Computes the mean stencils of all lattices in `mean`; x is overwritten. */
 static void find_answers(linear_system *of, const lattice *all, lanes *x, lanes *mean)
 {
   const section own = share_of(of->run, COMPONENTS);
@@ -92,12 +94,12 @@ static void find_answers(linear_system *of, const lattice *all, lanes *x, lanes 
           find_mean(of, &teeth, of->forces, mean);
       }
     if (asked)
-      products(of->run, of->given, of->X, x, of->forces, of->n); /* which waits for others first */
+      products(of->run, of->given, of->X, x, of->forces, of->n); /* begins with a barrier */
   }
   wait_for_others(of->run);
 }
 
-/* What answers elsewhere, as a part of what does at the place that is moved: the largest of all components. */
+/* Ratio of the off-diagonal part of the stencil to its diagonal: the largest of all components. */
 static double largest_part_elsewhere(const linear_system *of, const lattice *all, const lanes *mean)
 {
   double largest = 0.0;

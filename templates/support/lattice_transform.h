@@ -1,26 +1,26 @@
-/* Discrete Fourier transforms along the axes of lattices, at all points of a step, by as many passes as a size has
- * factors, each from one array into another (Stockham's arrangement; C. Van Loan, Computational Frameworks for the Fast
- * Fourier Transform, 1992, section 1.7). Before it: indexed_newton.h. */
+/* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
+ * each from one array into another (Stockham autosort; C. Van Loan, Computational Frameworks for the Fast Fourier
+ * Transform, 1992, section 1.7). Requires: indexed_newton.h. */
 
-enum { LARGEST_FACTOR = 499 }; /* of sizes that are transformed: a pass costs as many products a place */
+enum { LARGEST_FACTOR = 499 }; /* of a size that is transformed: a pass costs as many products per element */
 
-/* The real and the imaginary parts of all coordinates. */
+/* Real and imaginary parts of all coordinates. */
 typedef struct {
   lanes *re, *im;
 } complex_lanes;
 
-/* exp(-2 pi i k / size), k = 0 .. size - 1, the real and the imaginary parts. */
+/* exp(-2 pi i k / size), k = 0 .. size - 1, real and imaginary parts. */
 typedef struct {
   const double *cosine, *sine;
 } roots;
 
-/* An axis of a lattice: `outer` times lines of `size` places, each of them `inner` numbers. */
+/* An axis of a lattice: `outer` lines of `size` places with `inner` numbers each. */
 typedef struct {
   long long first, outer, size, inner;
   roots of_one;
 } axis;
 
-/* A pass: of `left` places of a line not yet transformed, each of `done` numbers, every so-manieth together. */
+/* A pass: `left` places of a line are not yet transformed, each of `done` numbers; `factor` of them are combined. */
 typedef struct {
   const axis *along;
   long long left, done;
@@ -42,7 +42,7 @@ static int can_be_transformed(long long size)
   return size == 1;
 }
 
-/* Four numbers x to y, times the roots k, 2 k, 3 k. */
+/* Radix-4 butterfly from x to y with the twiddle factors k, 2 k, 3 k. */
 static inline void four_to_four(complex_lanes x, complex_lanes y, long long apart, long long next, const roots *of_one,
     long long k)
 {
@@ -59,7 +59,7 @@ static inline void four_to_four(complex_lanes x, complex_lanes y, long long apar
   }
 }
 
-/* The same of any number. */
+/* Butterfly of any radix. */
 static inline void some_to_some(complex_lanes x, complex_lanes y, long long apart, long long next, const pass *now,
     long long k)
 {
@@ -78,7 +78,7 @@ static inline void some_to_some(complex_lanes x, complex_lanes y, long long apar
   }
 }
 
-/* Numbers from `begin` to `end` of a place, of a group. */
+/* Transforms the numbers of a section of a place, for one group. */
 static void transform_places(const pass *now, complex_lanes x, complex_lanes y, long long place, section here)
 {
   const long long together = now->left / now->factor, apart = together * now->done;
@@ -93,7 +93,7 @@ static void transform_places(const pass *now, complex_lanes x, complex_lanes y, 
   }
 }
 
-/* A pass from x to y; of every thread its own part. */
+/* Performs this thread's part of a pass from x to y. */
 static void make_pass(const run_memory *run, const pass *now, complex_lanes x, complex_lanes y, long long n)
 {
   const axis *along = now->along;
@@ -121,7 +121,7 @@ static inline void exchange(complex_lanes *x, complex_lanes *y)
   *y = kept;
 }
 
-/* Transforms x along an axis; it then is in x, whose memory may be that of y. */
+/* Transforms x along an axis; the result is in x, which may be exchanged with y. */
 static void transform(const run_memory *run, const axis *along, complex_lanes *x, complex_lanes *y, long long n)
 {
   pass now = {along, along->size, along->inner, 1};
@@ -134,7 +134,7 @@ static void transform(const run_memory *run, const axis *along, complex_lanes *x
   }
 }
 
-/* An array whose first axes are those of a lattice, so many numbers a place. */
+/* An array whose first axes are those of a lattice, with `components` numbers per place. */
 typedef struct {
   long long first, components, size[AXES];
   int axes;

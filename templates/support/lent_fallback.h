@@ -1,4 +1,4 @@
-/* Newton's iteration for a library without it. Before it: newton_fallback.h, LENT_WORKSPACE. */
+/* Newton solver for a library without it (see fallback.h). Requires: newton_fallback.h, LENT_WORKSPACE. */
 #include <stdlib.h>
 
 static SELDOM int lent_step(const step_data *step, double *dq, double *dp, const solver_options *options,

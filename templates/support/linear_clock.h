@@ -1,8 +1,9 @@
-/* Time is an integral along the curve, the sum that the weights of the first points give. Before it: linearised.h,
- * INTEGRAL_WEIGHT, RATE_ENTRY, RATE_SLOPES, the kernels rate_slopes and level_slopes. */
+/* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first
+ * points. Requires: linearised.h, INTEGRAL_WEIGHT, RATE_ENTRY, RATE_SLOPES, the kernels rate_slopes and
+ * level_slopes. */
 
-/* How the time at the end depends on that at the start, on q0, parameters and h, and on unknowns; back: the transpose.
- */
+/* Derivative of the time at the end with respect to that at the start, q0, parameters, h and the unknowns; back: its
+ * transpose. */
 static void end_time(const linearised_step *at, int back)
 {
   const step_data *step = at->step;

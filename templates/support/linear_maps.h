@@ -1,5 +1,6 @@
-/* Changes of what a step starts from, of its unknowns, of what stands at points, of rows; the linear maps between
- * them, and their transposes. Before it: real, M, B, GIVEN, WIDTH, band.h, stages.h; where DAMPED, damping.h. */
+/* Linear maps between tangent vectors of the inputs of a step, of its unknowns, of the arguments and results of kernels
+ * at points, and of the rows of its equations; and their transposes. Requires: real, M, B, GIVEN, WIDTH, band.h,
+ * stages.h; if DAMPED, damping.h. */
 
 #ifdef DAMPED
 #define GROWN(weight, growth, abscissa) ((weight) * MATH(exp)((growth) * (abscissa)))
@@ -7,12 +8,12 @@
 #define GROWN(weight, growth, abscissa) ((void)(growth), (weight))
 #endif
 
-/* WIDTH changes at a time. */
+/* WIDTH vectors at a time. */
 typedef struct {
   real lane[WIDTH];
 } wide;
 
-/* y += factor x, another; or back: x += factor y. */
+/* y += factor x; back: the transpose, x += factor y. */
 static inline void flow(int back, wide *y, real factor, wide *x)
 {
   real *restrict to = back ? x->lane : y->lane;
@@ -21,14 +22,14 @@ static inline void flow(int back, wide *y, real factor, wide *x)
     to[j] += factor * from[j];
 }
 
-/* Sums between unknowns, or rows, and what stands at points from `offset` on: for so many sites from the first, times
- * h^power. */
+/* Sums from unknowns to points, or from points to rows, at points from `offset` on: for `sites` sites from the first,
+ * times h^power. */
 typedef struct {
   const real *table;
   int first, sites, offset, power, from_state;
 } linear_loop;
 
-/* Slopes from the first on: of the result `to` places on by the argument `from` places on. */
+/* Derivatives from number `first` on: of the result at offset `to` with respect to the argument at offset `from`. */
 typedef struct {
   const int (*pair)[2];
   int count, first, to, from;
@@ -37,9 +38,10 @@ typedef struct {
 typedef void slope_kernel(const real *u, real t, const real *parameters, real *value, real *slope);
 typedef void value_kernel(const real *u, real t, const real *parameters, real *value);
 
-/* Points of one kind: how many there are of everything; where arguments come from, where results go; the kernel with
- * its slopes by the arguments, and, given ones, by parameters and time: {i, j}, j from the first parameter on; how all
- * of these change, where results are not linear and it is asked for. */
+/* Stage group: points with the same kernel. Numbers of points, arguments, results and derivatives; sources of arguments
+ * and destinations of results; the kernel with derivatives with respect to the arguments, and `by_given`, with respect
+ * to parameters and time: {i, j}, j from the first parameter on; second derivatives, if results are not linear and they
+ * are requested. */
 typedef struct {
   int points, arguments, results, slopes, given, gathers, scatters, blocks;
   const linear_loop *gather, *scatter;
@@ -59,7 +61,7 @@ static real power_of(real h, int k)
   return k < 0 ? 1 / product : product;
 }
 
-/* The arguments at each point. */
+/* Arguments at each point. */
 static void arguments_of(const point_family *f, const step_data *step, const real *z, real *at)
 {
   for (int g = 0; g < f->gathers; g++) {
@@ -76,7 +78,8 @@ static real time_of(const point_family *f, const step_data *step, int n)
   return step->t + (f->abscissa ? f->abscissa[n] * step->h : 0);
 }
 
-/* Where the slopes of a family end: behind those by what is given there are, where DAMPED, those by gamma h. */
+/* End of the derivatives of a stage group; if DAMPED, those with respect to gamma h follow those with respect to
+ * inputs. */
 static inline long long end_of_slopes(const point_family *f)
 {
   const long long each = f->arguments + f->results + f->slopes + f->given;
@@ -87,8 +90,8 @@ static inline long long end_of_slopes(const point_family *f)
 #endif
 }
 
-/* At each point: by h, unknowns held, the slopes of arguments and of what results are multiplied by; those of results
- * by arguments; those by parameters and time; by gamma h. Returns where they end. */
+/* Computes at each point, with fixed unknowns: derivatives with respect to h of the arguments and of the factors of the
+ * results; of the results with respect to the arguments; to parameters and time; to gamma h. Returns their end. */
 static real *slopes_of(const point_family *f, const step_data *step, const real *z, real *by_h)
 {
   const real h = step->h;
@@ -168,7 +171,7 @@ static void multiply_wide(const point_family *f, int back, const real *slope, wi
             u + n * f->arguments + f->block[k].from + f->block[k].pair[e][1]);
 }
 
-/* From results to rows, those before the first left out. */
+/* From results to rows, from row `first` of each site on. */
 static void scatter_wide(const point_family *f, real h, real growth, int back, int first, wide *value, wide *rows)
 {
   for (int s = 0; s < f->scatters; s++) {
@@ -183,7 +186,7 @@ static void scatter_wide(const point_family *f, real h, real growth, int back, i
   }
 }
 
-/* From what v and dz say, those of them that are there, to arguments. */
+/* From v and dz, where they are not NULL, to arguments. */
 static void arguments_wide(const point_family *f, real h, int back, const real *by_h, wide *v, wide *dz, wide *u)
 {
   if (v)
@@ -192,14 +195,14 @@ static void arguments_wide(const point_family *f, real h, int back, const real *
     gather_wide(f, h, back, dz, u);
 }
 
-/* What a step is made with beside its slopes: h; where DAMPED, gamma h and its changes. */
+/* Step data besides the derivatives: h; if DAMPED, gamma h and its variations. */
 typedef struct {
   real h, growth;
   wide *grown;
 } step_change;
 
-/* From v to all rows, or from dz to the last ones, by way of the points of a family; back: from these to those. Returns
- * where its slopes end. */
+/* From v to all rows, or from dz to the last ones, through the points of a stage group; back: the transpose. Returns
+ * the end of its derivatives. */
 static const real *through_family(const point_family *f, const step_change *by, int back, const real *slopes,
     wide *points, wide *v, wide *dz, wide *rows)
 {
@@ -231,7 +234,7 @@ static void exchange_wide(wide *a, wide *b)
   *b = kept;
 }
 
-/* The multiples of rows that made column k of the factors, of rows below it, or back; see eliminate. */
+/* Subtracts multiples of row k in the forward substitution with the factors, or its transpose; see eliminate. */
 static void lower_wide(const real *a, const band *shape, const real *pivot, int k, int back, wide *x)
 {
   const real *column = a + shape->first + k * shape->stride;
@@ -243,7 +246,7 @@ static void lower_wide(const real *a, const band *shape, const real *pivot, int 
     exchange_wide(x + k, x + (int)pivot[k]);
 }
 
-/* Unknown k, known from those behind it, taken from those before it; or back. */
+/* Eliminates unknown k in the back substitution, or its transpose. */
 static void upper_wide(const real *a, const band *shape, int k, int back, wide *x)
 {
   const real *column = a + shape->first + k * shape->stride;
@@ -255,7 +258,7 @@ static void upper_wide(const real *a, const band *shape, int k, int back, wide *
     x[k].lane[j] *= column[k];
 }
 
-/* x = a^-1 x with the factors of a, or back: of its transpose. */
+/* x = a^-1 x with the factors of a; back: with the transpose of a. */
 static void solve_wide(const real *a, const band *shape, const real *pivot, int back, wide *x)
 {
   for (int k = 0; k < shape->rows; k++)

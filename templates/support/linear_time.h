@@ -1,6 +1,6 @@
-/* Time goes on by h. Before it: linearised.h. */
+/* Linearised time without time transformation: t + h. Requires: linearised.h. */
 
-/* How the time at the end depends on that at the start and on h; back: the transpose. */
+/* Derivative of the time at the end with respect to that at the start and h; back: its transpose. */
 static void end_time(const linearised_step *at, int back)
 {
   flow(back, at->v + GIVEN_H - 1, 1, at->v + GIVEN_H);

@@ -1,4 +1,4 @@
-/* Vectors over all points of all coordinates, of every thread its own part. Before it: indexed_newton.h. */
+/* Vectors over all points of all coordinates; every thread computes its own part. Requires: indexed_newton.h. */
 
 static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
 {
@@ -22,7 +22,7 @@ static double inner_product(const linear_system *of, const lanes *x, const lanes
   return sum_of(&all, 0);
 }
 
-/* y += by x; of every thread its own coordinates. */
+/* y += by x, for the coordinates of this thread. */
 static void add_multiple(const linear_system *of, lanes *restrict y, double by, const lanes *restrict x)
 {
   for (int g = 0; g < GROUPS; g++)
@@ -30,7 +30,7 @@ static void add_multiple(const linear_system *of, lanes *restrict y, double by, 
       y[i] += by * x[i];
 }
 
-/* x = by y. */
+/* x = by y, for the coordinates of this thread. */
 static void scale(const linear_system *of, lanes *x, double by, const lanes *y)
 {
   for (int g = 0; g < GROUPS; g++)

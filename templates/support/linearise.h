@@ -1,4 +1,5 @@
-/* Vectors over chains of steps, forward or back. Before it: carry_steps, which carries them over STEPS_AT_ONCE. */
+/* Tangent or adjoint vectors over a sequence of steps, forward or backward. On failure report->t is the time of the
+ * failed step. Requires: carry_steps, which propagates them over at most STEPS_AT_ONCE steps. */
 int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)

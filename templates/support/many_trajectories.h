@@ -1,20 +1,20 @@
-/* Sweeps of many trajectories: what is kept of their last steps, and when a step is done. Before it: trajectories.h,
- * contraction.h, and the tables LAST_ALONE, LAST, BEFORE, which continue what was kept into the next step. A step fails
- * for single trajectories, which become inactive, never for all. */
+/* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
+ * trajectories, which become inactive, never for all. Requires: trajectories.h, contraction.h, and the tables
+ * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
 
-/* What is kept at the points, of the last step and of the one before, in whose place the next comes. */
+/* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
 typedef struct {
   lanes (*last)[M], (*before)[M];
 } history;
 
-/* Where to compute what is to be kept. */
+/* Memory for the values to be stored. */
 static inline coordinates *kept(history past, coordinates *own)
 {
   (void)own;
   return past.before;
 }
 
-/* What is kept at the points, continued into this step from the last one or from the last two. */
+/* Extrapolates the stored values into this step from the last one or from the last two. */
 static inline void continue_curve(const step_data *step, history past, long long steps, lanes (*x)[M])
 {
   (void)step;
@@ -29,17 +29,17 @@ static inline void continue_curve(const step_data *step, history past, long long
 
 static inline void remember_curve(lanes (*x)[M], history past)
 {
-  (void)x, (void)past; /* it is there already */
+  (void)x, (void)past; /* computed in place (kept) */
 }
 
-/* The velocities of a motion on a straight line, which are there before the first step. */
+/* Velocities of the straight line; they are stored before the first step. */
 static inline int start_velocities(const step_data *step, lanes (*z)[M])
 {
   (void)step, (void)z;
   return OK;
 }
 
-/* How the sweeps of a step come on. */
+/* Progress of the iteration of a step. */
 typedef struct {
   lanes first, last, before;
   int pending;
@@ -56,11 +56,11 @@ static inline int needs_sweep(const progress *now)
   return now->pending;
 }
 
-/* Trajectories that contract too slowly or left the domain become inactive. */
+/* Trajectories that converge too slowly or left the domain become inactive. */
 static inline void take_change(progress *now, lanes change, const solver_options *options, int k, solver_report *report)
 {
   const lane_view after = {change}, last = {now->last}, before = {now->before};
-  const solver_options wanted = *options; /* where nothing that is written can be meant */
+  const solver_options wanted = *options; /* a copy, which cannot alias what is written */
   double *active = report->active;
   int pending = 0;
   for (int j = 0; j < LANES; j++) {
@@ -75,7 +75,7 @@ static inline void take_change(progress *now, lanes change, const solver_options
   report->sweeps++;
 }
 
-/* Single trajectories whose sweeps shrink no longer are left to the sweeps of one. */
+/* Trajectories whose iteration stagnates are left to the solver of single trajectories. */
 static inline int stirs(const progress *now, const solver_options *options, int k)
 {
   (void)now, (void)options, (void)k;

@@ -1,13 +1,14 @@
-/* Newton's iteration on the stage equations. Before it: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT,
- * MOMENTA and MOVES, and evaluate, which gives the equations and their Jacobian; where DAMPED, damping.h. */
+/* Newton's method for the stage equations, with reuse of the Jacobian's factors (simplified Newton; Hairer & Wanner,
+ * Solving ODEs II, sec. IV.8). Requires: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT, MOMENTA and MOVES,
+ * and evaluate, which computes the equations and their Jacobian; if DAMPED, damping.h. */
 
-#define STOPPED_SHRINKING REAL(0.25) /* Newton's updates shrink to their squares: what shrinks by less is rounding */
-#define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* what is left of positions that a force has stiffly settled */
-#define STALLS (SITES > M ? 2 : 1) /* with kept factors positions and multipliers settle one after the other */
-#define KEEP_CHANGE REAL(1e-2) /* factors are kept while updates are below this part of the state */
-#define KEEP_RATE REAL(0.1) /* and shrink at least tenfold: then a further iteration costs less than new factors */
+#define STOPPED_SHRINKING REAL(0.25) /* Newton updates converge quadratically: one that decreases by less is rounding */
+#define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* rounding error of positions that a stiff force determines */
+#define STALLS (SITES > M ? 2 : 1) /* with frozen factors positions and multipliers converge one after the other */
+#define KEEP_CHANGE REAL(1e-2) /* factors are reused while updates are below this part of the state */
+#define KEEP_RATE REAL(0.1) /* and decrease at least tenfold: then another iteration costs less than new factors */
 
-/* How far the last update moved the stages and the end momentum: the largest ratio to its own size, the ratio of the
+/* Change of the stages and the end momentum by the last update: the largest ratio to the own size, the ratio of the
  * largest to the largest size, and the largest itself. */
 typedef struct {
   real relative, overall, absolute, stages; /* stages: overall, of the positions of the stages alone */
@@ -33,8 +34,8 @@ static void measure(movement *moved, const real *change, const real *size)
   moved->absolute = larger(moved->absolute, largest_change);
 }
 
-/* What Newton's iteration works with: unknowns; rows and their update; pivots and factors of the Jacobian. Where
- * factors go from step to step (POINT > 0), they were made at point: t, q0 with what rounding cut off, unknowns. */
+/* Memory of Newton's method: unknowns; rows and their update; pivots and factors of the Jacobian. If factors are reused
+ * in later steps (POINT > 0), `point` is where they were computed: t, q0 with its compensation, unknowns. */
 typedef struct {
   real *z, *point, *rows, *update, *pivot, *factors;
 } newton_data;
@@ -51,7 +52,7 @@ static newton_data newton_in(real *workspace)
   return data;
 }
 
-/* The stages of a motion on a straight line with velocity v and momentum p0; other unknowns are 0. */
+/* Stages of a straight line with velocity v and momentum p0; other unknowns are 0. */
 static void place_on_line(const real *v, const real *p0, real *z)
 {
   memset(z + M * B, 0, sizeof(real) * (N - M * B));
@@ -60,7 +61,7 @@ static void place_on_line(const real *v, const real *p0, real *z)
       z[i * B + b] = STRAIGHT[b] * v[i] + MOMENTA[b] * p0[i];
 }
 
-/* z -= update, the solution with the factors at hand; p0 likewise, if it is not NULL. Measures the update. */
+/* z -= update, the solution with the current factors; p0 likewise, if it is not NULL. Measures the update. */
 static void apply_update(const newton_data *data, const band *shape, real h, real *p0, const real *size_p,
     const real *size_q, movement *moved)
 {
@@ -87,17 +88,17 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
     measure(moved, change, size_p);
 }
 
-/* Whether an update at round-off level shrinks no longer. A stiff force makes of the rounding of positions much more in
- * the momenta: there positions alone are at round-off, and momenta are known no better. */
+/* Returns 1 if an update at round-off level no longer decreases. A stiff force amplifies the rounding of positions in
+ * the momenta: then only the positions are at round-off, and the momenta cannot be computed more accurately. */
 static int has_stalled(const movement *moved, real last)
 {
   return moved->relative >= STOPPED_SHRINKING * last &&
       (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
 }
 
-/* Whether the iterate that `moved` led to is accepted: its update is below the tolerance, or has stalled at round-off
- * level. Kept factors shrink updates only so fast: they must have done so once, and twice to tell round-off from slow
- * progress. */
+/* Returns 1 if the iterate that `moved` led to is accepted: its update is below the tolerance, or has stalled at
+ * round-off level. With frozen factors convergence is linear: one decrease is required, and two to distinguish
+ * round-off from slow convergence. */
 static int has_converged(const solver_options *options, const movement *moved, int stalls, int trials)
 {
   if (trials < 2)
@@ -109,7 +110,7 @@ static int has_converged(const solver_options *options, const movement *moved, i
   return trials > 2 && stalls >= STALLS;
 }
 
-/* In place of p1 - p0 the row q0 + h sum_b beta_b z_b = q1, with p0 as further unknown. */
+/* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
 static void add_boundary(const step_data *step, const newton_data *data, const real *q1, int with_jacobian,
     const band *shape)
 {
@@ -128,7 +129,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const r
   }
 }
 
-/* Factors of the Jacobian just evaluated; remembers where. Returns 0 if it is singular. */
+/* Factorises the Jacobian and stores where it was evaluated. Returns 0 if it is singular. */
 static int linearise(const step_data *step, const newton_data *data, const band *shape)
 {
   if (POINT > 0) {
@@ -140,9 +141,9 @@ static int linearise(const step_data *step, const newton_data *data, const band 
   return factorise(data->factors, shape, data->pivot);
 }
 
-/* Newton's iteration on the stage equations from the guess in z; on success z and p1 - p0 belong together. The factors,
- * of an earlier step if *keep, serve as long as updates are small and shrink fast. With an end position q1, p0 is
- * unknown too and found in place. */
+/* Solves the stage equations from the initial guess in z; on success z and the increment p1 - p0 are consistent, on
+ * failure they are undefined. The factors, of an earlier step if *keep, are reused as long as updates are small and
+ * decrease fast. With an end position q1, p0 is unknown, too, and solved for in place. */
 static int newton(const step_data *step, const newton_data *data, const real *q1, real *p0, real *increment, int *keep,
     const solver_options *options, solver_report *report)
 {

@@ -1,4 +1,4 @@
-/* The largest error of the curves that Newton's iteration found. Before it: stage_error.h. */
+/* Largest error estimate of steps by Newton's method. Requires: stage_error.h. */
 static real largest_error(const run_memory *run, const step_data *step, const solver_data *data, const real *dq,
     real *workspace)
 {

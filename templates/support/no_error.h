@@ -1,4 +1,4 @@
-/* Of methods without a curve that tells its error. */
+/* Error estimate of methods without a curve: none. */
 static int observe_error(run_memory *run, step_data *step, const solver_data *data, const real *dq, const real *dp,
     const solver_options *options, real *workspace)
 {

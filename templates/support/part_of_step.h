@@ -1,7 +1,8 @@
-/* The part of a step that lasts as long as is wanted. Before it: run.h, clock.h. */
+/* Part of a step in tau that ends at a given time: x with duration(x h) = end - t, by Newton's method safeguarded by
+ * bisection. Returns the status of a failed step, or NOT_CONVERGED. Requires: run.h, clock.h. */
 
 #define MOST_TRIALS 60 /* bisection alone takes as many as a number has bits: 53 */
-#define SMALLEST_MISS (4 * REAL_EPSILON) /* of the times at hand */
+#define SMALLEST_MISS (4 * REAL_EPSILON) /* relative to the times */
 
 int NAME(part_of_step)(real t, real h, real end, const real *q0, const real *p0, const real *parameters,
     const solver_options *options, real *q1, real *p1, real *part, solver_report *report, real *workspace)

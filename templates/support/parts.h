@@ -1,4 +1,4 @@
-/* Parts of large kernels stay functions of their own: compilers take ever longer over ever longer ones. */
+/* Parts of large kernels that must not be inlined: compile times grow faster than the length of a function. */
 #ifdef __GNUC__
 #define SCVI_NOINLINE __attribute__((noinline))
 #else

@@ -1,7 +1,7 @@
-/* Where forces and momenta are asked for. Before it: points.h or trajectories.h, the tables; PROJECTED where the
- * unknowns are not the velocities at the points. */
+/* Arguments of forces and momenta. Requires: points.h or trajectories.h, the tables; PROJECTED if the unknowns are not
+ * the velocities at the points. */
 
-/* Positions and velocities at point n of the curve that z gives. */
+/* Positions and velocities at point n of the curve with coefficients z. */
 static inline void place(const step_data *step, int n, lanes (*scaled)[M], lanes (*z)[M], lanes *u)
 {
   for (int i = 0; i < M; i++) {

@@ -1,5 +1,4 @@
-/* What the steps of a run share where velocities and forces at points are summed. Before it: the tables; where momenta
- * shrink, damped_points.h. */
+/* Quadrature weights times h, constant during a run. Requires: the tables; with damping, damped_points.h. */
 typedef struct {
   weight position_weight[GROUPS], momentum_weight[GROUPS]; /* h beta, h w: the same rounded numbers everywhere */
 #ifdef DAMPED
@@ -18,7 +17,7 @@ static void prepare_sweep(const step_data *step, sweep_data *data)
 #endif
 }
 
-/* h times the weights, times what is at the points. */
+/* Values at the points times the weights. */
 static inline void scale(const weight *weights, lanes (*x)[M], lanes (*scaled)[M])
 {
   for (int n = 0; n < GROUPS; n++)

@@ -1,6 +1,6 @@
-/* The derivative of steps, and its transpose, exact: those of the map which the solved equations define. Before it:
- * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the points at which kernels are evaluated; linearised.h;
- * where DAMPED, growth_wide, from what is given to gamma h; end_time, how the time at the end depends on all. */
+/* Derivative of a step (JVP) and its transpose (VJP) by implicit differentiation of the stage equations. Requires:
+ * newton_from_line.h, strays.h, linear_maps.h, and FAMILIES, the stage groups; linearised.h; if DAMPED, growth_wide,
+ * from inputs to gamma h; end_time, the derivative of the time at the end. */
 
 static linearised_step linearised_in(const step_data *step, real *workspace)
 {
@@ -24,7 +24,7 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   return at;
 }
 
-/* The step solved, as where sweeps fail, its equations factorised, its slopes evaluated. */
+/* Solves the step as the fallback does, factorises its equations and evaluates the derivatives at the points. */
 static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1,
     solver_report *report)
 {
@@ -51,7 +51,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
   return OK;
 }
 
-/* From v (or where back: to it) to all rows, or from dz to the last one, that of p1, by way of all points. */
+/* From v (back: to it) to all rows, or from dz to the last one, that of p1, through all points. */
 static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
 {
   const step_change by = {at->step->h, at->growth, at->grown};
@@ -60,7 +60,7 @@ static void through_points(const linearised_step *at, int back, wide *v, wide *d
     slopes = through_family(FAMILIES + f, &by, back, slopes, at->points, v, dz, at->rows);
 }
 
-/* dz = -(matrix)^-1 rows, the last row of each site left out. */
+/* dz = -(matrix)^-1 rows, without the last row of each site. */
 static void solve_forward(const linearised_step *at)
 {
   for (int i = 0; i < N; i++)
@@ -82,7 +82,7 @@ static void solve_back(const linearised_step *at)
     at->rows[i / B * (B + 1) + i % B] = at->x[PLACE[i / B] * B + i % B];
 }
 
-/* How q1 depends on q0, on unknowns and on h. */
+/* Derivative of q1 with respect to q0, unknowns and h. */
 static void end_position(const linearised_step *at, int back)
 {
   const real h = at->step->h, *z = at->data.z;
@@ -93,7 +93,7 @@ static void end_position(const linearised_step *at, int back)
     }
 }
 
-/* How rows depend on p0. */
+/* Derivative of the rows with respect to p0. */
 static void momentum_rows(const linearised_step *at, int back)
 {
   for (int i = 0; i < M; i++)
@@ -101,7 +101,7 @@ static void momentum_rows(const linearised_step *at, int back)
       flow(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
 }
 
-/* How p1 depends on p0, on the rows that say by what it grows, and on damping, which shrinks it. */
+/* Derivative of p1 with respect to p0, the rows of its increment, and damping. */
 static void end_momentum(const linearised_step *at, int back)
 {
 #ifdef DAMPED
@@ -124,7 +124,7 @@ static void end_momentum(const linearised_step *at, int back)
   }
 }
 
-/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+/* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
 static void push_step(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
@@ -141,8 +141,8 @@ static void push_step(const linearised_step *at)
   end_momentum(at, 0);
 }
 
-/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): its transpose. In dz stand
- * slopes by unknowns that there are beside it. */
+/* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). dz
+ * contains the adjoint variables of the unknowns. */
 static void pull_on(const linearised_step *at)
 {
   memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
@@ -167,7 +167,7 @@ static void pull_step(const linearised_step *at)
   pull_on(at);
 }
 
-/* Adds to vectors `to` what the step makes of `from`, WIDTH at a time. */
+/* Adds to the vectors `to` the JVPs (back: VJPs) of `from`, WIDTH at a time. */
 static int carry_over(const linearised_step *at, int back, int count, const real *from, real *to)
 {
   for (int first = 0; first < count; first += WIDTH) {

@@ -1,14 +1,15 @@
-/* Steps on Lobatto's points for constant diagonal masses, RATTLE for two of them, without the matrix of Newton's
- * iteration: the multipliers that lead to g = 0 at the points, by Newton's iteration with the factors of their first
- * guess, in which forces follow; then those that put p1 on the tangent space. Before it: newton.h, constraints.h, the
- * kernels held_force and held_mass; the tables HELD_ABSCISSA, HELD_WEIGHT, HELD_START, HELD_MOMENTUM and its low part,
- * HELD_POSITION and HELD_RESPONSE; PRODUCTS, pairs {e, f} of slopes of which the product belongs to the entry {k, l} of
- * PRODUCT_ENTRY; HELD_PLACE of constraints, HELD_REACH of their matrix. */
+/* Constrained steps on Lobatto points for constant diagonal masses (RATTLE for two points; Lobatto IIIA-IIIB: L. Jay,
+ * SIAM J. Numer. Anal. 33, 1996), without the full Newton matrix: simplified Newton iteration for the multipliers that
+ * give g = 0 at the points, with the factors at their initial guess, in which the forces are updated; then the
+ * multipliers that project p1 onto the tangent space. Requires: newton.h, constraints.h, the kernels held_force and
+ * held_mass; the tables HELD_ABSCISSA, HELD_WEIGHT, HELD_START, HELD_MOMENTUM and its low words, HELD_POSITION and
+ * HELD_RESPONSE; PRODUCTS, pairs {e, f} of derivatives whose product belongs to the entry {k, l} of PRODUCT_ENTRY;
+ * HELD_PLACE of constraints, HELD_REACH of their matrix. */
 #define RATTLE
 
-enum { DEGREE = B - 1 }; /* of B points; what belongs to a point stands n numbers behind what belongs to the first */
+enum { DEGREE = B - 1 }; /* of B points; values at point n are n elements after those at the first */
 
-/* Positions u at the points but the first; forces L_q and slopes G at all; multipliers at those but the last. */
+/* Positions u at all points but the first; forces L_q and derivatives G at all; multipliers at all but the last. */
 typedef struct {
   real inverse_mass[M], u[M * DEGREE], force[M * B], slope[CONSTRAINT_ENTRIES * B], lambda[CONSTRAINTS * DEGREE];
 } held_step;
@@ -20,8 +21,8 @@ static band held_shape(int count)
   return shape;
 }
 
-/* Factors of scale sum over coordinates of row_r response[n][r] column_n / mass, with rows r of each constraint, and
- * columns n; row and column are slopes at so many points. Returns 0 if that matrix has no inverse. */
+/* Factorises scale sum over coordinates of row_r response[n][r] column_n / mass, with rows r of each constraint, and
+ * columns n; row and column are derivatives at `count` points. Returns 0 if that matrix is singular. */
 static int factorise_held(const newton_data *data, const real *row, const real *column, const real *response, int count,
     const real *inverse_mass, real scale)
 {
@@ -39,7 +40,7 @@ static int factorise_held(const newton_data *data, const real *row, const real *
   return all_finite(data->factors, (int)band_size(&shape)) && factorise(data->factors, &shape, data->pivot);
 }
 
-/* x with that matrix times x = -right. */
+/* Solves matrix x = -right with these factors. */
 static void solve_held(const newton_data *data, const real *right, int count, real *x)
 {
   const band shape = held_shape(count);
@@ -51,7 +52,7 @@ static void solve_held(const newton_data *data, const real *right, int count, re
     memcpy(x + k * count, data->update + HELD_PLACE[k] * count, sizeof(real) * (size_t)count);
 }
 
-/* Force and slopes at point n, which is at u; the values of the constraints there. */
+/* Evaluates the force and the constraint derivatives at point n, at position u, and the constraints g. */
 static void look(const step_data *step, int n, const real *u, held_step *now, real *g)
 {
   real force[M], slope[CONSTRAINT_ENTRIES];
@@ -64,7 +65,7 @@ static void look(const step_data *step, int n, const real *u, held_step *now, re
     now->slope[e * B + n] = slope[e];
 }
 
-/* At all points but the first. */
+/* Evaluates all points but the first. */
 static void look_ahead(const step_data *step, held_step *now, real *g)
 {
   for (int n = 0; n < DEGREE; n++) {
@@ -77,7 +78,7 @@ static void look_ahead(const step_data *step, held_step *now, real *g)
   }
 }
 
-/* f += G^T lambda at the points but the last. */
+/* f += G^T lambda at all points but the last. */
 static void add_reactions(const held_step *now, const real *lambda, real *f)
 {
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
@@ -88,7 +89,7 @@ static void add_reactions(const held_step *now, const real *lambda, real *f)
   }
 }
 
-/* f = L_q + G^T lambda at the points but the last. */
+/* f = L_q + G^T lambda at all points but the last. */
 static void all_forces(const held_step *now, real *f)
 {
   for (int i = 0; i < M; i++)
@@ -97,7 +98,7 @@ static void all_forces(const held_step *now, real *f)
   add_reactions(now, now->lambda, f);
 }
 
-/* By how much positions follow a change f of forces: x += h^2 sum_n response[n] f_n / mass. */
+/* Adds the displacements due to a change f of the forces: x += h^2 sum_n response[n] f_n / mass. */
 static void add_response(const step_data *step, const held_step *now, const real *f, real *x)
 {
   for (int i = 0; i < M; i++) {
@@ -111,7 +112,7 @@ static void add_response(const step_data *step, const held_step *now, const real
   }
 }
 
-/* Velocities z that forces f lead to. */
+/* Velocities z due to the forces f. */
 static void velocities_by(const step_data *step, const held_step *now, const real *f, real *z)
 {
   for (int i = 0; i < M; i++) {
@@ -127,7 +128,7 @@ static void velocities_by(const step_data *step, const held_step *now, const rea
   }
 }
 
-/* Positions u that velocities z lead to. */
+/* Positions u due to the velocities z. */
 static void places(const step_data *step, const real *z, real *u)
 {
   for (int i = 0; i < M; i++) {
@@ -140,7 +141,7 @@ static void places(const step_data *step, const real *z, real *u)
   }
 }
 
-/* u += change; how much that is. */
+/* u += change; returns its size. */
 static movement move(const step_data *step, held_step *now, const real *change)
 {
   movement moved = no_movement();
@@ -157,7 +158,8 @@ static movement move(const step_data *step, held_step *now, const real *change)
   return moved;
 }
 
-/* lambda and u with g(u) = 0, and what is at the points then. */
+/* Solves g(u) = 0 for lambda and u; evaluates forces and constraints there. Returns SINGULAR, NOT_CONVERGED or
+ * NOT_FINITE on failure. */
 static int meet(const step_data *step, held_step *now, const newton_data *data, const solver_options *options,
     solver_report *report)
 {
@@ -194,13 +196,13 @@ static int meet(const step_data *step, held_step *now, const newton_data *data, 
     if (met || (!options->absolute && moved.overall <= ROUNDOFF_LEVEL && moved.relative >= STOPPED_SHRINKING * last))
       return all_finite(now->u, M * DEGREE) ? OK : NOT_FINITE;
     if (k > 1 && moved.overall > ROUNDOFF_LEVEL && !(moved.relative < STOPPED_SHRINKING * last))
-      return NOT_CONVERGED; /* Newton's iteration is quicker */
+      return NOT_CONVERGED; /* Newton's method is faster */
     last = moved.relative;
   }
   return NOT_CONVERGED;
 }
 
-/* What the step begins with: the first point, and a guess of the others, from unknowns in data->z. */
+/* Initial values: the first point, and a guess of the others, from the unknowns in data->z. */
 static void begin(const step_data *step, const newton_data *data, held_step *now)
 {
   real g[CONSTRAINTS];
@@ -213,7 +215,7 @@ static void begin(const step_data *step, const newton_data *data, held_step *now
     memcpy(now->lambda + k * DEGREE, data->z + (M + k) * B, sizeof(real) * DEGREE);
 }
 
-/* p1 - p0 on the tangent space, and the unknowns z of the step. */
+/* Computes p1 - p0 on the tangent space, and the unknowns z of the step. */
 static int arrive(const step_data *step, const held_step *now, const newton_data *data, real *dp)
 {
   const real weight = step->h * HELD_WEIGHT[DEGREE];
@@ -244,7 +246,7 @@ static int arrive(const step_data *step, const held_step *now, const newton_data
   return OK;
 }
 
-/* Unknowns z of the step, from a guess in their place, and p1 - p0. */
+/* Computes the unknowns z of the step, from their initial guess, and p1 - p0. On failure they are undefined. */
 static int rattle(const step_data *step, const newton_data *data, real *dp, const solver_options *options,
     solver_report *report)
 {

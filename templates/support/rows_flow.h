@@ -1,7 +1,8 @@
-/* Parts of the flow of many rows as anything calls them that has arrays. Before it: flow.h. */
+/* Flow of many rows, for callers with arrays. Requires: flow.h. */
 
-/* part: 0 states, 1 changes of them, 2 slopes by what is given; of rows x (rows, GIVEN), each with count changes,
- * (GIVEN), or slopes, (kept states, FLOW_STATE). */
+/* part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with respect to the inputs (VJP); of rows x (rows,
+ * GIVEN), each with `count` tangent vectors, (GIVEN), or adjoint vectors, (kept states, FLOW_STATE). On failure the
+ * results are undefined. */
 int NAME(flow_rows)(int part, long long steps, long long every, int count, long long rows, const real *x,
     const real *given, real *found, solver_report *report)
 {

@@ -1,4 +1,4 @@
-/* Changes of slopes, (rows, count, GIVEN), as anything calls them that has arrays. Before it: flow_second.h. */
+/* Derivatives of gradients, (rows, count, GIVEN), for callers with arrays. Requires: flow_second.h. */
 
 int NAME(bend_rows)(long long steps, long long every, int count, long long rows, const real *x, const real *slopes,
     const real *changes, real *found, solver_report *report)

@@ -1,32 +1,37 @@
-/* Lengths of steps that choose their own, roots of 2 to the power of a rung: how long one is, and how its error tells
- * that of the next. Before it: MANTISSA; GROWTH, what a rung up multiplies the error of a curve by; ERROR_POWER. After
- * it: a trial of a step, trials.h. */
+/* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a level (rung), and the error estimate
+ * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
+ * ERROR_POWER. Include before a trial of a step and trials.h. */
 enum {
-  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* rungs */
-  MOST_UP = 4 * OCTAVE, /* rungs, while the first step is looked for */
-  MOST_DOWN = 2 * OCTAVE /* after a step that failed */
+  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* levels per factor of two */
+  MOST_UP = 4 * OCTAVE, /* levels, while the first step size is determined */
+  MOST_DOWN = 2 * OCTAVE /* after a failed step */
 };
 
-#define USED_PART REAL(0.5) /* of the error allowed, what a longer step may be expected to use */
-#define FEW_POWERS REAL(4.5) /* of an octave, in the error of a curve of two coefficients that bend it, or one */
-#define LITTLE REAL(0.5) /* of the error that lets a step be two rungs longer: less is not measured */
-#define LAST_STEP REAL(1e-6) /* a step that ends so near the end, as a part of it, ends there */
-#define FIRST_STEP REAL_EPSILON /* of the whole span: the first step tried */
-#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: a million add up to what rounding leaves */
-#define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: less is rounding */
+#define USED_PART REAL(0.5) /* of the admissible error: predicted error of an increased step */
+#define FEW_POWERS REAL(4.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
+                              * coefficients or one */
+#define LITTLE REAL(0.5) /* of the error below which a step may be two levels larger: smaller errors are not
+                          * distinguished */
+#define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
+#define FIRST_STEP REAL_EPSILON /* of the whole span: first trial step size */
+#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: the sum over a million steps is of the size of
+                                                       * rounding errors */
+#define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: smaller values are rounding
+                                                                        * errors */
 #ifndef ITERATION_PART
-#define ITERATION_PART REAL(0.00390625) /* of the error allowed to a step: that of its stage equations */
+#define ITERATION_PART REAL(0.00390625) /* tolerance of the stage equations relative to that of a step */
 #endif
 
-/* A rung up multiplies the error of a curve by GROWTH. A step is too long beyond `most`, and may be a rung longer below
- * `few`, two below `fewer`. */
+/* Limits of the error estimate: a step above `most` is rejected; below `few` the next step may be one level larger,
+ * below `fewer` two. */
 typedef struct {
   real most, few, fewer;
-  real decay; /* from a coefficient of a curve to the next, where its error is just allowed */
+  real decay; /* ratio of successive coefficients of a curve whose error is just admissible */
 } error_limits;
 
-/* Where the highest coefficient is the second that bends a curve, an error is its fourth power: the one below is all
- * that bends it, as little as the step is short. Of more, the least decay is taken, as if a step might bend all. */
+/* If the leading coefficient is the second one that contributes to the curvature, the error is proportional to its
+ * fourth power, since the lower one, which is small for short steps, is the only other one. With more coefficients the
+ * smallest decay is assumed. */
 static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
@@ -42,7 +47,7 @@ static real length_of(long long rung)
   return MATH(ldexp)(MANTISSA[rung - octave * OCTAVE], (int)octave);
 }
 
-/* The longest rung that is not longer than h > 0. */
+/* Largest level whose step size does not exceed h > 0. */
 static long long rung_below(real h)
 {
   int exponent;
@@ -53,7 +58,7 @@ static long long rung_below(real h)
   return rung;
 }
 
-/* The error of a curve, had its step been so many rungs longer. */
+/* Error estimate if the step size were `rungs` levels larger. */
 static inline real error_at(real error, int rungs)
 {
   for (; rungs > 0; rungs--)
@@ -63,8 +68,8 @@ static inline real error_at(real error, int rungs)
   return error;
 }
 
-/* By how many rungs the next step is longer; shorter by an octave at most. The error is expected to go on growing as it
- * did; where it fell, much of that may have been luck. */
+/* Change of level for the next step, down by a factor of two at most. The error is expected to continue its growth; a
+ * decrease is only partly trusted. */
 static int next_change(real error, real before, const error_limits *limits)
 {
   const real expected =
@@ -75,7 +80,7 @@ static int next_change(real error, real before, const error_limits *limits)
   return change;
 }
 
-/* The length of the next step, or the rest of the way where that is hardly longer, which then is the last. */
+/* Size of the next step, or the remaining interval if that is hardly longer; *last is then 1. */
 static real next_length(real length, real rest, int *last)
 {
   *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);

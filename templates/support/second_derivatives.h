@@ -1,11 +1,12 @@
-/* How the slopes that go back over a step change where what it starts from does: the tangent of the adjoint, exact. The
- * equations, times the multipliers that the adjoint solves for, are one function of what is given and of the unknowns;
- * its Hessian times a change is the source from which the change of the multipliers follows, by the same factors.
- * Before it: push_and_pull.h, kernels of curvature, BENT_ARGUMENTS, BENT_VALUES. */
+/* Second derivatives of a step by forward-over-reverse differentiation: the tangent of the adjoint. The stage equations
+ * times the adjoint multipliers are a function of the inputs and the unknowns; its Hessian times a tangent vector is
+ * the source of the tangents of the multipliers, which are solved for with the same factors. Requires: push_and_pull.h,
+ * kernels of second derivatives, BENT_ARGUMENTS, BENT_VALUES. */
 
-/* Of WIDTH changes and slopes, lane by lane: what changes is given and what of unknowns follows; the slopes and what of
- * their changes comes from the equations being no linear ones, by what is given and by unknowns; and at the points of a
- * family arguments and results: changes, slopes, and changes of slopes. Last the arguments themselves. */
+/* Memory for WIDTH tangent and adjoint vectors. Tangent vectors of the inputs (change) and of the unknowns (dz);
+ * adjoint variables (slopes), their tangents (slope_changes), and the contributions of the nonlinear terms with respect
+ * to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results: tangents, adjoint
+ * variables, and tangents of these. Last, the arguments u. */
 typedef struct {
   wide *change, *dz, *slopes, *slope_changes, *by_given, *by_dz;
   wide *moved, *pulled, *bent;
@@ -35,7 +36,8 @@ static inline void add_product(wide *sum, real factor, const wide *x, const wide
     sum->lane[j] += factor * x->lane[j] * y->lane[j];
 }
 
-/* What the kernel of a point makes of lane j: the changes of slopes, by arguments, and by parameters and time. */
+/* Second derivatives of the kernel at a point for lane j: tangents of the adjoint variables of arguments, and of
+ * parameters and time. */
 static void bend_lane(const point_family *f, const step_data *step, const bending *to, int n, int j)
 {
   const int arguments = f->arguments, results = f->results, parameters = GIVEN - 2 * M - 2;
@@ -59,7 +61,8 @@ static void bend_lane(const point_family *f, const step_data *step, const bendin
   to->by_given[GIVEN_H].lane[j] += c * value[arguments + parameters];
 }
 
-/* Results are multiplied by h^power: what that changes of the slopes by them and by h. */
+/* Contributions of the factor h^power of the results to the tangents of the adjoint variables of the results and of
+ * h. */
 static void bend_results(const point_family *f, real h, const bending *to, const real *by_h)
 {
   const int first = f->points * f->arguments;
@@ -76,8 +79,8 @@ static void bend_results(const point_family *f, real h, const bending *to, const
   }
 }
 
-/* Arguments are made from q0 and from h^power times unknowns: what that changes of the slopes by h, and by arguments
- * as unknowns move them. */
+/* Contributions of arguments, q0 plus h^power times unknowns, to the tangents of the adjoint variables of h and of the
+ * arguments. */
 static void bend_arguments(const point_family *f, real h, const bending *to, const real *by_h)
 {
   const wide *dh = to->change + GIVEN_H;
@@ -97,7 +100,7 @@ static void bend_arguments(const point_family *f, real h, const bending *to, con
   }
 }
 
-/* All that the points of a family add. Returns where its slopes end. */
+/* Contributions of a stage group. Returns the end of its derivatives. */
 static const real *bend_family(const point_family *f, const linearised_step *at, const bending *to, const real *slopes)
 {
   const real h = at->step->h, *by_h = slopes + f->points * f->arguments, *slope = by_h + f->points * f->results;
@@ -123,7 +126,7 @@ static const real *bend_family(const point_family *f, const linearised_step *at,
   return given + f->points * f->given;
 }
 
-/* q1 = q0 + h (sum of unknowns). */
+/* Contributions of q1 = q0 + h (sum of unknowns). */
 static void bend_end_position(const bending *to)
 {
   for (int i = 0; i < M; i++)
@@ -133,7 +136,7 @@ static void bend_end_position(const bending *to)
     }
 }
 
-/* slopes and slope_changes, by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h). */
+/* Replaces slopes and slope_changes, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
 static void bend_step(const linearised_step *at, const bending *to)
 {
   const real *slopes = at->slopes;
@@ -171,7 +174,8 @@ static void add_lanes(const wide *from, int own, real *to)
       to[j * GIVEN + i] += from[i].lane[j];
 }
 
-/* Adds to (2, count, GIVEN) slopes and changes `to` what the step makes of `from`, WIDTH at a time. */
+/* Adds to (2, count, GIVEN) adjoint vectors and their tangents `to` the result of the step for `from`, WIDTH at a
+ * time. */
 static int bend_over(const linearised_step *at, int count, const real *changes, const real *from, real *to)
 {
   const bending of = bending_in(at);

@@ -1,18 +1,18 @@
-/* How a step by separable_sweep.h changes with what it starts from, and the transpose, by sweeps again. With D = X -
- * q0, the slopes K = F_q at the points, s = h^2 / m and P the table PRODUCT, the changes x of the points and the
- * slopes y of a number by the forces are the fixed points of
+/* Derivatives of a step solved by separable_sweep.h and their transpose, by fixed-point iteration. With D = X - q0, the
+ * derivatives K = F_q at the points, s = h^2 / m and P the table PRODUCT, the variations x of the points and the
+ * adjoint variables y of the forces are the fixed points of
  *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
- * whose rate of contraction is that of the step itself. All are exact: those of the map which the equations define.
- * Before it: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and by_slopes,
- * BY_SLOPES_BACK, POINT_GIVEN and given_slopes, MASS_GIVEN and mass_by_given. */
+ * which converge at the rate of the step itself. The derivatives are those of the exact solution of the stage
+ * equations. Requires: separable_sweep.h, changes_at_rest.h, PRODUCT_BACK, the transposed table, point_slopes and
+ * by_slopes, BY_SLOPES_BACK, POINT_GIVEN and given_slopes, MASS_GIVEN and mass_by_given. */
 
 enum {
   KEPT_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
   GIVEN_T = GIVEN - 2
 };
 
-/* A solved step: how its points stand from q0, the increments, the slopes of its forces behind room
- * for M changes. */
+/* Linearisation of a solved step: displacements D of its points from q0, the increments, and the derivatives of its
+ * forces behind memory for M variations. */
 typedef struct {
   const step_data *step;
   const sweep_data *data;
@@ -24,7 +24,7 @@ typedef struct {
   lanes D[GROUPS][M], u[GROUPS][M + POINT_SLOPES], given[GROUPS][GIVEN_SLOPES];
 } swept_step;
 
-/* What is told of a step from its increments and the forces it keeps. */
+/* Stores the displacements and increments of a step, from which slopes_of_step linearises it. */
 static void keep_step(const step_data *step, const sweep_data *data, const double *memory, const double *dq,
     const double *dp, double *to)
 {
@@ -64,7 +64,7 @@ static __attribute__((noinline)) void slopes_of_step(const step_data *step, cons
 #endif
 }
 
-/* f = K x, or back: K^T x. */
+/* f = K x; back: K^T x. */
 static inline void through_slopes(swept_step *at, int back, lanes (*f)[M])
 {
   const step_data *step = at->step;
@@ -72,14 +72,14 @@ static inline void through_slopes(swept_step *at, int back, lanes (*f)[M])
     (back ? BY_SLOPES_BACK : by_slopes)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
 }
 
-/* The next x, whose first part is x0. */
+/* The next iterate of x, whose constant term is x0. */
 static inline lanes next_change(const swept_step *at, const lanes *table, lanes (*x0)[M], lanes (*f)[M], int n, int i)
 {
   return x0[n][i] + at->scale[i] * apply(table, n, f, i);
 }
 
-/* The x in u, which begins as x0, and f = K x, transposed where back. Measured by the masses, as are kinetic energies:
- * whatever the units of coordinates. */
+/* Solves for the x in u, which starts as x0, and f = K x; back: the transpose. The change is measured in the metric of
+ * the masses, independent of the units of the coordinates. */
 static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
 {
   const lanes *table = back ? PRODUCT_BACK : PRODUCT;
@@ -110,7 +110,7 @@ static inline int settle(swept_step *at, int back, lanes (*f)[M], int *look)
   return status == 1 ? OK : NOT_CONVERGED;
 }
 
-/* How much the masses change. */
+/* Variations of the masses. */
 static inline void masses_changed(swept_step *at, const double *v, double *dm)
 {
   memset(dm, 0, sizeof(double) * M);
@@ -122,7 +122,7 @@ static inline void masses_changed(swept_step *at, const double *v, double *dm)
 #endif
 }
 
-/* The changes of forces, points held. */
+/* Variations of the forces at fixed points. */
 static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M])
 {
   memset(F, 0, sizeof(lanes) * GROUPS * M);
@@ -134,7 +134,7 @@ static inline void forces_changed(swept_step *at, const double *v, lanes (*F)[M]
     }
 }
 
-/* Whether q0 and p0 alone change. */
+/* Returns 1 if only q0 and p0 vary. */
 static inline int is_of_state(const double *v)
 {
   int none = 1;
@@ -143,7 +143,7 @@ static inline int is_of_state(const double *v)
   return none;
 }
 
-/* v, changes of (q0, p0, parameters, t, h), become those of (q1, p1, parameters, t + h, h). */
+/* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
 static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;
@@ -175,7 +175,7 @@ static __attribute__((noinline)) int push_swept(swept_step *at, double *v, int *
   return OK;
 }
 
-/* What slopes by the forces, in u, come to, by what else these depend on: added to v. */
+/* Adds to v the gradient with respect to parameters and time from the adjoint variables of the forces in u. */
 static inline void given_back(swept_step *at, double *v)
 {
   lanes by[GIVEN - 2 * M][GROUPS];
@@ -192,7 +192,7 @@ static inline void given_back(swept_step *at, double *v)
     v[2 * M + j] += points_total(by[j]);
 }
 
-/* v, slopes by (q1, p1, parameters, t + h, h), become those by (q0, p0, parameters, t, h): the transpose. */
+/* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). */
 static __attribute__((noinline)) int pull_swept(swept_step *at, double *v, int *look)
 {
   const sweep_data *data = at->data;

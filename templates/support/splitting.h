@@ -1,7 +1,8 @@
-/* A step by kicks of h KICK[n] L_q, each followed by a drift of h DRIFT[n] v.
- * Before it: a drift, LEAPS, the tables, KICK_ABSCISSA, and the kernel force. */
+/* Splitting step: kicks h KICK[n] L_q, each followed by a drift h DRIFT[n] v. Requires: a drift, LEAPS, the tables,
+ * KICK_ABSCISSA, and the kernel force. */
 
-/* The increments of one step; memory keeps the last force, the first of the next step where kicks come first. */
+/* Computes the increments of one step; memory contains the last force, which the next step reuses if it starts with a
+ * kick. */
 static int solve(const step_data *step, const solver_data *data, real *memory, long long *guess, real *dq, real *dp,
     const solver_options *options, solver_report *report, real *workspace)
 {

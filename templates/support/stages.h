@@ -1,8 +1,7 @@
-/* Sums between blocks of unknowns z and points, the same for every method. Before it: real, M, B, POINTS, PLACE,
- * band.h, step.h, gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
- * coordinates. */
+/* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, PLACE, band.h, step.h,
+ * gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the coordinates. */
 
-/* u = q0 + u at every point, with what rounding cut off q0 before. */
+/* u = q0 + u at every point, including the compensation of q0. */
 static inline void offset(const step_data *step, int points, real *u, int across)
 {
   for (int n = 0; n < points; n++)
@@ -10,8 +9,8 @@ static inline void offset(const step_data *step, int points, real *u, int across
       u[n * across + i] = step->q0[i] + (step->carry_q[i] + u[n * across + i]);
 }
 
-/* rows_r += sum_n weight[n] scale table[n][r] value_n for so many sites; the last row is p1, whose terms are also
- * summed without sign into size. */
+/* rows_r += sum_n weight[n] scale table[n][r] value_n for `sites` sites; the last row is p1, the absolute values of
+ * whose terms are added to size. */
 static inline void scatter(const real *table, int points, const real *weight, real scale, const real *value, int across,
     int sites, real *rows, real *size)
 {
@@ -29,8 +28,8 @@ static inline void scatter(const real *table, int points, const real *weight, re
   }
 }
 
-/* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns
- * (j, b), for every slope and its pair of sites i, j. */
+/* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns (j,
+ * b), for every derivative and its pair of sites i, j. */
 static inline void scatter_slopes(const real *row, const real *column, int points, const real *weight, real scale,
     const int (*pair)[2], int count, const real *slope, int across, real *jacobian, const band *shape)
 {
@@ -51,7 +50,7 @@ static inline void scatter_slopes(const real *row, const real *column, int point
   }
 }
 
-/* The part of rows and sizes that the state has, and a Jacobian of zeros. */
+/* Initial values of rows and sizes from the state, and a zero Jacobian. */
 static inline void begin_rows(const step_data *step, const real *z, real *rows, real *size_p, real *size_q,
     real *jacobian, const band *shape)
 {

@@ -1,5 +1,5 @@
-/* The largest error of the curves that sweeps found, or the fallback where they failed. Before it: curve_error.h,
- * borrowed_fallback.h; its power makes it one of those of the sweeps. */
+/* Largest error estimate of steps by fixed-point iteration, or by the fallback library where it failed. Requires:
+ * curve_error.h, borrowed_fallback.h, whose error is converted to the same power. */
 static SELDOM double fallback_error(const run_memory *run, const double *workspace)
 {
   return larger(run->error, pow(*workspace, 1 / ERROR_POWER));

@@ -1,5 +1,5 @@
-/* The largest error of the curves that sweeps found, or Newton's iteration where they failed. Before it: curve_error.h,
- * stage_error.h; their powers make the errors of one those of the other. */
+/* Largest error estimate of steps by fixed-point iteration, or by Newton's method where it failed. Requires:
+ * curve_error.h, stage_error.h, whose errors are converted to the same power. */
 static SELDOM double fallback_error(const run_memory *run, const step_data *step, const double *dq, double *workspace)
 {
   const double error = stage_error(step, newton_in(workspace).z, dq, ALL, DECAY, 0.0);

@@ -1,11 +1,11 @@
-/* Lanes are trajectories: one vector holds what LANES of them have at one point. Before it: vectors.h. The same names
- * are in points.h. */
+/* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
+ * names. Requires: vectors.h. */
 enum { GROUPS = S }; /* vectors for all points */
 
-typedef lanes coordinates[M]; /* what all coordinates have at a point */
+typedef lanes coordinates[M]; /* values of all coordinates at a point */
 
-typedef lanes number; /* what each trajectory has once */
-typedef double weight; /* what a point has, for all trajectories */
+typedef lanes number; /* a value of each trajectory */
+typedef double weight; /* a value of a point, the same for all trajectories */
 
 static inline number number_of(double x)
 {
@@ -41,7 +41,7 @@ static inline number exponential_less_1(number x)
   return view.all;
 }
 
-/* The largest of M numbers. */
+/* Maximum of M numbers. */
 static inline number largest_number(const number *x)
 {
   lane_view largest = {x[0]};
@@ -63,7 +63,7 @@ static inline weight fused_weights(double a, weight b, weight c)
   return fma(a, b, c);
 }
 
-/* sum_j table_nj x_j of one coordinate, in two sums that do not wait for each other. */
+/* sum_j table_nj x_j of one coordinate, in two independent sums. */
 static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
 {
   lanes a = table[n][0] * x[0][i], b = lanes_of(0.0);
@@ -76,7 +76,7 @@ static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
   return a + b;
 }
 
-/* sum_n weights_n x_n; then with the low parts of the weights. */
+/* sum_n weights_n x_n; weigh_twice: with the low words of the weights. */
 static inline number weigh(const weight *weights, lanes (*x)[M], int i)
 {
   number sum = lanes_of(0.0);
@@ -93,7 +93,7 @@ static inline number weigh_twice(const weight *weights, const weight *low, lanes
   return sum;
 }
 
-/* What x is at the first point, and at the last. */
+/* Values at the first and at the last point. */
 static inline number at_start(lanes (*x)[M], int i)
 {
   return x[0][i];
@@ -104,7 +104,7 @@ static inline number at_end(lanes (*x)[M], int i)
   return x[S - 1][i];
 }
 
-/* What becomes of a change of each point: that of the trajectory. */
+/* Change of each trajectory. */
 static inline number total_change(lanes change)
 {
   return change;

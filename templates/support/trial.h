@@ -1,20 +1,21 @@
-/* A trial of a step of few coordinates. Before it: rungs.h; attempt of a solver, which tries a step. */
+/* Trial of an adaptive step of a system with few coordinates. Requires: rungs.h; attempt of a solver, which tries a
+ * step. */
 
-/* What the trials of a step share. */
+/* Data shared by the trials of a step. */
 typedef struct {
   state at;
   step_data step;
   solver_data data;
   error_limits limits;
-  real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low parts */
-  long long guess, rung; /* of the length */
-  long long change; /* of rungs, from the step before to this */
-  real length; /* 0 before the first trial */
-  int last; /* whether the step ends at t_end */
+  real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low words */
+  long long guess, rung; /* level of the step size */
+  long long change; /* of the level, from the previous step to this */
+  real length; /* step size; 0 before the first trial */
+  int last; /* 1 if the step ends at t_end */
 } trial;
 
-/* One trial of the step that the run is at: increments, and what their curve leaves unresolved, if more than `least`;
- * infinity where there is none. */
+/* Performs one trial of the next step: its increments and the error estimate of the curve if it exceeds `least`,
+ * infinite if the step failed. */
 HOT void try_step(run_memory *run, trial *now, real least, const solver_options *options, solver_report *report)
 {
   const real rest = (now->t_end - now->at.t) - now->at.t_low;

@@ -1,8 +1,8 @@
-/* Trials of a step, until one is as long as its error allows. Before it: rungs.h; the type trial with at.t, at.t_low,
- * t_end, limits, change, error, guess and last, and try_step, which fills the last three; SHORT_STEPS_FAIL, whether
- * rounding alone may make a step fail; HOT. After it: what makes the step that was found the state. */
+/* Trials of an adaptive step until its error estimate is admissible. Requires: rungs.h; the type trial with at.t,
+ * at.t_low, t_end, limits, change, error, guess and last, and try_step, which sets the last three; SHORT_STEPS_FAIL, 1
+ * if rounding alone may make a step fail; HOT. Include before the code that accepts the step. */
 
-/* By how many rungs the first step may be longer at once. */
+/* Number of levels by which the first step may be increased at once. */
 static int rungs_up(const trial *now)
 {
   real error = now->error;
@@ -13,9 +13,9 @@ static int rungs_up(const trial *now)
   return up;
 }
 
-/* The first step: from one that is certainly too short by trial to one that is about right. The shortest may fail, and
- * of sweeps longer ones, too: where some velocities are zero, rounding leaves little of what they become. Or rounding
- * is all that it shows, which looks like an error of any size: that of a curve rises by as much as is expected. */
+/* Determines the first step size by increasing one that is certainly too small. The smallest trials may fail, with
+ * fixed-point iteration larger ones, too: if some velocities are zero, rounding dominates them. Or their error estimate
+ * is only rounding, of any size; the estimate of a curve grows as expected. */
 static void try_first_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real span = MATH(fabs)(now->t_end - now->at.t);
@@ -38,7 +38,7 @@ static void try_first_step(run_memory *run, trial *now, const solver_options *op
   }
 }
 
-/* Shortens the step after a trial that failed, or whose error was too large; 0 if it is as good as nothing. */
+/* Reduces the step size after a failed or rejected trial; returns 0 on step size underflow. */
 static int shorten(run_memory *run, const trial *now)
 {
   int down = 2;
@@ -51,7 +51,7 @@ static int shorten(run_memory *run, const trial *now)
   return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
 }
 
-/* The step that the run is at, tried shorter and shorter until its error is allowed or it vanishes. */
+/* Tries the next step with smaller and smaller sizes until its error is admissible; returns VANISHED on underflow. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
@@ -70,7 +70,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return OK;
 }
 
-/* Chooses the length of the next step. */
+/* Chooses the size of the next step. */
 static inline void choose_length(run_memory *run, const trial *now)
 {
   const int change = next_change(now->error, run->error_before, &now->limits);
@@ -81,7 +81,7 @@ static inline void choose_length(run_memory *run, const trial *now)
   run->error_before = error_at(now->error, change);
 }
 
-/* What steps are chosen by: the error allowed to each, which their equations are then solved for. */
+/* Sets the admissible error of a step, and the tolerance of its equations accordingly. */
 static void begin_trials(run_memory *run, trial *now, real tolerance, solver_options *standard)
 {
   now->limits = limits_of(tolerance > 0 ? tolerance : ROUNDOFF_ERROR);

@@ -1,9 +1,9 @@
-/* The flow as XLA calls it, through its C interface for foreign functions. Before it: flow.h. */
+/* Flow as XLA custom calls through the XLA FFI. Requires: flow.h. */
 #include <stdio.h>
 
 #include "xla/ffi/api/c_api.h"
 
-/* XLA asks which version of its interface a handler was compiled for: whether it did. */
+/* Returns 1 if XLA only asks for the version of the interface that the handler was compiled for; sets it. */
 static int tells_version(const XLA_FFI_CallFrame *frame)
 {
   for (XLA_FFI_Extension_Base *each = frame->extension_start; each; each = each->next)
@@ -29,7 +29,8 @@ static XLA_FFI_Error *failure(const XLA_FFI_CallFrame *frame, int status, const 
   return frame->api->XLA_FFI_Error_Create(&error);
 }
 
-/* How many steps, and how many between kept states, as attributes, which come sorted by name; count at a time. */
+/* Numbers of steps, and of steps between stored states, from the attributes, which are sorted by name; `count`
+ * vectors. */
 static flow_way way_of(const XLA_FFI_CallFrame *frame, int count)
 {
   const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
@@ -46,7 +47,7 @@ static long long rows_of(const XLA_FFI_Buffer *x)
   return rows;
 }
 
-/* x (.., GIVEN), and for changes and slopes those, (.., count, size), to results. */
+/* Evaluates the flow: x (.., GIVEN), for derivatives also vectors (.., count, size). */
 static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
 {
   const XLA_FFI_Buffer *x = frame->args.args[0], *given = part == FLOW_STATES ? x : frame->args.args[1];

@@ -1,6 +1,7 @@
-/* Changes of slopes as XLA calls them. Before it: xla_flow.h, flow_second.h. */
+/* Derivatives of gradients as an XLA custom call. Requires: xla_flow.h, flow_second.h. */
 
-/* x (.., GIVEN), slopes (.., count, kept states, FLOW_STATE) and changes (.., count, GIVEN), to results like these. */
+/* x (.., GIVEN), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count, GIVEN); results
+ * like the latter. */
 XLA_FFI_Error *NAME(xla_bend)(XLA_FFI_CallFrame *frame)
 {
   flow_way way;
