@@ -1,1 +1,1 @@
-"""C without syntax: kernels, families of points, sweeps, the program; and how an expression becomes a kernel."""
+"""Intermediate representation: kernels, stage groups, fixed-point iterations, the program; expressions to kernels."""

@@ -1,4 +1,4 @@
-"""Expressions become straight-line arithmetic.
+"""Translation of SymPy expressions into straight-line arithmetic.
 
 A kernel's expressions are read into one graph in which equal nodes are the same node. Three rules make sharing cheap
 and complete enough that no separate search for common subexpressions is needed:
@@ -7,7 +7,7 @@ and complete enough that no separate search for common subexpressions is needed:
   so 3 mu r^-5 x and 3 mu r^-5 y share all but the last factor;
 * a sum is normalised to content 1 and a positive first term, so a - b, b - a and 2 a - 2 b are one node;
 * every negative power of x is built from 1/x and every half-integer power from sqrt(x); x^(-k/2) for k = 1, 3, 5, 7,
-  frequent in mechanics, are functions of their own, for which vectors have something faster; odd quarters are these
+  frequent in mechanics, are separate functions, which vector instructions evaluate faster; odd quarters are these
   times x^(1/4) or x^(-1/4), a root of a root.
 
 Nothing here changes a value: constants are exact and rounded when they are printed.
@@ -54,7 +54,7 @@ LARGEST_UNROLLED_POWER = 64
 
 
 DEEPEST_EXPRESSION = 24
-"""Longest chain of operations written as one C expression; longer sums are cut into temporaries."""
+"""Greatest depth of one C expression; deeper ones are cut into temporaries."""
 
 
 class _Graph:
@@ -68,7 +68,7 @@ class _Graph:
         self._constant: dict[sympy.Basic, bool] = {}
 
     def node(self, content: Constant | Load | tuple[str, tuple[int, ...]]) -> int:
-        """The id of a node, new or not."""
+        """Return the id of a node, which is created if it is new."""
         if content not in self._ids:
             self._ids[content] = len(self.nodes)
             self.nodes.append(content)
@@ -86,7 +86,7 @@ class _Graph:
         return self._read[expression]
 
     def is_constant(self, expression: sympy.Basic) -> bool:
-        """Whether no symbol occurs: each part is asked once, where ``free_symbols`` walks through it every time."""
+        """Return whether no symbol occurs; unlike ``free_symbols``, every subexpression is examined once."""
         known = self._constant.get(expression)
         if known is None:
             known = not expression.is_Symbol and all(map(self.is_constant, expression.args))
@@ -129,7 +129,7 @@ class _Graph:
         factors = sympy.Mul.make_args(rest)
         if coefficient == 1:
             return self.read(rest)
-        if any(map(self.is_constant, factors)):  # roots of numbers, with which the coefficient may unite
+        if any(map(self.is_constant, factors)):  # roots of numbers, which may combine with the coefficient
             return self.read(sympy.Mul(coefficient, rest))
         return self._multiplied(coefficient, factors)
 
@@ -171,7 +171,7 @@ class _Graph:
         return self.node(("*", (self._by_roots(x, halves), quarter))) if halves else quarter
 
     def _by_roots(self, x: int, halves: int) -> int:
-        """x^(halves / 2), halves not 0."""
+        """Return the node of x^(halves / 2), halves != 0."""
         if -halves in INVERSE_ROOTS:
             return self.node((INVERSE_ROOTS[-halves], (x,)))
         whole, half = divmod(halves, 2)
@@ -185,7 +185,7 @@ class _Graph:
         return self.node(("/", (self.node(Constant(Fraction(1))), x)))
 
     def _whole(self, x: int, n: int) -> int:
-        """x^n by halving, n >= 1."""
+        """Return the node of x^n by repeated squaring, n >= 1."""
         if n == 1:
             return x
         half = self._whole(x, n // 2)
@@ -193,7 +193,7 @@ class _Graph:
         return self.node(("*", (square, x))) if n % 2 else square
 
     def _rank(self, factor: sympy.Expr) -> tuple[int, int]:
-        """Numbers, parameters, composites, coordinates; among equals the order of first reading."""
+        """Order of factors: numbers, parameters, composites, coordinates; ties by the order of first reading."""
         if self.is_constant(factor):
             return (0, self.read(factor))
         if isinstance(factor, sympy.Symbol):
@@ -211,7 +211,10 @@ def lower_kernel(
     slopes: Sequence[sympy.Expr] = (),
     constants: int = 0,
 ) -> Kernel:
-    """One kernel with all its results sharing their common parts; so many of the last arguments are constants."""
+    """Return the kernel of ``values`` and ``slopes`` with common subexpressions shared.
+
+    The last ``constants`` arguments are constant.
+    """
     loads = {symbol: Load("u", i) for i, symbol in enumerate(arguments)}
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
@@ -230,7 +233,7 @@ def lower_kernel(
 
 
 def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, ...], tuple[Expression, ...]]:
-    """Nodes used more than once become temporaries, each defined shortly before its use; others stand in place."""
+    """Turn nodes used more than once into temporaries, each defined shortly before its use; inline the others."""
     order = _order(graph, roots)
     uses = [0] * len(graph.nodes)
     for k in order:
@@ -255,10 +258,10 @@ def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, .
 
 
 def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
-    """Reachable nodes, operands first: those of the results that use the first arguments before those of others.
+    """Reachable nodes, operands first; results that depend on the first arguments come first.
 
-    In a chain a result shares parts with its neighbours only; numbers then are needed soon after they are computed,
-    which compilers and processors reward.
+    In a chain a result shares subexpressions with its neighbours only, so that numbers are used soon after they are
+    computed, which helps compilers and processors.
     """
     first = _first_arguments(graph)
     order: list[int] = []
@@ -277,9 +280,9 @@ def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _first_arguments(graph: _Graph) -> list[float]:
-    """Of each node, the smallest index of an argument that it depends on."""
+    """Smallest index of an argument on which each node depends."""
     first: list[float] = []
-    for k, content in enumerate(graph.nodes):  # operands have smaller numbers
+    for k, content in enumerate(graph.nodes):  # operands have smaller ids
         if isinstance(content, Load) and content.source == "u":
             first.append(content.index)
         else:

@@ -1,4 +1,4 @@
-"""What keeps a motion on its constraints, beside the equations of a step: projections, and the forces that do it."""
+"""Constraints of a program, besides the equations of a step: projections, multipliers, RATTLE."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["Constraints", "Rattle"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rattle:
-    """What steps on s + 1 points of Lobatto's need where masses are constant and diagonal; RATTLE for s = 1.
+    """Tables of constrained steps on s + 1 Lobatto points for constant diagonal masses; RATTLE for s = 1.
 
     Attributes:
         force: L_q at u = q.
         mass: M (no arguments).
-        products: (e, f) of slopes of constraints by the same coordinate.
+        products: (e, f) of derivatives of constraints with respect to the same coordinate.
         entries: of each product the two constraints (k, l).
         abscissae: (s + 1,) of the points; weights: (s + 1,), of p1 = p0 + h sum_n w_n F_n.
-        start: (s,), 0 but for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
+        start: (s,), 0 except for rounding, and momentum: (s, s), from forces at the points but the last to velocities,
             M V_b = (1 + start[b]) p0 + h sum_n momentum[n][b] F_n.
         position: (s, s) from them to the points but the first, u_i = q0 + h sum_b position[b][i] V_b.
         response: (s, s), the product of both, h^2 sum_n response[n][i] F_n / M.
@@ -43,10 +43,11 @@ class Constraints:
     """Constraints g(q, t) = 0, ``count`` of them.
 
     Attributes:
-        formulas: for people.
-        kernel: g at u = q, then the slopes g_q that are not 0.
-        entries: (k, i) of these slopes.
-        motion: at u = (q, v): what L_vv a is without them, m numbers; then g_q v + g_t, and what it grows by without a.
+        formulas: as text.
+        kernel: g at u = q, then the nonzero derivatives g_q.
+        entries: (k, i) of these derivatives.
+        motion: at u = (q, v): L_vv a without constraints, m numbers; then g_q v + g_t, and the terms of its time
+            derivative without a.
     """
 
     formulas: tuple[str, ...]
@@ -56,5 +57,5 @@ class Constraints:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of constraints."""
         return len(self.formulas)

@@ -1,4 +1,4 @@
-"""Steps that choose their own length, as data."""
+"""Adaptive step sizes, as data."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ __all__ = ["Control", "Ladder"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """Steps on a ladder, h = 2^(k / rungs), by sweeps or by Newton's iteration; or steps of a density of their own.
+    """Adaptive steps with sizes h = 2^(k / rungs), by fixed-point iteration or Newton's method; or a step density.
 
     Attributes:
-        mantissas: 2^(k / rungs) for the rungs of an octave.
-        ladder: of sweeps, ``None`` without these.
-        stage_growth: of the error of the curve of Newton's iteration from rung to rung; 0 where that tells no error.
-        density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a monitor g; in place of the ladder.
+        mantissas: 2^(k / rungs) for the levels of an octave.
+        ladder: predictor of the fixed-point iteration, ``None`` without one.
+        stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
+        density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the
+            ladder.
     """
 
     mantissas: tuple[float, ...] = ()
@@ -29,13 +30,13 @@ class Control:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ladder:
-    """Guesses of sweeps for steps on a ladder, and how the error of a step goes with its length.
+    """Predictor tables of the fixed-point iteration for varying step sizes, and the growth of the error estimate.
 
     Attributes:
-        reach: rungs between one step and the next, at most.
+        reach: largest change of level between successive steps.
         alone: by the change into the next step, -reach .. reach: from the last step to the next.
         last, before: by the changes into the last step and into the next: from these two steps.
-        growth: of the error of a curve from rung to rung.
+        growth: factor of the error estimate per level.
     """
 
     reach: int

@@ -15,11 +15,11 @@ __all__ = ["CollocationSweep", "NodeTables", "PointTables", "PrintedEnds", "Shoo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeTables:
-    """Curves given by v0 and z = h a: V = v0 + A z and q = q0 + h A V at the nodes; all padded to whole vectors.
+    """Curves from v0 and z = h a: V = v0 + A z and q = q0 + h A V at the nodes; all padded to whole vectors.
 
     Attributes:
         count: of the nodes; lanes beyond repeat the last and have weight 0.
-        abscissae: c_n, where time stands.
+        abscissae: c_n, of the time.
         collocation: A.
         end: b, q1 = q0 + h sum b V and v1 = v0 + sum b z.
         mask: 1 for nodes.
@@ -34,10 +34,10 @@ class NodeTables:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointTables:
-    """Quadrature points on such a curve: q = q0 + h a V and v = l V, V the velocities at the nodes.
+    """Quadrature points on a curve: q = q0 + h a V and v = l V, V the velocities at the nodes.
 
     Attributes:
-        abscissae: c_n, where time stands.
+        abscissae: c_n, of the time.
         position, velocity: a, l.
         action: L_q and L_v at (q, v, t).
     """
@@ -50,13 +50,13 @@ class PointTables:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurveSweep(Sweep):
-    """What the two iterations on accelerations have in common.
+    """Common part of the two iterations on accelerations.
 
     Attributes:
-        nodes, points: of the curve, and of a quadrature along it where there is one.
+        nodes, points: of the curve, and of a quadrature along it, if there is one.
         kernel: at the nodes.
-        guess: from z of former steps to z.
-        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
+        guess: predictor of z from former steps.
+        mass_entries: (i, j), i >= j, of the derivatives of ``kernel``.
     """
 
     lanes: int
@@ -71,12 +71,12 @@ class CurveSweep(Sweep):
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes."""
+        """Kernels that are evaluated on SIMD lanes."""
         return (self.kernel, self.points.action) if self.points else (self.kernel,)
 
     @property
     def tables(self) -> Iterator[SweepTable]:
-        """Those of nodes and points, what else the kind has, and the guess."""
+        """Tables of nodes and points, further ones, and the predictor."""
         yield SweepTable("NODE_TIME", self.nodes.abscissae)
         yield SweepTable("COLLOCATION", self.nodes.collocation)
         yield SweepTable("NODE_END", self.nodes.end)
@@ -90,12 +90,12 @@ class CurveSweep(Sweep):
 
     @property
     def further_tables(self) -> tuple[SweepTable, ...]:
-        """Those of one kind alone."""
+        """Tables of one kind of iteration only."""
         return ()
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """How many nodes there are."""
+        """Number of nodes, as a macro."""
         return {"NODES": self.nodes.count}
 
 
@@ -104,7 +104,7 @@ class ShootingSweep(CurveSweep):
     """The fixed-point iteration of a shooting-based variational method; tables padded to ``lanes`` rows.
 
     Unknowns: v0, the scaled accelerations z_i = h a_i at the nodes and the scaled multipliers m_i. With
-    V = v0 + A z and q = q0 + h A V at the nodes, and q = q0 + h a V, v = l V at the points, one sweep is
+    V = v0 + A z and q = q0 + h A V at the nodes, and q = q0 + h a V, v = l V at the points, one iteration is
 
         z -= h M^-1 E(q, V, z / h),          p1 = p0 + h sum w L_q + h^2 sum (m . E)_q,
         gamma = h a^T w L_q + l^T w L_v + h (m . E)_v + h^2 A^T (m . E)_q - b p1,
@@ -125,7 +125,7 @@ class ShootingSweep(CurveSweep):
 
     @property
     def further_tables(self) -> tuple[SweepTable, ...]:
-        """The adjoints."""
+        """Adjoint tables."""
         return (
             SweepTable("COLLOCATION_T", self.collocation_transposed),
             SweepTable("POINT_POSITION_T", self.position_transposed),
@@ -136,17 +136,17 @@ class ShootingSweep(CurveSweep):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """A mass, the curve and its points, the sweep."""
+        """Support headers: mass, curve, points, iteration."""
         return (self.mass_part, "unknown_velocity", "curve", "curve_points", "shooting_sweep")
 
     def memory(self, dimension: int) -> int:
-        """Z of the last two steps, v0 and m."""
+        """Return the length of z of the last two steps, v0 and m."""
         return dimension * (3 * self.lanes + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedEnds:
-    """Momenta at both ends of a curve by quadrature, as the paper prints them; all (lanes,).
+    """Momenta at both ends of a curve by quadrature, in the printed form of the paper; all (lanes,).
 
         p0 = -sum (h start_force L_q + start_momentum L_v),     p1 = p0 + sum (h end_force L_q + end_momentum L_v).
 
@@ -165,15 +165,15 @@ class PrintedEnds:
 class CollocationSweep(CurveSweep):
     """A fixed-point iteration on accelerations: the Euler-Lagrange equations at the nodes of a curve from q0.
 
-    With V = v0 + A z and q = q0 + h A V at the nodes, z = h M^-1 (L_q - L_vq V - L_vt) until nothing moves. Without
-    ``ends``, p0 and p1 are L_v at the ends of the curve, and v0 is known; with them they are sums over the points, and
-    v0 is corrected after z by M^-1 times the misfit of p0.
+    With V = v0 + A z and q = q0 + h A V at the nodes, z = h M^-1 (L_q - L_vq V - L_vt) is iterated to convergence.
+    Without ``ends``, p0 and p1 are L_v at the ends of the curve, and v0 is known; with them they are sums over the
+    points, and v0 is corrected after z by M^-1 times the residual of p0.
 
     The kernel: L_q - L_vq V - L_vt and the mass at (q, V, t).
 
     Attributes:
         ends: of the printed form, ``None`` for spectral collocation and Runge-Kutta methods.
-        hamiltonian: whether a Hamiltonian is given.
+        hamiltonian: whether the system is Hamiltonian.
     """
 
     ends: PrintedEnds | None
@@ -181,7 +181,7 @@ class CollocationSweep(CurveSweep):
 
     @property
     def further_tables(self) -> tuple[SweepTable, ...]:
-        """What the points give to the momenta at the ends."""
+        """Contributions of the points to the momenta at the ends."""
         if not self.ends:
             return ()
         return (
@@ -193,17 +193,17 @@ class CollocationSweep(CurveSweep):
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """How many nodes there are; without points, how the initial velocity follows from p0."""
+        """Number of nodes; without points, whether the system is Hamiltonian."""
         return {"NODES": self.nodes.count} if self.points else {"HAMILTONIAN": int(self.hamiltonian)}
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """A mass, the curve, its ends, the sweep."""
+        """Support headers: mass, curve, ends, iteration."""
         if not self.ends:
             return (self.mass_part, "known_velocity", "curve", "ends_by_transform", "collocation_sweep")
         ends = ("unknown_velocity", "curve", "curve_points", "ends_by_quadrature")
         return (self.mass_part, *ends, "collocation_sweep")
 
     def memory(self, dimension: int) -> int:
-        """Z of the last two steps and v0."""
+        """Return the length of z of the last two steps and v0."""
         return dimension * (2 * self.lanes + 1)

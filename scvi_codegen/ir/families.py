@@ -1,7 +1,7 @@
-"""Families of points in loops: what is gathered, which kernel is evaluated, where its results are scattered.
+"""Stage groups in loops: gather of arguments, kernel evaluation, scatter of results.
 
-Unknowns and rows stand at *sites*: the m coordinates, then the components of what has another size (multipliers). A
-loop is over so many ``sites`` from the ``first`` on.
+Unknowns and rows are located at *sites*: the m coordinates, then the components of blocks of another size
+(multipliers). A loop covers ``sites`` sites from the ``first`` on.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["Family", "GatherLoop", "ScatterLoop", "SlopeBlock"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GatherLoop:
-    """Arguments of a kernel: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][first + i]``."""
+    """Loop for arguments of a kernel: ``u[offset + i] = (q0[i] +) h^power sum_b table[n][b] z[b][first + i]``."""
 
     name: str
     first: int
@@ -29,7 +29,7 @@ class GatherLoop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScatterLoop:
-    """Results: ``rows[r][first + i] += weight_n h^power table[n][r] value[offset + i]``; p1 has the last column."""
+    """Loop for results: ``rows[r][first + i] += weight_n h^power table[n][r] value[offset + i]``; p1 is last."""
 
     name: str
     first: int
@@ -41,7 +41,7 @@ class ScatterLoop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeBlock:
-    """Non-zero slopes of a scatter by a gather: ``slope[first + e]`` is d value[i_e] / d u[j_e], i and j sites."""
+    """Nonzero derivatives of a scatter by a gather: ``slope[first + e]`` is d value[i_e] / d u[j_e], i and j sites."""
 
     scatter: int
     gather: int
@@ -51,13 +51,13 @@ class SlopeBlock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Points of one kind with the loops around their kernel.
+    """Stage group: points with the same kernel and the loops around it.
 
     Attributes:
-        arguments: what the gathers give, m each.
+        arguments: names of the gathers, m each.
         value, slope: the kernel, and the kernel with its derivatives.
-        integrand: what is summed along the curve with h^(1 + integrand_power), or ``None``: to the discrete Lagrangian,
-            or, where forces act, to what they give.
+        integrand: summed along the curve with h^(1 + integrand_power), or ``None``: the discrete Lagrangian, or with
+            forces their work and impulse.
     """
 
     name: str
@@ -79,16 +79,16 @@ class Family:
 
     @property
     def uses_time(self) -> bool:
-        """Whether the kernel depends on time explicitly (its slopes then can only do so, too)."""
+        """True if the kernel depends on time explicitly, in its values or derivatives."""
         return self.value.uses_time or self.slope.uses_time
 
     @property
     def uses_step(self) -> bool:
-        """Whether h occurs around the kernel."""
+        """True if h occurs in the loops around the kernel."""
         powers = [loop.power for loop in self.gathers] + [loop.power for loop in self.scatters]
         return self.uses_time or any(powers)
 
     @property
     def scratch(self) -> int:
-        """Arguments, values and slopes at all points."""
+        """Number of arguments, values and derivatives at all points."""
         return self.points * (self.slope.arguments + len(self.slope.results))

@@ -1,4 +1,4 @@
-"""Sums over indices as data: which kernel is evaluated over which loops, on which entries of arrays."""
+"""Indexed systems as data: kernels, their loops, and the entries of arrays that they read and write."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ __all__ = ["HeldSteps", "IndexedProgram", "LoopedKernel"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopedKernel:
-    """A kernel evaluated over loops.
+    """A kernel in loops over indices.
 
     Attributes:
-        text: what is summed, for people.
+        text: the formula.
         loops: outermost first.
         slots: the coordinates (for forces, velocities too) that are the kernel's arguments u.
-        targets: what each value is added to; of a potential the slots.
-        given: the entries of arrays that are its last parameters, behind those that are numbers.
-        kernel: of a potential or a force: a value a target, what is added to the force there (of a momentum: to the
-            velocity); of a mass: one value, added to that of the only target.
+        targets: entries that each value is added to; for a potential the slots.
+        given: the entries of arrays that are its last parameters, after the scalar ones.
+        kernel: of a potential or a force: one value per target, added to the force there (of a momentum: to the
+            velocity); of a mass: one value, added to the mass of the only target.
         scalar: of a potential: L itself.
-        along: how many of the slots, the last, are those of a direction, not of the state.
+        along: number of slots, the last ones, that belong to a direction instead of the state.
     """
 
     text: str
@@ -41,12 +41,12 @@ class LoopedKernel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldSteps:
-    """Steps that constraints hold, by RATTLE.
+    """Constrained steps by RATTLE.
 
     Attributes:
-        conditions: values g, g_t and the slopes of g by each slot, at every element.
-        bends: along velocities, d^2 g / dt^2 of a straight motion.
-        parts: of a step, each of which is one of RATTLE.
+        conditions: g, g_t and the derivatives of g with respect to each slot, at every element.
+        bends: d^2 g / dt^2 at constant velocities.
+        parts: fractions of a step, each of which is a RATTLE step.
     """
 
     conditions: tuple[LoopedKernel, ...]
@@ -56,25 +56,25 @@ class HeldSteps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedProgram:
-    """An integrator of any number of coordinates, without syntax.
+    """Intermediate representation of the integrator of an indexed system.
 
     Attributes:
-        prefix, title, notes: of the text.
+        prefix, title, notes: of the source.
         order: of the method, for the error of its steps.
         sizes: names of the sizes of arrays.
         coordinates, fields, tables: arrays.
-        momenta: of a Hamiltonian, behind the coordinates in the state.
-        velocities: on which forces depend, behind the coordinates at the points.
+        momenta: of a Hamiltonian, after the coordinates in the state.
+        velocities: on which forces depend, after the coordinates at the points.
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
         constants: terms of L, or of -H, without coordinates and momenta, which the energy needs.
-        sweep: the fixed-point iteration of one coordinate, of which the tables serve all; ``forces`` are its kernels.
-        splitting: the kicks and drifts that replace it where the method is explicit.
-        held: what replaces both where there are constraints.
-        control: steps that choose their length, if they are wanted.
-        products, diagonals: the derivatives of the forces times a direction, and their diagonals, where Newton's
-            iteration takes the place of the sweeps.
-        reach: of these, how far they couple places of lattices; 0 where they do not, or not at constant distances.
+        sweep: the fixed-point iteration of one coordinate, whose tables serve all; ``forces`` are its kernels.
+        splitting: the kicks and drifts of an explicit method, instead.
+        held: constrained steps, instead of both.
+        control: adaptive steps, if requested.
+        products, diagonals: the Jacobian of the forces times a direction, and its diagonal, if Newton's method replaces
+            the fixed-point iteration.
+        reach: largest distance of lattice places that these couple; 0 if none, or if distances are not constant.
     """
 
     prefix: str
@@ -102,5 +102,5 @@ class IndexedProgram:
 
     @property
     def error_power(self) -> int:
-        """The power of h with which what a curve leaves unresolved goes; 0 where it tells nothing."""
+        """Exponent of h in the error estimate of a curve; 0 if there is no estimate."""
         return 0 if self.sweep is None or (self.velocities and self.sweep.points == 1) else self.sweep.error_power

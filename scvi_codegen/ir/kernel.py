@@ -1,9 +1,9 @@
-"""A kernel: straight-line arithmetic over its arguments, time and parameters, and loops that add to its values.
+"""Kernels: straight-line arithmetic of arguments, time and parameters, and loops that add to their values.
 
 ``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
 then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
-numbers of the target's scalar type; there are no branches. Terms that differ only in what they take from ``u`` may
-stand in a loop over a table of places (:class:`IndexedSum`).
+numbers of the target's scalar type; there are no branches. Terms that differ only in the elements of ``u`` that they
+read may be a loop over a table of indices (:class:`IndexedSum`).
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class Kernel:
         name: C identifier.
         arguments: length of ``u``.
         temporaries, results: expressions.
-        values: how many of the results are values; the rest are slopes.
-        symbols: what ``u`` holds, in the symbols of the formulas.
-        formulas: what the results were before their common parts were found.
-        purpose: what it computes, one sentence for people.
+        values: number of results that are values; the rest are derivatives (slopes).
+        symbols: of the elements of ``u``, as in the formulas.
+        formulas: the results as expressions.
+        purpose: one sentence on what it computes.
         sums: loops that add to the values once all results are stored, in order.
     """
 
@@ -76,32 +76,32 @@ class Kernel:
             each.check(self)
 
     def with_sums(self, sums: tuple[IndexedSum, ...]) -> Kernel:
-        """The same with further loops, whose terms are called after the kernel."""
+        """Return the kernel with further loops, whose terms are called after it."""
         named = (replace(each, term=replace(each.term, name=f"{self.name}_{each.term.name}")) for each in sums)
         return replace(self, sums=(*self.sums, *named))
 
     @property
     def functions(self) -> tuple[Kernel, ...]:
-        """The kernel and the terms that its loops evaluate."""
+        """The kernel and the terms of its loops."""
         return (self, *(each.term for each in self.sums))
 
     @property
     def uses_arguments(self) -> bool:
-        """Whether any ``u[i]`` occurs."""
+        """True if any ``u[i]`` occurs."""
         return self.uses("u")
 
     @property
     def uses_time(self) -> bool:
-        """Whether ``t`` occurs."""
+        """True if ``t`` occurs."""
         return self.uses("t")
 
     @property
     def uses_parameters(self) -> bool:
-        """Whether any ``parameters[i]`` occurs."""
+        """True if any ``parameters[i]`` occurs."""
         return self.uses("parameters")
 
     def uses(self, array: str) -> bool:
-        """Whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``slope``."""
+        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``slope``."""
         if array == "value" or (self.sums and array == "u"):
             return True
         if array == "slope":
@@ -111,7 +111,7 @@ class Kernel:
         return any(load.source == array for each in (*self.temporaries, *self.results) for load in loads(each))
 
     def operation_counts(self) -> dict[str, int]:
-        """Operations by name, in alphabetical order."""
+        """Return the number of operations by name, in alphabetical order."""
         counts: dict[str, int] = {}
         for expression in (*self.temporaries, *self.results):
             _count(expression, counts)
@@ -122,7 +122,7 @@ class Kernel:
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
-        """("w", "value" or "slope", index, expression): each result right after the last temporary that it needs."""
+        """Yield ("w", "value" or "slope", index, expression): each result right after its last temporary."""
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
             due[1 + _last_temporary(expression)].append(k)
@@ -134,7 +134,7 @@ class Kernel:
                 yield "slope" if slope else "value", number - slope * self.values, self.results[number]
 
     def __str__(self) -> str:
-        """The kernel as readable text, one assignment a line."""
+        """Return the kernel as readable text, one assignment per line."""
         lines = [f"kernel {self.name}(u[{self.arguments}], t, parameters)"]
         for kind, k, expression in self.statements():
             target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
@@ -147,16 +147,16 @@ class Kernel:
 class IndexedSum:
     """A kernel in a loop over an index table: for every row e, value[targets[e][a]] += term_a(u[table[e][..]], ...).
 
-    Rows are taken in order, the targets a of a row in order, so that a loop and the same terms written out one after
-    the other (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. A place may occur in a row twice. The length of
-    the code depends on the term, not on the number of rows; time and parameters are those of the kernel.
+    Rows and the targets a of a row are processed in order, so that a loop and its unrolled form
+    (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. An index may occur in a row twice. The length of the code
+    depends on the term, not on the number of rows; time and parameters are those of the kernel.
 
     Attributes:
-        term: a kernel of as many arguments as slots and constants, of as many values as targets, without slopes and
-            without loops of its own.
-        table: (rows, slots) places in ``u``.
-        given: (constants, rows) what the arguments behind the slots are: numbers, or parameters.
-        targets: (rows, values) places in the values; by default those in ``u``.
+        term: a kernel with as many arguments as slots and constants, as many values as targets, no derivatives and no
+            loops.
+        table: (rows, slots) indices of ``u``.
+        given: (constants, rows) values of the arguments after the slots: numbers, or parameters.
+        targets: (rows, values) indices of the values; by default those of ``u``.
     """
 
     term: Kernel
@@ -166,7 +166,7 @@ class IndexedSum:
 
     @property
     def aims(self) -> tuple[tuple[int, ...], ...]:
-        """The targets, also where they are those of the table."""
+        """The targets, also if they are those of the table."""
         return self.targets or self.table
 
     def check(self, kernel: Kernel) -> None:
@@ -182,13 +182,13 @@ class IndexedSum:
             raise ValueError(f"the tables of '{term.name}' are not of equal length")
 
     def __str__(self) -> str:
-        """One line: the loop."""
+        """Return the loop as one line."""
         given, aims = ", given[..][e]" * bool(self.given), "targets" if self.targets else "table"
         return f"value[{aims}[e][a]] += {self.term.name}(u[table[e]]{given})[a], e < {len(self.table)}"
 
 
 def loads(expression: Expression) -> Iterator[Load]:
-    """What an expression reads."""
+    """Yield the loads of an expression."""
     pending = [expression]
     while pending:
         each = pending.pop()
@@ -199,12 +199,12 @@ def loads(expression: Expression) -> Iterator[Load]:
 
 
 def operations(expression: Expression) -> int:
-    """How many operations an expression has."""
+    """Return the number of operations of an expression."""
     return 1 + sum(map(operations, expression.operands)) if isinstance(expression, Operation) else 0
 
 
 def _last_temporary(expression: Expression) -> int:
-    """The largest index of a temporary in an expression, -1 without one."""
+    """Return the largest index of a temporary in an expression, -1 if there is none."""
     return max((load.index for load in loads(expression) if load.source == "w"), default=-1)
 
 

@@ -1,4 +1,4 @@
-"""Numbers of a program: exact, or known to 50 digits. What is printed is rounded by the target's scalar type, once."""
+"""Numbers of a program, exact or with 50 digits; they are rounded once, when printed, to the target's scalar type."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from scvi_codegen.tables.precision import DIGITS, Matrix, Vector, mp, settled
 __all__ = ["Number", "NumberTable", "exact_number", "lower_matrix", "lower_vector"]
 
 PROMISED = 50
-"""Digits of a table: of the 60 that it is computed with, the last ones are rounding, so that what is 1 is 1."""
+"""Digits of a table; the last of the 60 that it is computed with are rounding errors, and a 1 has to be exactly 1."""
 
 Number: TypeAlias = Any
-"""A ``Fraction``, a number of many digits (``mpf``), or a ``float`` where no more digits are meant."""
+"""A ``Fraction``, a multiprecision number (``mpf``), or a ``float`` if no more digits are intended."""
 
 NumberTable: TypeAlias = tuple[tuple[Number, ...], ...]
 
 
 def lower_vector(numbers: Vector) -> tuple[Number, ...]:
-    """Numbers of a table to the digits that are promised; what is 0 but for rounding is 0."""
+    """Return the numbers of a table to :data:`PROMISED` digits; zeros except for rounding become 0."""
     with mp.workdps(PROMISED):
         return tuple(settled(x) for x in numbers)
 
 
 def lower_matrix(entries: Matrix) -> NumberTable:
-    """The same for the rows of a table."""
+    """Return the rows of a table to :data:`PROMISED` digits."""
     return tuple(lower_vector(line) for line in entries)
 
 
 def exact_number(constant: sympy.Expr) -> Number:
-    """The number that an expression without symbols is: a fraction, or 60 digits of it.
+    """Return the value of an expression without symbols: a fraction, or 60 digits of it.
 
     Raises:
         SystemDefinitionError: if it is not a real number, or beyond the largest double.

@@ -1,8 +1,8 @@
-"""A kernel cut into parts that compilers finish: what they need for a function grows faster than its length.
+"""Division of large kernels into parts: compile times grow faster than the length of a function.
 
-gcc 12 takes 6 of 10 seconds of five post-Newtonian bodies to assign registers in one kernel of 20 000 operations, and
-four minutes on a force of 190 pairs. Cut, each is linear. What one part computes and a later one reads goes through an
-array, ``kept``; the compiler would have spilled most of it.
+gcc 12 spends 6 of 10 seconds for five post-Newtonian bodies on register allocation in one kernel of 20,000 operations,
+and four minutes on a force of 190 pairs. Divided, the time is linear. Values that later parts read are stored in an
+array, ``kept``; the compiler would have spilled most of them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scvi_codegen.ir.kernel import Expression, Kernel, Load, Operation, loads, o
 __all__ = ["LARGEST_PART", "Part", "Statement", "is_cut", "kept_numbers", "parts"]
 
 LARGEST_PART = 1000
-"""Operations of one C function."""
+"""Largest number of operations of one C function."""
 
 Statement: TypeAlias = tuple[str, int, Expression]
 """(kind, index, expression): ``w`` is a temporary of the part, ``kept``, ``value`` and ``slope`` are arrays."""
@@ -25,7 +25,7 @@ Statement: TypeAlias = tuple[str, int, Expression]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """Some consecutive statements of a kernel; loads from ``kept`` are temporaries of earlier parts.
+    """Consecutive statements of a kernel; loads from ``kept`` are temporaries of earlier parts.
 
     Attributes:
         name: C identifier.
@@ -36,7 +36,7 @@ class Part:
     statements: tuple[Statement, ...]
 
     def uses(self, array: str) -> bool:
-        """Whether it reads or writes ``u``, ``t``, ``parameters``, ``kept``, ``value`` or ``slope``."""
+        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``kept``, ``value`` or ``slope``."""
         return any(
             kind == array or any(load.source == array for load in loads(expression))
             for kind, _, expression in self.statements
@@ -44,13 +44,13 @@ class Part:
 
 
 def kept_numbers(cut: Sequence[Part]) -> int:
-    """Length of ``kept``."""
+    """Return the length of ``kept``."""
     return 1 + max((index for part in cut for kind, index, _ in part.statements if kind == "kept"), default=-1)
 
 
 @lru_cache(maxsize=32)
 def parts(kernel: Kernel) -> tuple[Part, ...]:
-    """The kernel in pieces of about equal size; one, if it is short enough."""
+    """Return the kernel in parts of about equal size; one, if it is short enough."""
     pieces = list(_pieces(tuple(kernel.statements())))
     if len(pieces) == 1:
         return (Part(name=kernel.name, statements=pieces[0]),)
@@ -73,12 +73,12 @@ def parts(kernel: Kernel) -> tuple[Part, ...]:
 
 
 def is_cut(kernels: Iterable[Kernel]) -> bool:
-    """Return whether one of the kernels, or a term that its loops evaluate, is several functions."""
+    """Return whether one of the kernels, or a term of its loops, is divided into several functions."""
     return any(len(parts(each)) > 1 for kernel in kernels for each in kernel.functions)
 
 
 def _pieces(statements: Sequence[Statement]) -> Iterator[tuple[Statement, ...]]:
-    """Consecutive statements of about equal numbers of operations."""
+    """Yield consecutive statements with about equal numbers of operations."""
     sizes = [operations(expression) for _, _, expression in statements]
     whole = sum(sizes)
     count = max(1, -(-whole // LARGEST_PART))
@@ -92,12 +92,12 @@ def _pieces(statements: Sequence[Statement]) -> Iterator[tuple[Statement, ...]]:
 
 
 def _temporaries(piece: Sequence[Statement]) -> Iterator[Load]:
-    """Loads of temporaries."""
+    """Return the loads of temporaries."""
     return (load for _, _, expression in piece for load in loads(expression) if load.source == "w")
 
 
 def _replaced(expression: Expression, places: dict[int, int]) -> Expression:
-    """The same, what earlier parts kept read from there."""
+    """Return the expression with temporaries of earlier parts loaded from ``kept``."""
     if isinstance(expression, Load):
         kept = expression.source == "w" and expression.index in places
         return Load("kept", places[expression.index]) if kept else expression

@@ -1,10 +1,10 @@
-"""The intermediate representation: a program is kernels, tables and loops, C without syntax. It prints itself.
+"""The intermediate representation: a program consists of kernels, tables and loops. It prints itself.
 
 A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
 more than once, then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary
-functions; there are no branches, loops or integers. Numbers are exact and rounded when they are printed. Everything
-around the kernels (gather, scatter, Newton, sweeps, the run) is a loop over tables, the same for every method and
-system, and stands in the templates.
+functions; there are no branches, loops or integers. Numbers are exact and rounded when they are printed. The code
+around the kernels (gather, scatter, Newton's method, fixed-point iterations, the run) consists of loops over tables,
+the same for every method and system, and is in the templates.
 """
 
 from __future__ import annotations
@@ -21,16 +21,19 @@ from scvi_codegen.ir.sweeps import Splitting
 __all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
 
 WORTH_REMEMBERING = 32
-"""Unknowns from which on factors of the Newton matrix go from step to step. With 16 (Kepler's problem, degree 8) new
-ones take as long as the additional iterations with old ones, with 34 twice as long, with 144 ten times."""
+"""Number of unknowns from which on factors of the Newton matrix are reused in later steps.
+
+New factors cost as much as the additional iterations with old ones at 16 unknowns (Kepler problem, degree 8), twice as
+much at 34, ten times at 144.
+"""
 
 FEW_UNKNOWNS = 3
-"""Up to so many, equations may be written out in place of loops over tables."""
+"""Largest number of unknowns whose equations may be unrolled instead of loops over tables."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MomentumMap:
-    """What a symmetry conserves, by name and formula; ``exact`` if the method is known to conserve it, too."""
+    """A first integral from a symmetry, by name and formula; ``exact`` if the method is known to conserve it, too."""
 
     name: str
     formula: str
@@ -52,13 +55,13 @@ class Integrals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageCurve:
-    """Of the unknowns of a coordinate, what its curve bends and what it leaves unresolved; tables of (B,) numbers.
+    """Error estimate from the unknowns of a coordinate: leading coefficient and curvature; tables of (B,) numbers.
 
     Attributes:
-        highest, next: h times this sum is what the highest Legendre coefficient of the accelerations moves it by, and
-            the one below, if there is one.
-        bends: h times the absolute sums of these is what the curve bends it by.
-        power: of h in the square of the one over the other.
+        highest, next: h times this sum is the displacement due to the leading Legendre coefficient of the
+            accelerations, and to the next lower one, if any.
+        bends: h times the absolute values of these sums is the displacement due to the curvature.
+        power: exponent of h in the squared leading displacement over that of the curvature.
     """
 
     highest: tuple[Number, ...]
@@ -69,46 +72,47 @@ class StageCurve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
-    """All of an integrator but its syntax.
+    """Intermediate representation of an integrator.
 
     Attributes:
         prefix: C identifier that begins every exported name.
         title: one line, the system and the method.
         notes: lines for the header's comment: order, symmetry, symplecticity.
-        coordinate_names, parameter_names, parameter_defaults: for people and for Python.
+        coordinate_names, parameter_names, parameter_defaults: for comments and for Python.
         sites: the coordinates, then the components of unknowns of other sizes.
         blocks: number of unknowns B at each site.
-        families: points and kernels of the equations that Newton's iteration solves; none without it.
-        places: (sites,) the place of each site in matrices, chosen so that those that meet are near each other.
-        mass_places: (m,) the same of coordinates alone.
-        bandwidth: how many places they are apart at most.
+        families: stage groups of the equations that Newton's method solves; none without it.
+        places: (sites,) position of each site in matrices, in a bandwidth-reducing ordering.
+        mass_places: (m,) the same for the coordinates alone.
+        bandwidth: largest distance of coupled sites in that ordering.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
-        straight: (B,) 1 where the straight-line guess of a block is v0, 0 where it is not.
-        momentum_blocks: (B,) 1 where that guess is p0.
-        moving_blocks: (B,) 1 where h times the block is a length; convergence is judged by these.
-        extrapolation: (B, B) guess for the next step, sum_c table[c][b] z_c; below it the same for multipliers, if any.
-        legendre: p and dp/dv at (q, v); where a Hamiltonian is given, v and dv/dp at (q, p).
-        mass_entries: (i, j) of the slopes of ``legendre``.
-        energy: L at (q, v), from which and ``legendre`` follows the energy; where a Hamiltonian is given, H at (q, p).
-        hamiltonian: whether a Hamiltonian is given.
-        momentum_maps: what is conserved.
-        momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` without any.
-        sweep: the fixed-point iteration tried first, or ``None`` for Newton's alone.
+        straight: (B,) 1 if the straight-line guess of a block is v0, else 0.
+        momentum_blocks: (B,) 1 if that guess is p0.
+        moving_blocks: (B,) 1 if h times the block is a displacement; convergence is tested with these.
+        extrapolation: (B, B) predictor of the next step, sum_c table[c][b] z_c; below it the same for multipliers, if
+            any.
+        legendre: p and dp/dv at (q, v); for a Hamiltonian, v and dv/dp at (q, p).
+        mass_entries: (i, j) of the derivatives of ``legendre``.
+        energy: L at (q, v), which with ``legendre`` gives the energy; for a Hamiltonian, H at (q, p).
+        hamiltonian: whether the system is Hamiltonian.
+        momentum_maps: first integrals from symmetries.
+        momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
+            none.
+        sweep: the fixed-point iteration tried first, or ``None`` for Newton's method alone.
         splitting: the explicit sequence that replaces both, or ``None``.
-        newton: whether Newton's iteration is there at all.
-        acts: whether the equations are those of a discrete Lagrangian, which Newton's iteration gives.
-        order: of the method; where none is claimed, the number of its points.
-        polynomial_curves: whether the highest coefficient of a curve tells what it leaves unresolved.
-        stage_curve: what tells how well the curve of the stages is resolved, or ``None``.
-        numbers: the paper's, of equations for a few unknowns, and of those for q1 and p1; ``""`` where
-            it has none.
-        integrals: what is integrated along a run, or ``None``; the first is the time that passes.
-        exchanges: names of what forces give: energy, and momentum maps; none without forces.
-        constraints: what keeps the motion on them, or ``None``.
+        newton: whether Newton's method is included.
+        acts: whether the equations are those of a discrete Lagrangian, which Newton's method evaluates.
+        order: of the method; the number of its points if none is claimed.
+        polynomial_curves: whether the leading coefficient of a curve is an error estimate.
+        stage_curve: error estimate from the unknowns of Newton's method, or ``None``.
+        numbers: equation numbers of the paper for a few unknowns, and for q1 and p1; ``""`` if it has none.
+        integrals: functions integrated along a run, or ``None``; the first one gives the time.
+        exchanges: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
+        constraints: their kernels, or ``None``.
         damping: the rate of a uniform damping, if there is one.
-        rattle: what is tried before Newton's iteration, where a step is one of RATTLE.
-        inputs: the place of the first of the five parameters of each function of time that is data, by name.
+        rattle: tables of RATTLE, which is tried before Newton's method if applicable.
+        inputs: index of the first of the five parameters of each tabulated input, by name.
     """
 
     prefix: str
@@ -157,12 +161,12 @@ class Program:
 
     @property
     def unknowns(self) -> int:
-        """B numbers a site."""
+        """Number of unknowns: B per site."""
         return self.blocks * self.sites
 
     @property
     def error_power(self) -> int:
-        """Of h in what a run keeps of the error of its curves; 0 where there is none."""
+        """Exponent of h in the recorded error estimate of a run; 0 if there is no estimate."""
         if not self.polynomial_curves:
             return 0
         if self.sweep:
@@ -171,7 +175,7 @@ class Program:
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Every kernel, in the order of emission."""
+        """All kernels, in the order of emission."""
         pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
         along = [family.integrand for family in self.families if self.newton and family.integrand]
         sums = {kernel.name: kernel for kernel in along}
@@ -184,33 +188,33 @@ class Program:
 
     @property
     def held_places(self) -> tuple[int, ...]:
-        """The place of each constraint among them, in the order of the sites."""
+        """Position of each constraint among the constraints, in the order of the sites."""
         own = self.places[self.dimension :]
         return tuple(sorted(own).index(place) for place in own)
 
     @property
     def held_reach(self) -> int:
-        """How far constraints that meet are apart at most, each in its place."""
+        """Largest distance of coupled constraints in this order."""
         places = self.held_places
         return max(abs(places[k] - places[j]) for k, j in self.rattle.entries) if self.rattle else 0
 
     @property
     def action(self) -> bool:
-        """Whether there is a discrete Lagrangian."""
+        """True if there is a discrete Lagrangian."""
         if self.splitting:
             return self.splitting.acts
         return self.newton and self.acts
 
     @property
     def sums(self) -> int:
-        """How many numbers are summed along a curve that Newton's iteration gives: the action, or the exchanges."""
+        """Number of sums along a curve of Newton's method: the action, or work and impulses."""
         if not self.newton:
             return 0
         return len(self.exchanges) if self.exchanges else int(self.action)
 
     @property
     def memory(self) -> int:
-        """Numbers a run remembers of its last step to guess the next."""
+        """Numbers that a run stores of its last steps to predict the next."""
         if self.splitting:
             return self.dimension
         points = self.sweep.memory(self.dimension) if self.sweep else 0
@@ -218,25 +222,26 @@ class Program:
 
     @property
     def remembers_factors(self) -> bool:
-        """Whether Newton's iteration begins a step with the factors of the one before: not if new ones cost little.
+        """True if Newton's method starts a step with the factors of the previous one: not if new ones cost little.
 
-        Nor with constraints, whose slopes turn with the motion: old factors then contract tenfold an iteration.
+        Nor with constraints, whose derivatives rotate with the motion: old factors then reduce the residual only
+        tenfold per iteration.
         """
         worth = self.unknowns >= WORTH_REMEMBERING and not self.constraints
         return self.newton and not self.splitting and worth
 
     @property
     def point(self) -> int:
-        """Numbers that say where the factors were made: time, q0 with what rounding cut off, unknowns."""
+        """Numbers that describe where the factors were computed: time, q0 with its compensation, unknowns."""
         return 1 + 2 * self.dimension + self.unknowns if self.remembers_factors else 0
 
     def matrix_size(self, sites: int, blocks: int) -> int:
-        """Numbers of a matrix with ``blocks`` unknowns a site: its band with room for fill-in, or all of it."""
+        """Return the size of a matrix with ``blocks`` unknowns per site: its band with fill-in, or all of it."""
         rows, reach = sites * blocks, (self.bandwidth + 1) * blocks - 1
         return rows * min(rows, 3 * reach + 1)
 
     def __str__(self) -> str:
-        """Readable text of the whole program."""
+        """Return readable text of the whole program."""
         head = [
             f"program {self.prefix}: {self.title}",
             f"  {self.blocks} blocks of {self.sites} unknowns, bandwidth {self.bandwidth}",

@@ -1,4 +1,4 @@
-"""What every fixed-point iteration declares: its kernels and tables, what it keeps, what its C is put together from."""
+"""Common interface of the fixed-point iterations: kernels, tables, stored values, and their support headers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["GuessTables", "Kept", "Sweep", "SweepTable", "transposed"]
 
 
 class Kept(Enum):
-    """What a sweep keeps at the points of a step, from which the next is guessed and the error of its curve is told."""
+    """Values at the points of a step that are stored for the predictor and the error estimate of the curve."""
 
     FORCES = auto()
     VELOCITIES = auto()
@@ -24,7 +24,7 @@ class Kept(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SweepTable:
-    """A table by its name in C: numbers, one a point, or rows of them; in two parts where one is not exact enough."""
+    """A table by its name in C: one number per point, or rows of them; double-double if necessary."""
 
     name: str
     numbers: tuple[Number, ...] | NumberTable
@@ -32,18 +32,18 @@ class SweepTable:
 
     @property
     def is_matrix(self) -> bool:
-        """Whether it has rows."""
+        """True if it has rows."""
         return isinstance(self.numbers[0], tuple)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuessTables:
-    """(lanes, lanes) tables that continue what was kept at the points: ``last_alone``, or ``last`` and ``before``.
+    """(lanes, lanes) predictor tables for values at the points: ``last_alone``, or ``last`` and ``before``.
 
     Attributes:
-        abscissae: where the kept values stand on a step, without padding.
-        degree, highest, next: (lanes,) what gives the highest Legendre coefficient of the curve through them, and the
-            one below; that is zeros where there is none.
+        abscissae: of the stored values on a step, without padding.
+        degree, highest, next: (lanes,) weights of the leading Legendre coefficient of the curve through them, and of
+            the next lower one; zeros if there is none.
     """
 
     abscissae: tuple[Number, ...]
@@ -56,22 +56,22 @@ class GuessTables:
 
     @property
     def tables(self) -> Iterator[SweepTable]:
-        """By their names in C."""
+        """Tables by their names in C."""
         yield SweepTable("LAST_ALONE", self.last_alone)
         yield SweepTable("LAST", self.last)
         yield SweepTable("BEFORE", self.before)
 
 
 class Sweep(ABC):
-    """A fixed-point iteration whose kernels are evaluated at points that are lanes: data, of which rendering makes C.
+    """Fixed-point iteration whose kernels are evaluated at points on SIMD lanes: data, from which C is rendered.
 
     Attributes:
-        lanes: a power of two, that of the points or more.
-        guess: of what is kept at the points.
-        mass_entries: (i, j), i >= j, of the slopes of the kernel that gives the mass, if one does.
-        kept: at the points of a step.
-        sweeps_after: how many sweeps follow the one after which nothing moves.
-        in_groups: whether its C is written for all points in one vector and for a vector a point.
+        lanes: a power of two, the number of points or more.
+        guess: predictor of the stored values.
+        mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
+        kept: values at the points of a step.
+        sweeps_after: number of iterations after the one that converges.
+        in_groups: whether its C supports several vectors for the points of a step, besides one.
     """
 
     __slots__ = ()
@@ -86,84 +86,84 @@ class Sweep(ABC):
     @property
     @abstractmethod
     def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes."""
+        """Kernels that are evaluated on SIMD lanes."""
 
     @property
     @abstractmethod
     def tables(self) -> Iterator[SweepTable]:
-        """All, in the order in which they are printed."""
+        """All tables, in the order in which they are printed."""
 
     @property
     @abstractmethod
     def parts(self) -> tuple[str, ...]:
-        """What its C is put together from, in order: support headers behind those of the meaning of a lane."""
+        """Support headers of its C, in order, after those of the meaning of a lane."""
 
     @abstractmethod
     def memory(self, dimension: int) -> int:
-        """Numbers kept from step to step."""
+        """Return the number of doubles kept from step to step."""
 
     def with_forces(self, forces: tuple[IndexedSum, ...]) -> Sweep | None:
-        """The same with further forces L_q of positions; ``None`` where these enter in other ways, too."""
+        """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
         return None
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """Macros that its parts ask for."""
+        """Macros that its support headers require."""
         return {}
 
     @property
     def constant_mass(self) -> Kernel | None:
-        """The masses, where they are constant and diagonal."""
+        """Kernel of the masses if they are constant and diagonal."""
         return None
 
     @property
     def changes_part(self) -> str:
-        """The part that carries changes, and slopes back, by the same sweeps; ``""`` where Newton's factors do."""
+        """Support header of tangent and adjoint vectors by fixed-point iteration; ``""`` if there is none."""
         return ""
 
     @property
     def changes_tables(self) -> tuple[SweepTable, ...]:
-        """What that takes beside :attr:`tables`."""
+        """Tables that this header requires besides :attr:`tables`."""
         return ()
 
     @property
     def damping(self) -> Kernel | None:
-        """The rate of a uniform damping, a number of the parameters, where there is one."""
+        """Kernel of the rate of a uniform damping, a function of the parameters, if there is one."""
         return None
 
     @property
     def integral_part(self) -> str:
-        """The part that integrates along the curve; ``""`` where nothing is integrated."""
+        """Support header of integrals along the curve; ``""`` if nothing is integrated."""
         return ""
 
     @property
     def guess_through(self) -> NumberTable:
-        """The table through which what is kept enters the guess; empty where it does so itself."""
+        """Table between the stored values and the predicted ones; empty if they are the same."""
         return ()
 
     @property
     def serves_many(self) -> bool:
-        """Whether lanes may be trajectories."""
+        """True if lanes may be trajectories."""
         return False
 
     @property
     def error_power(self) -> int:
-        """Of h in the square of the displacement by the highest coefficient over that by all but a mean velocity."""
+        """Exponent of h in the squared leading displacement over that of the curvature (all but a mean velocity)."""
         return 2 * self.guess.degree + (0 if self.kept is Kept.VELOCITIES else 2)
 
     @property
     def diagonal(self) -> bool:
-        """Whether the mass matrix is diagonal."""
+        """True if the mass matrix is diagonal."""
         return all(i == j for i, j in self.mass_entries)
 
     @property
     def mass_part(self) -> str:
-        """The part that solves with the mass."""
+        """Support header of solves with the mass matrix."""
         return "diagonal_mass" if self.diagonal else "full_mass"
 
 
 def transposed(table: NumberTable, points: int) -> NumberTable:
-    """Of a padded table; lanes beyond the points neither give nor take."""
+    """Return the transpose of a padded table; lanes beyond the points remain 0."""
     padding = (0,) * (len(table) - points)
     columns = tuple(zip(*table[:points], strict=True))[:points]
     return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))

@@ -26,18 +26,18 @@ class SeparableSweep(Sweep):
         q_n = q0 + h drift[n] v0 + h^2 sum_j product[n][j] F_j / m,     v0 = p0 / m,
         q1 = q0 + h v0 + h^2 sum_j end_position[j] F_j / m,             p1 = p0 + h sum_j end_momentum[j] F_j.
 
-    All tables are padded to ``lanes`` rows and columns, and printed in two parts, so that what their rounding does to
-    the map is 2^-53 times less than what one rounding of a sum does: the energy of a variational method does not drift.
+    All tables are padded to ``lanes`` rows and columns, and printed as double-double numbers, so that their rounding
+    perturbs the map 2^-53 times less than the rounding of a sum: the energy of a variational method does not drift.
 
     Attributes:
         points: real points; lanes beyond repeat the last one and have weight 0.
         lanes: a power of two.
-        abscissae: (lanes,) c_n, where time stands.
+        abscissae: (lanes,) c_n, of the time.
         drift, end_position, end_momentum: (lanes,); product: (lanes, lanes).
         guess: from the forces of former steps to sum_j product[n][j] F_j.
         force: F at (q, t).
         mass: m (no arguments).
-        velocity: (lanes, lanes) V_n = v0 + h sum_j velocity[n][j] F_j / m, where forces depend on velocities.
+        velocity: (lanes, lanes) V_n = v0 + h sum_j velocity[n][j] F_j / m, if forces depend on velocities.
     """
 
     points: int
@@ -56,16 +56,16 @@ class SeparableSweep(Sweep):
 
     kept: ClassVar[Kept] = Kept.FORCES
     sweeps_after: ClassVar[int] = 1
-    """The final one, with all digits of the coefficients."""
+    """Number of iterations after convergence: the final one, with double-double coefficients."""
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes."""
+        """Kernels that are evaluated on SIMD lanes."""
         return (self.force,)
 
     @property
     def tables(self) -> Iterator[SweepTable]:
-        """Most in two parts."""
+        """Tables, most of them double-double."""
         yield SweepTable("ABSCISSA", self.abscissae)
         yield SweepTable("DRIFT", self.drift, in_two_parts=True)
         yield SweepTable("PRODUCT", self.product, in_two_parts=True)
@@ -77,46 +77,46 @@ class SeparableSweep(Sweep):
 
     @property
     def changes_part(self) -> str:
-        """By forces and their slopes."""
+        """Support header of tangent and adjoint vectors, by forces and their derivatives."""
         return "" if self.velocity else "separable_changes"
 
     @property
     def changes_tables(self) -> tuple[SweepTable, ...]:
-        """The transpose of what leads from forces to positions."""
+        """Transposed table from forces to positions."""
         return (SweepTable("PRODUCT_BACK", transposed(self.product, self.points)),)
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """One."""
+        """Support header of the iteration."""
         return ("separable_sweep",)
 
     @property
     def constant_mass(self) -> Kernel:
-        """M."""
+        """Kernel of the constant diagonal masses."""
         return self.mass
 
     @property
     def guess_through(self) -> NumberTable:
-        """From forces to positions."""
+        """Table from forces to positions."""
         return self.product
 
     @property
     def serves_many(self) -> bool:
-        """Always."""
+        """True: lanes may be trajectories."""
         return True
 
     def memory(self, dimension: int) -> int:
-        """The forces at the points in the last two steps."""
+        """Return the number of forces at the points in the last two steps."""
         return 2 * dimension * self.lanes
 
     def with_forces(self, forces: tuple[IndexedSum, ...]) -> SeparableSweep:
-        """See :meth:`Sweep.with_forces`."""
+        """Return the iteration with further forces; see :meth:`Sweep.with_forces`."""
         return replace(self, force=self.force.with_sums(forces))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointSweep(Sweep):
-    """What the two iterations on velocities at the points have in common; tables padded to ``lanes``.
+    """Common part of the two iterations on velocities at the points; tables are padded to ``lanes``.
 
         q_n = q0 + sum_j position[n][j] (h position_weights[j] V_j),    q1 = q0 + sum_j end_position[j] (h .. V_j),
         P_n = p0 + sum_j momentum[n][j] (h momentum_weights[j] F_j),    p1 = p0 + sum_j end_momentum[j] (h .. F_j),
@@ -126,11 +126,11 @@ class PointSweep(Sweep):
     Attributes:
         points: real points g; lanes beyond repeat the last one and have weight 0.
         lanes: a power of two.
-        abscissae: (lanes,) c_n, where time stands.
-        guess: from the velocities of former steps to those of the next.
-        kernel: what gives the velocities.
+        abscissae: (lanes,) c_n, of the time.
+        guess: predictor of the velocities from former steps.
+        kernel: that determines the velocities.
         force: F alone.
-        integrands: what is integrated along the curve, if anything.
+        integrands: functions integrated along the curve, if any.
     """
 
     points: int
@@ -151,12 +151,12 @@ class PointSweep(Sweep):
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes."""
+        """Kernels that are evaluated on SIMD lanes."""
         return (self.kernel, self.force, *((self.integrands,) if self.integrands else ()))
 
     @property
     def tables(self) -> Iterator[SweepTable]:
-        """Those of positions and momenta, what else the kind has, and the guess."""
+        """Tables of positions and momenta, further ones, and the predictor."""
         yield SweepTable("ABSCISSA", self.abscissae)
         yield SweepTable("POSITION", self.position)
         yield SweepTable("POSITION_WEIGHT", self.position_weights)
@@ -169,32 +169,32 @@ class PointSweep(Sweep):
 
     @property
     def further_tables(self) -> tuple[SweepTable, ...]:
-        """Those of one kind alone."""
+        """Tables of one kind of iteration only."""
         return ()
 
     @property
     def uses_time(self) -> bool:
-        """Whether time occurs in a kernel with lanes."""
+        """True if time occurs in a kernel on lanes."""
         return any(kernel.uses_time for kernel in self.kernels)
 
     def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
-        """See :meth:`Sweep.with_forces`."""
+        """Return the iteration with further forces; see :meth:`Sweep.with_forces`."""
         return replace(self, force=self.force.with_sums(forces))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoupledSweep(PointSweep):
-    """A fixed-point iteration on velocities for any regular Lagrangian: V += L_vv^-1 (P - L_v) until nothing moves.
+    """A fixed-point iteration on velocities for any regular Lagrangian: V += L_vv^-1 (P - L_v) to convergence.
 
     The kernel: F, L_v and the mass at (q, V, t).
 
     Attributes:
-        blocks: velocities s that give the curve, g unless the method is an SVI with other points.
-        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, with other points than
-            blocks; else empty.
-        mass_entries: (i, j), i >= j, of the slopes of ``kernel``.
-        followed: whether the kernel gives F_q, F_v and L_vq, too, by which a correction is followed by another, and
-            forces by both.
+        blocks: number of velocities that determine the curve, g unless the method is an SVI with other points.
+        velocity, projection: (lanes, lanes) from the blocks z to V and from points to blocks, if they differ; else
+            empty.
+        mass_entries: (i, j), i >= j, of the derivatives of ``kernel``.
+        followed: whether the kernel gives F_q, F_v and L_vq, too, with which forces and momenta are linearised in the
+            correction.
         damping: its rate, if there is one.
     """
 
@@ -207,51 +207,51 @@ class CoupledSweep(PointSweep):
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Those with lanes; forces that follow are not asked for again."""
+        """Kernels that are evaluated on SIMD lanes; linearised forces are not evaluated again."""
         given = super(CoupledSweep, self).kernels
         return tuple(each for each in given if each is not self.force) if self.followed else given
 
     def memory(self, dimension: int) -> int:
-        """The velocities z of the last two steps."""
+        """Return the number of velocities z of the last two steps."""
         return 2 * dimension * self.lanes
 
     def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
-        """In both kernels: positions come first in the arguments, forces in the values; ``None`` with their slopes."""
+        """Return the iteration with further forces in both kernels; ``None`` if forces are linearised."""
         if self.followed:
             return None
         return replace(self, kernel=self.kernel.with_sums(forces), force=self.force.with_sums(forces))
 
     @property
     def projected(self) -> bool:
-        """Whether the unknowns are not the velocities at the points."""
+        """True if the unknowns are not the velocities at the points."""
         return bool(self.velocity)
 
     @property
     def further_tables(self) -> tuple[SweepTable, ...]:
-        """Between the unknowns and the velocities at the points, where they differ."""
+        """Tables between the unknowns and the velocities at the points, if they differ."""
         tables = (SweepTable("VELOCITY", self.velocity), SweepTable("PROJECTION", self.projection))
         return tables if self.projected else ()
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """Whether unknowns and velocities at the points differ."""
+        """Macro PROJECTED if unknowns and velocities at the points differ."""
         return {"PROJECTED": 1} if self.projected else {}
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Weights, which damping changes, a mass, corrections, the sweep."""
+        """Support headers: damping, weights, mass, corrections, iteration."""
         damped = ("damped_points",) if self.damping else ()
         corrections = "followed_corrections" if self.followed else "corrections"
         return (*damped, "point_weights", self.mass_part, "places", corrections, "coupled_sweep")
 
     @property
     def changes_part(self) -> str:
-        """By velocities, where these are the unknowns and nothing else is carried along."""
+        """Support header of tangent and adjoint vectors, if velocities are the only unknowns."""
         return "" if self.projected or self.damping or self.integrands else "coupled_changes"
 
     @property
     def changes_tables(self) -> tuple[SweepTable, ...]:
-        """Positions from velocities, momenta from forces, and their transposes."""
+        """Tables of positions from velocities, momenta from forces, and their transposes."""
         tables = {
             "CHANGE_POSITION": _weighed(self.position, self.position_weights),
             "CHANGE_MOMENTUM": _weighed(self.momentum, self.momentum_weights),
@@ -261,18 +261,18 @@ class CoupledSweep(PointSweep):
 
     @property
     def integral_part(self) -> str:
-        """Along the velocities."""
+        """Support header of integrals, by the velocities."""
         return "coupled_integrals" if self.integrands else ""
 
     @property
     def serves_many(self) -> bool:
-        """Unless unknowns are projected, or something is integrated."""
+        """True if lanes may be trajectories: unless unknowns are projected."""
         return not self.projected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HamiltonianSweep(PointSweep):
-    """A fixed-point iteration for any Hamiltonian: F = -H_q(q, P), P, V = H_p(q, P), q in turn until nothing moves.
+    """A fixed-point iteration for any Hamiltonian: F = -H_q(q, P), P, V = H_p(q, P), q in turn to convergence.
 
     The kernel: H_p at (q, P, t).
     """
@@ -281,22 +281,22 @@ class HamiltonianSweep(PointSweep):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Weights, the sweep."""
+        """Support headers: weights, iteration."""
         return ("point_weights", "hamiltonian_sweep")
 
     @property
     def integral_part(self) -> str:
-        """Along positions and momenta."""
+        """Support header of integrals, by positions and momenta."""
         return "hamiltonian_integrals" if self.integrands else ""
 
     def memory(self, dimension: int) -> int:
-        """Velocities and forces of the last two steps."""
+        """Return the number of velocities and forces of the last two steps."""
         return 4 * dimension * self.lanes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Splitting:
-    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., those of weight 0 left out.
+    """An explicit step: kick 0, drift 0, kick 1, drift 1, .., without those of weight 0.
 
     Attributes:
         kicks: (n,) p += h kicks[n] L_q.
@@ -304,7 +304,7 @@ class Splitting:
         abscissae: (n,) c_n of the kicks.
         force: L_q at (q, t).
         drift: the constant diagonal of M (no arguments), v = M^-1 p, or v = H_p at p.
-        by_masses: which of both.
+        by_masses: True for M^-1 p.
     """
 
     kicks: tuple[Number, ...]
@@ -316,15 +316,15 @@ class Splitting:
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
-        """Both."""
+        """Kernels of kicks and drifts."""
         return (self.force, self.drift)
 
     @property
     def acts(self) -> bool:
-        """Whether it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
+        """True if it has a discrete Lagrangian in closed form: a single drift, whose velocity is (q1 - q0) / h."""
         return self.by_masses and sum(x != 0 for x in self.drifts) == 1
 
 
 def _weighed(table: NumberTable, weights: tuple[Number, ...]) -> NumberTable:
-    """Columns times weights."""
+    """Return the columns times weights."""
     return tuple(tuple(x * weight for x, weight in zip(row, weights, strict=True)) for row in table)

@@ -1,4 +1,4 @@
-"""Loops of a kernel written out: the same arithmetic in the same order, in a straight line."""
+"""Unrolling of the loops of a kernel: the same arithmetic in the same order, without loops."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["unrolled"]
 
 
 def unrolled(kernel: Kernel) -> Kernel:
-    """The kernel without loops; where compilers contract nothing, both round alike."""
+    """Return the kernel without loops; without contraction of operations by the compiler, both round alike."""
     temporaries, results = list(kernel.temporaries), list(kernel.results)
     for each in kernel.sums:
         for number, aims in enumerate(each.aims):
@@ -22,7 +22,7 @@ def unrolled(kernel: Kernel) -> Kernel:
 
 
 def _placed(each: IndexedSum, number: int, temporaries: list[Expression]) -> list[Expression]:
-    """What a row of the table gives; the temporaries that it needs are appended."""
+    """Return the values of a row of the table; append the temporaries that they need."""
     first = len(temporaries)
     arguments = (*(Load("u", place) for place in each.table[number]), *(column[number] for column in each.given))
 
