@@ -1,13 +1,13 @@
-"""From the Lagrangian to the emitted C on one page of HTML: every equation, table and count, and the C beside them.
+"""Derivation report on one page of HTML, from the Lagrangian to the C: every equation, table and operation count.
 
     >>> from scvi_codegen.methods import SVI
     >>> from scvi_codegen.models.systems import planar_pendulum
     >>> "Euler-Lagrange equations" in derivation_html(planar_pendulum(), SVI(2))
     True
 
-The page needs nothing else: formulas are MathML, pictures inline, no script, no network. What is too long to be read
-is left out, and its size stands in its place (:mod:`scvi_codegen.derivation.page.elision`), so that a large system has
-a page of the same kind.
+The page is self-contained: formulas are MathML, pictures inline, without scripts or network. Formulas that are too long
+are replaced by their size (:mod:`scvi_codegen.derivation.page.elision`), so that the page of a large system remains
+readable.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The named numbers of a method's tables, with their short exact forms."""
+"""Named numbers of a method's tables, with their short exact forms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["entries", "table_entries"]
 
 
 def entries(values: Mapping[sympy.Symbol, Number], method: Method) -> tuple[TableEntry, ...]:
-    """Numbers of a method's tables by symbol, sorted by name and index, with their radicals."""
+    """Return numbers of a method's tables by symbol, sorted by name and index, with their radicals."""
     basis = _basis(method)
     return tuple(
         TableEntry(symbol, value, recognised(value, basis)) for symbol, value in sorted(values.items(), key=_by_name)
@@ -28,7 +28,7 @@ def entries(values: Mapping[sympy.Symbol, Number], method: Method) -> tuple[Tabl
 
 
 def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]:
-    """The named numbers of all tables of a method's equations; those that do not occur in the equations, too."""
+    """Return the named numbers of all tables of a method's equations, also those that do not occur in the equations."""
     tables = [stages.end_position]
     values: dict[sympy.Symbol, Number] = {}
     for family in stages.families:
@@ -51,13 +51,13 @@ def _by_name(item: tuple[sympy.Symbol, Number]) -> tuple[object, ...]:
 
 @lru_cache(maxsize=64)
 def _basis(method: Method) -> tuple[sympy.Expr, ...]:
-    """1 and the roots in the method's nodes and points with their products; () where one has no closed form."""
+    """Return 1 and the roots in the method's nodes and points with their products; () if one has no closed form."""
     forms = list(_closed_forms(method))
     return () if None in forms else radical_basis(x for form in forms for x in form or ())
 
 
 def _closed_forms(method: Method) -> Iterator[Sequence[sympy.Expr] | None]:
-    """The exact points, weights and coefficients behind the method's tables."""
+    """Yield the exact points, weights and coefficients of the method's tables."""
     for part in method.parts:
         if isinstance(part, Tableau):
             exact = exact_tableau(part)

@@ -1,4 +1,4 @@
-"""The closed form of a step: every equation written out, with the paper's numbers, as exact SymPy.
+"""Closed form of a step: all equations as exact SymPy expressions, with the paper's numbers.
 
     >>> from scvi_codegen.methods import SCVI
     >>> from scvi_codegen.models.systems import planar_pendulum
@@ -6,7 +6,7 @@
     (34a) 0 = g*l*m*sin(Q_1) + l**2*m*(Q_1/h**2 - q_k/h**2 - v_0/h)
 
 Entries of nodes' and quadratures' tables appear as named symbols with their values beside them, or as radicals where
-these are short. Nothing is simplified: what stands here is what was derived. The compiled code solves the same
+these are short. Nothing is simplified after the derivation. The compiled code solves the same
 equations with velocities in place of the positions Q^v (:mod:`scvi_codegen.methods.stage_system`); a test compares the
 steps.
 """
@@ -39,23 +39,23 @@ from scvi_codegen.tables.precision import Number
 __all__ = ["StepEquations", "derive"]
 
 MOST_SHOWN = 12
-"""Equations that a notebook shows."""
+"""Largest number of equations that a notebook shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class StepEquations:
-    """The equations of one step, for looking at and for calculating with.
+    """Equations of one step, to display and to compute with.
 
     Attributes:
-        system, method: what was derived.
-        stages: the equations before they were written out.
-        unknowns: what the equations are solved for.
+        system, method: the system and the method.
+        stages: the stage system.
+        unknowns: of the equations.
         state: (q_k, p_k): two tuples of m symbols.
         time: t_k; ``step`` is h.
         equations: as many as unknowns.
         end_position, end_momentum: m equations each, ``residual`` being the new value itself.
         entries: the table entries that occur.
-        initial_guess: of each unknown, on the straight line with velocity ``v_k``.
+        initial_guess: of each unknown, for uniform motion with velocity ``v_k``.
     """
 
     system: MechanicalSystem
@@ -73,7 +73,7 @@ class StepEquations:
 
     @property
     def stage_equations(self) -> tuple[Equation, ...]:
-        """Those of interior stages, multipliers and the Legendre transform."""
+        """Equations of interior stages, multipliers and the Legendre transform."""
         return tuple(equation for equation in self.equations if equation.kind != "IDEL")
 
     @property
@@ -83,7 +83,7 @@ class StepEquations:
 
     @property
     def symmetries(self) -> tuple[Symmetry, ...]:
-        """Those of the system, with what they conserve."""
+        """Symmetries of the system, with their first integrals."""
         return symmetries(self.system)
 
     @property
@@ -94,11 +94,11 @@ class StepEquations:
         return sympy.ImmutableSparseMatrix(size, size, entries)
 
     def numeric(self, expression: sympy.Expr) -> sympy.Expr:
-        """``expression`` with the values of table entries, to 50 digits."""
+        """Return ``expression`` with the values of table entries, to 50 digits."""
         return expression.xreplace({entry.symbol: sympy.Float(str(entry.value), 50) for entry in self.entries})
 
     def matrix_form(self) -> MatrixForm:
-        """The Kronecker form (18) or (21); spectral collocation only.
+        """Return the Kronecker form (18) or (21); spectral collocation only.
 
         Raises:
             MethodError: for other methods.
@@ -108,12 +108,12 @@ class StepEquations:
         return matrix_form(self.system, self.method, self.unknowns, self.state, self.time, self.step)
 
     def to_text(self) -> str:
-        """Plain text: unknowns, equations, end state, guess, tables."""
+        """Return plain text: unknowns, equations, end state, guess, tables."""
         written = text_lines(self.equations, self._end, self.initial_guess, self.entries)
         return "".join(f"{line}\n" for line in (*self._heading(), *written, *self._conserved()))
 
     def to_latex(self) -> str:
-        """LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
+        """Return LaTeX: an ``align*`` environment with the paper's numbers as tags, and the tables."""
         return latex(self.equations, self._end, self.entries, self.symmetries)
 
     @property
@@ -142,7 +142,7 @@ class StepEquations:
         return f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>"
 
     def _repr_latex_(self) -> str | None:
-        """LaTeX of all equations, nothing where a notebook could not show them."""
+        """LaTeX of all equations, nothing if a notebook could not show them."""
         size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
         return self.to_latex() if size <= MOST_SHOWN * LARGEST_SHOWN else None
 
@@ -159,13 +159,13 @@ class StepEquations:
 
 @takes(system=SYSTEM, radicals=SWITCH)
 def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations:
-    """The closed form of one step as the paper writes it.
+    """Return the closed form of one step in the notation of the paper.
 
     Args:
         system: the Lagrangian.
         method: or its name. SVI: (27); SCVI: (34), with its multipliers unless as printed; SC: (18), (21); Runge-Kutta:
             (22).
-        radicals: replace table entries by radicals where they have a short form.
+        radicals: replace table entries by radicals if they have a short form.
     """
     method = as_method(method, system)
     stages = paper_equations(system, method)
@@ -190,7 +190,7 @@ def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = F
 
 
 class _Writer:
-    """Writes a stage system out: gathers into arguments, arguments into kernels, kernels into rows."""
+    """Writer of a stage system: gathers into arguments, arguments into kernels, kernels into rows."""
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages = system, stages
@@ -211,13 +211,13 @@ class _Writer:
         self.values: dict[sympy.Symbol, Number] = {}
 
     def _symbol(self, name: str) -> sympy.Symbol:
-        """A symbol of the derivation, with underscores before its name if the system has one of that name."""
+        """Return a symbol of the derivation, with underscores before its name if the system has one of that name."""
         while name in self.taken:
             name = f"_{name}"
         return sympy.Symbol(name, real=True)
 
     def equations(self) -> tuple[Equation, ...]:
-        """The rows of the stage system, component by component."""
+        """Return the rows of the stage system, component by component."""
         rows = self._rows()
         return tuple(
             Equation(row.number, row.kind, sympy.Add(*rows[r][i]))
@@ -226,7 +226,7 @@ class _Writer:
         )
 
     def end_state(self) -> tuple[tuple[Equation, ...], tuple[Equation, ...]]:
-        """q_{k+1} and p_{k+1}."""
+        """Return q_{k+1} and p_{k+1}."""
         number_q, number_p = self.stages.end_numbers
         position = self._gathered(self.stages.end_position, 0, power=0, scale=sympy.S.One)
         shrunk = sympy.exp(-self.stages.damping * self.step)
@@ -237,7 +237,7 @@ class _Writer:
         )
 
     def guess(self) -> dict[sympy.Symbol, sympy.Expr]:
-        """The straight line."""
+        """Return the initial guess: uniform motion."""
         guess = {}
         for block, symbols in zip(self.stages.blocks, self.unknowns, strict=True):
             rest, moving = (_rational(x) for x in block.straight)
@@ -260,7 +260,7 @@ class _Writer:
         return rows
 
     def _momentum(self, column: int, row: Row) -> sympy.Expr:
-        """The coefficient of p_k: the named entry of q_(k+1) in that column where it is one, else a number."""
+        """Return the coefficient of p_k: the named entry of q_(k+1) in that column if it is one, else a number."""
         table = self.stages.end_position
         name = table.names[0][column] if column < len(table.names[0]) else ""
         if name.startswith("beta") and row.momentum == table.entries[0][column]:
@@ -281,13 +281,13 @@ class _Writer:
                     rows[r][i].append(factor * value)
 
     def _growth(self, family: PointFamily, n: int) -> sympy.Expr:
-        """What damping makes of a weight."""
+        """Return the factor of a weight due to damping."""
         if self.stages.damping == 0:
             return sympy.S.One
         return sympy.exp(self.stages.damping * self._abscissa(family, n) * self.step)
 
     def _abscissa(self, family: PointFamily, n: int) -> sympy.Expr:
-        """Where point n is on the step, by its name."""
+        """Return the abscissa of point n on the step, by its name."""
         prefix, abscissa = "d" if family.name == "quadrature" else "c", family.abscissae[n]
         return self._named("" if abscissa in (0, 1) else f"{prefix}_{n + 1}", abscissa)
 
@@ -318,7 +318,7 @@ class _Writer:
         return self._named(table.names[n][b], table.entries[n][b])
 
     def _named(self, name: str, value: Number) -> sympy.Expr:
-        """The symbol of an entry (``name/2``: half a named one), its value recorded; nameless are small integers."""
+        """Return the symbol of an entry (``name/2``: half a named one) and record its value."""
         if not name:
             return sympy.Integer(int(value))
         if name.startswith("-"):
@@ -330,7 +330,7 @@ class _Writer:
 
 
 def _rational(value: Number) -> sympy.Expr:
-    """Coefficients of p_k and of the straight line: small dyadic numbers and node positions."""
+    """Return a coefficient of p_k or of the straight line: small dyadic numbers and node positions."""
     exact = sympy.nsimplify(sympy.Float(str(value), 30), rational=True, tolerance=sympy.Float("1e-25"))
     return exact if exact.q < 10**6 else sympy.Float(str(value), 17)
 
@@ -340,7 +340,7 @@ def _fraction(value: object) -> sympy.Rational:
 
 
 def _with_radicals(derived: StepEquations) -> StepEquations:
-    """Table entries replaced by their exact forms, where there is one."""
+    """Return the equations with table entries replaced by their exact forms, if there are any."""
     exact = {entry.symbol: entry.exact for entry in derived.entries if entry.exact is not None}
 
     def written(equations: tuple[Equation, ...]) -> tuple[Equation, ...]:

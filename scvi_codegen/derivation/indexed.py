@@ -1,4 +1,4 @@
-"""What is derived of sums over indices, as mathematics: L or H, the slopes of every term by its entries, and a step."""
+"""Derivation of indexed systems: L or H, the derivatives of every term with respect to its entries, and a step."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ DIGITS = 17
 
 
 def derive_sums(system: IndexedSystem, method: Method, *, as_latex: bool = False) -> str:
-    """The kernels that are compiled, with the loops around them, and the equations of a step, as text or LaTeX.
+    """Return the compiled kernels, with the loops around them, and the equations of a step, as text or LaTeX.
 
     Raises:
-        MethodError: for a method without sweeps.
+        MethodError: for a method without fixed-point iteration.
     """
     program = lower_indexed(system, method, "derived")
     if as_latex:
@@ -63,7 +63,7 @@ def _loops_text(loops: Sequence[object], formula: Expr) -> str:
 
 
 def _latex(system: IndexedSystem) -> Iterator[str]:
-    """One line each, in display mode."""
+    """Yield one line each, in display mode."""
     yield rf"\[ {system.latex} \]"
     for term, slopes in system.kernels:
         entries = {slot: latex_entry(access) for slot, access in term.slots}

@@ -1,4 +1,4 @@
-"""The Kronecker forms (18) and (21) of spectral collocation, by Lemmas 2.1 and 2.2, apart from the written-out rows."""
+"""Kronecker forms (18) and (21) of spectral collocation, by Lemmas 2.1 and 2.2, independent of the equations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MatrixForm:
         A, a0: the differentiation matrix on [t_k, t_k + h] without its first row, (s, s), and its first column, (s, 1).
         operator: the Kronecker product that acts on the unknowns.
         left: operator times unknowns plus the known state.
-        residual: a column vector that vanishes on the step.
+        residual: a column vector, 0 for the solution.
     """
 
     A: sympy.ImmutableMatrix
@@ -48,7 +48,7 @@ def matrix_form(
     time: sympy.Symbol,
     step: sympy.Symbol,
 ) -> MatrixForm:
-    """The equations of one step in matrices.
+    """Return the equations of one step in matrices.
 
     Args:
         system, method: m coordinates, degree s.
@@ -98,7 +98,7 @@ def _phase_space_form(
     unknowns: Symbols,
     state: tuple[Symbols, Symbols],
 ) -> MatrixForm:
-    """(21) with H_p = V, -H_q = L_q and P = L_v(Q, V); the positions Q follow from the unknowns V by (15)."""
+    """Return (21) with H_p = V, -H_q = L_q and P = L_v(Q, V); the positions Q follow from the unknowns V by (15)."""
     size, m = A.rows, system.dimension
     q0, p0 = (sympy.Matrix(1, m, part) for part in state)
     V = sympy.Matrix(size, m, unknowns)
@@ -128,7 +128,7 @@ def _frozen_form(
 
 
 def _vec(matrix: sympy.Matrix) -> sympy.Matrix:
-    """Rows stacked atop one another (Definition 2.2)."""
+    """Return the rows stacked on top of each other (Definition 2.2)."""
     return sympy.Matrix(list(matrix))
 
 

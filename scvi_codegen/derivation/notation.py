@@ -16,10 +16,10 @@ from scvi_codegen.tables.precision import Number, mp
 __all__ = ["LARGEST_SHOWN", "Equation", "TableEntry", "html", "latex", "text_lines"]
 
 LARGEST_SHOWN = 400
-"""Operations of an equation that a notebook shows."""
+"""Largest number of operations of an equation that a notebook shows."""
 
 End = Mapping[sympy.Symbol, "Equation"]
-"""The state at the end of a step, by the symbol of the state at its start."""
+"""State at the end of a step, by the symbol of the state at its start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class TableEntry:
 
 @dataclass(frozen=True, slots=True)
 class Equation:
-    """0 = residual.
+    """Equation 0 = residual.
 
     Attributes:
         number: the paper's number, or the variable with respect to which a generating function is stationary.
@@ -56,7 +56,7 @@ class Equation:
 def text_lines(
     equations: Iterable[Equation], end: End, guess: Mapping[sympy.Symbol, sympy.Expr], entries: Sequence[TableEntry]
 ) -> Iterator[str]:
-    """The equations of a step in plain text."""
+    """Yield the equations of a step in plain text."""
     yield "\nequations"
     yield from (f"  {equation}" for equation in equations)
     yield "\nend of the step"
@@ -71,7 +71,7 @@ def text_lines(
 def latex(
     equations: Sequence[Equation], end: End, entries: Sequence[TableEntry], symmetries: Sequence[Symmetry]
 ) -> str:
-    """An ``align*`` environment with numbers as tags, one for the tables, one for the momentum maps."""
+    """Return an ``align*`` environment with numbers as tags, one for the tables, one for the momentum maps."""
     residuals = [equation.residual for equation in (*equations, *end.values())]
     symbols = set(end).union(*(r.free_symbols for r in residuals), (entry.symbol for entry in entries))
     names = {symbol: latex_name(symbol.name) for symbol in symbols}
@@ -96,7 +96,7 @@ def latex(
 
 
 def html(equation: Equation) -> Html:
-    """An equation for a notebook, or its size where that is large."""
+    """Return an equation for a notebook, or its size if that is large."""
     size = sympy.count_ops(equation.residual)
     if size > LARGEST_SHOWN:
         return Html(f"<div>{plain(f'({equation.number}) {size} operations')}</div>")

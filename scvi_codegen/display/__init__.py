@@ -1,1 +1,1 @@
-"""How things show themselves: notebook cards, MathML, tables of numbers, pages of HTML."""
+"""Display of objects: notebook cards, MathML, tables of numbers, pages of HTML."""

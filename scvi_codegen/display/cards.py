@@ -1,4 +1,4 @@
-"""What a notebook shows of an object: a title, facts, tables and small pictures, as HTML in the notebook's colours."""
+"""Notebook cards as HTML: a title, facts, tables and small pictures, in the notebook's colours."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ __all__ = ["Html", "card", "grid", "listed", "plain", "sparkline"]
 
 Html = NewType("Html", str)
 WIDTH, HEIGHT = 180, 28
-"""Of a small picture, in pixels."""
+"""Width and height of a small picture, in pixels."""
 CELL = "text-align:left;padding:0.1em 1em 0.1em 0;vertical-align:middle;white-space:nowrap"
 MOST_NAMES = 12
 
 
 def plain(text: object) -> Html:
-    """Text as HTML."""
+    """Return text as HTML."""
     return Html(escape(str(text)))
 
 
 def listed(names: Sequence[object]) -> Html:
-    """Names with commas between them, those beyond the first dozen as a number."""
+    """Return names with commas between them, and the number of those beyond the first dozen."""
     shown = ", ".join(map(str, names[:MOST_NAMES]))
     return plain(f"{shown}, .. ({len(names)})" if len(names) > MOST_NAMES else shown or "none")
 
 
 def card(title: str, facts: Iterable[tuple[str, Html]], *parts: Html) -> str:
-    """A title, a line for each fact, and what else there is to see.
+    """Return a card: a title, a line for each fact, and further parts.
 
     Args:
         title: text.
@@ -40,7 +40,7 @@ def card(title: str, facts: Iterable[tuple[str, Html]], *parts: Html) -> str:
 
 
 def grid(rows: Iterable[Sequence[Html]], *, head: Sequence[str] = (), caption: str = "") -> Html:
-    """A table; the first cell of a row is its heading."""
+    """Return a table; the first cell of a row is its heading."""
     lines = (
         [f'<caption style="text-align:left;white-space:nowrap;padding:0.5em 0 0.1em">{plain(caption)}</caption>']
         if caption
@@ -55,11 +55,11 @@ def grid(rows: Iterable[Sequence[Html]], *, head: Sequence[str] = (), caption: s
 
 
 def sparkline(values: Sequence[float], label: str) -> Html:
-    """A curve without axes; what is not finite is left out.
+    """Return a curve without axes, without values that are not finite.
 
     Args:
         values: at equal distances.
-        label: what it shows, for those who do not see it.
+        label: description for screen readers.
     """
     finite = [(k, value) for k, value in enumerate(values) if abs(value) < float("inf")]
     low = min((value for _, value in finite), default=0.0)

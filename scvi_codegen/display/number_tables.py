@@ -1,4 +1,4 @@
-"""Nodes, quadratures and Runge-Kutta tableaux as tables to be read: radicals where they are short, and decimals."""
+"""Tables of nodes, quadratures and Runge-Kutta tableaux: radicals if they are short, and decimals."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from scvi_codegen.tables.tableau import Tableau
 __all__ = ["NumberTable", "Part", "decimal", "number_table", "numbers_html", "positions", "short"]
 
 Part: TypeAlias = Nodes | Quadrature | Tableau
-"""What the numbers of a method are made from."""
+"""Parts of a method with numbers."""
 _Column: TypeAlias = tuple[str, Vector, Sequence[sympy.Expr] | None]
-"""Its heading, its numbers and, where they are known, their exact forms."""
+"""Heading, numbers and, if known, exact forms."""
 SHORT = 40
-"""Characters of an exact form that is shown."""
+"""Largest number of characters of an exact form that is shown."""
 SIGNIFICANT = 17
 MOST_ROWS = 12
-"""Of a table in a notebook."""
+"""Largest number of rows of a table in a notebook."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +35,7 @@ class NumberTable:
     """Lines of text and of exact numbers.
 
     Attributes:
-        title: what it is.
+        title: of the table.
         columns: headings.
         rows: as many cells as columns.
     """
@@ -47,7 +47,7 @@ class NumberTable:
 
 @singledispatch
 def number_table(part: Part) -> NumberTable:
-    """All numbers of a part of a method."""
+    """Return all numbers of a part of a method."""
     raise TypeError(f"{part!r} has no numbers to show")
 
 
@@ -67,7 +67,7 @@ def _(quadrature: Quadrature) -> NumberTable:
 
 
 def _listed(title: str, series: range, columns: Sequence[_Column]) -> NumberTable:
-    """A row a point, by its number in the ``series``."""
+    """Return a table with one row per point, numbered by the ``series``."""
     written = [written for column in columns for written in _columns(*column)]
     return NumberTable(
         title=title,
@@ -77,7 +77,7 @@ def _listed(title: str, series: range, columns: Sequence[_Column]) -> NumberTabl
 
 
 def numbers_html(table: NumberTable) -> Html:
-    """The first rows of a table for a notebook."""
+    """Return the first rows of a table for a notebook."""
     rows = [[_cell(cell) for cell in row] for row in table.rows[:MOST_ROWS]]
     left_out = len(table.rows) - len(rows)
     title = f"{table.title} (the first {MOST_ROWS} of {len(table.rows)} rows)" if left_out else table.title
@@ -89,24 +89,24 @@ def _cell(cell: str | sympy.Expr) -> Html:
 
 
 def positions(part: Part) -> Vector:
-    """Where on the step they stand, in [0, 1]."""
+    """Return the abscissae on the step, in [0, 1]."""
     return part.c if isinstance(part, Tableau) else part.abscissae
 
 
 def decimal(value: Number) -> str:
-    """17 digits, as a double needs."""
+    """Return 17 digits, which identify a double."""
     return str(mp.nstr(value, SIGNIFICANT))
 
 
 def short(exact: sympy.Expr | None) -> bool:
-    """Whether an exact form is short enough to be shown."""
+    """Return whether an exact form is short enough to be shown."""
     return exact is not None and len(str(exact)) <= SHORT
 
 
 def _columns(
     name: str, values: Vector, exact: Sequence[sympy.Expr] | None
 ) -> Iterator[tuple[str, tuple[str | sympy.Expr, ...]]]:
-    """The exact column where all its entries are short, and the decimal one where that says more."""
+    """Yield the exact column if all its entries are short, and the decimal one unless all of these are rational."""
     if exact is not None and all(map(short, exact)):
         yield name, tuple(exact)
         if all(x.is_Rational for x in exact):

@@ -1,1 +1,1 @@
-"""Stage system to program, and which solver serves it (:mod:`~scvi_codegen.lowering.solvers`)."""
+"""Lowering of stage systems to programs, and the choice of a solver (:mod:`~scvi_codegen.lowering.solvers`)."""

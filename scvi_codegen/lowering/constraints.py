@@ -1,4 +1,4 @@
-"""Constraints as kernels: values and slopes, and what the multipliers of a state follow from."""
+"""Kernels of constraints: values, derivatives, and the terms of the equation for the Lagrange multipliers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["lowered_constraints"]
 
 
 def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
-    """The constraints of a system, ``None`` without any."""
+    """Return the kernels of the constraints of a system, ``None`` if it has none."""
     if not system.constraints:
         return None
     slopes, rates = constraint_slopes(system), constraint_rates(system)

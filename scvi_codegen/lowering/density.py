@@ -1,8 +1,8 @@
-"""The density of steps: what a monitor g lets them be long by, as a quantity with an equation of motion of its own.
+"""Step density of a time transformation g, integrated by an equation of motion of its own.
 
-With dt = g dtau and rho = 1/g, drho/dtau = -d(log g)/dt along the motion. Leapfrog steps of rho, explicit, between
-those of a symmetric method make one that is symmetric as a whole, on (q, p, rho), whatever the system: it may depend on
-time, and forces may act. Source: E. Hairer, G. Soederlind, SIAM J. Sci. Comput. 26 (2005), section 2.
+With dt = g dtau and rho = 1/g, drho/dtau = -d(log g)/dt along the motion. Explicit leapfrog steps of rho between the
+steps of a symmetric method give a method that is symmetric on (q, p, rho), for any system, also time-dependent or
+forced. Source: E. Hairer, G. Soederlind, SIAM J. Sci. Comput. 26 (2005), section 2.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ __all__ = ["density_of"]
 
 
 def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
-    """Steps that a monitor of the system chooses.
+    """Return the step density of a time-rescaling function of the system.
 
     Args:
-        system: what moves, in time as it is.
-        monitor: as of :func:`~scvi_codegen.mechanics.monitors.monitor_function`, in the time, too.
+        system: in physical time.
+        monitor: as in :func:`~scvi_codegen.mechanics.monitors.monitor_function`, also with functions of time.
 
     Raises:
-        SystemDefinitionError: for a monitor that is none.
+        SystemDefinitionError: for an invalid time-rescaling function.
     """
     g = monitor_function(system, monitor, in_time=True)
     forms = forms_of(system)

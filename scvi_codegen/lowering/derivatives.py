@@ -1,4 +1,4 @@
-"""How the equations of a step depend on parameters and time, and how their slopes do: the kernels, differentiated."""
+"""Derivatives of the stage equations with respect to parameters and time, and their second derivatives, as kernels."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ __all__ = ["derivatives_of"]
 def derivatives_of(
     system: MechanicalSystem, stages: StageSystem, program: Program, *, second: bool = False
 ) -> Derivatives:
-    """What is differentiated beside the unknowns; ``program`` is that of the stage equations ``stages``.
+    """Return the derivatives of ``program``, the program of the stage equations ``stages``, with respect to all inputs.
 
     Args:
-        second: whether second derivatives are wanted, too.
+        second: whether second derivatives are included.
     """
     given = tuple(_given_slopes(system, family.name, family.results, family.arguments) for family in stages.families)
     return Derivatives(
@@ -73,7 +73,7 @@ def _linear_clock(system: MechanicalSystem, arguments: Sequence[Symbol]) -> Line
 
 
 def _level_slopes(system: MechanicalSystem) -> Kernel:
-    """Of the energy E of a state: K = rate (H - E) is 0 on its level, so that E changes by the change of K / rate."""
+    """Kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE is the change of K / rate."""
     assert system.clock is not None
     m, energy = system.dimension, system.clock.energy
     slopes = gradient(system.formula, (*system.coordinates, *system.parameters))
@@ -92,7 +92,7 @@ def _level_slopes(system: MechanicalSystem) -> Kernel:
 
 
 def _curvature(system: MechanicalSystem, family: PointFamily) -> Kernel | None:
-    """The change of a gradient: first along dy, then by each y, so that the Hessian itself is never written out."""
+    """Kernel of the Hessian-vector product of multipliers . results, as the gradient of a directional derivative."""
     depends = (*family.arguments, *system.parameters, system.time)
     multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(family.results))]
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]

@@ -1,4 +1,4 @@
-"""Families of points: kernels with their slopes, gathers and scatters as loops over rounded tables."""
+"""Stage groups: kernels with their derivatives, gathers and scatters as loops over rounded tables."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from scvi_codegen.tables.precision import mp
 __all__ = ["argument_name", "has_action", "lowered_family"]
 
 MOST_COMPARED, UNLIKE = 16, mp.mpf(10) ** -20
-"""Pairs of derivatives written differently that are compared by value, and by how much these may differ."""
+"""Number of pairs of mixed derivatives that are compared by value, and their largest relative difference."""
 
 
 def has_action(system: MechanicalSystem) -> bool:
-    """Whether both ends of a curve determine it; where velocities say nothing of momenta, L_d does not exist.
+    """Return whether the discrete Lagrangian exists as a function of both ends of a step.
 
-    Nor does it where forces act, or constraints hold: momenta are not its slopes.
+    It does not if velocities do not determine momenta, with forces, with constraints, or with damping.
     """
     if system.forces or system.constraints or system.damping != 0:
         return False
@@ -38,7 +38,7 @@ def has_action(system: MechanicalSystem) -> bool:
 
 
 def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) -> Family:
-    """A family of points in loops: its kernel with slopes, and rounded tables."""
+    """Return a stage group in loops: its kernel with derivatives, and rounded tables."""
     slopes, blocks = _slope_blocks(family, sites)
     names = tuple(argument_name(system, gather) for gather in family.gathers)
     u = f"u = ({', '.join(names)})"
@@ -71,7 +71,7 @@ def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) 
 
 
 def _results(family: PointFamily, names: tuple[str, ...]) -> str:
-    """What the kernel of a family gives, in words."""
+    """Return a description of the results of a kernel."""
     if family.computes:
         return family.computes
     if family.name == "node":
@@ -85,7 +85,7 @@ def _results(family: PointFamily, names: tuple[str, ...]) -> str:
 
 
 def _integrand(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel | None:
-    """What is summed along the curve: what forces give, else the scalar of a family where that is an action."""
+    """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
     if given := exchanges(system):
         rates, purpose = [each.rate for each in given], f"What forces give per unit of time, at {u}."
         return system_kernel(system, "exchanges", rates, of=family.arguments, purpose=purpose)
@@ -104,7 +104,7 @@ def _integrand(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel 
 
 
 def argument_name(system: MechanicalSystem, gather: Gather) -> str:
-    """What a gather gives, as the formulas call it."""
+    """Return the name of the arguments of a gather as used in formulas."""
     names = {
         system.coordinates: "q",
         system.velocities: "v",
@@ -118,7 +118,7 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
 
 
 def _slope_blocks(family: PointFamily, sites: Sites) -> tuple[tuple[sympy.Expr, ...], tuple[SlopeBlock, ...]]:
-    """Non-zero slopes, grouped by scatter and gather."""
+    """Return the nonzero derivatives, grouped by scatter and gather."""
     entries = _slopes(family)
     slopes: list[sympy.Expr] = []
     blocks = []
@@ -137,7 +137,7 @@ def _slope_blocks(family: PointFamily, sites: Sites) -> tuple[tuple[sympy.Expr, 
 
 
 def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
-    """Non-zero derivatives of results by arguments; where the results are a gradient, one for both of a pair."""
+    """Return the nonzero derivatives of results with respect to arguments; symmetric for a gradient."""
     entries = jacobian(family.results, family.arguments)
     if family.scalar is None or family.forced:
         return entries
@@ -146,7 +146,7 @@ def _slopes(family: PointFamily) -> dict[tuple[int, int], sympy.Expr]:
 
 
 def _check_symmetry(family: PointFamily, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
-    """Raise :class:`MethodError` if mixed derivatives differ: Newton's iteration would not converge with them."""
+    """Raise :class:`MethodError` if mixed derivatives differ: Newton's method would not converge with them."""
     unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
     for i, j in unlike[:MOST_COMPARED]:
         pair = entries[i, j], entries.get((j, i), sympy.S.Zero)

@@ -1,7 +1,7 @@
-"""A Lagrangian of sums over indices and a method to a program: kernels of terms, tables of one coordinate.
+"""Lowering of indexed systems: kernels of terms, and the tables of one coordinate.
 
-Where masses are constant the tables of a method are the same for every coordinate (they depend on none), so those of a
-system of one coordinate serve all.
+Since masses are constant, the tables of a method are the same for every coordinate, so that those of a system of one
+coordinate serve all.
 """
 
 from __future__ import annotations
@@ -37,28 +37,28 @@ from scvi_codegen.methods.method import Method
 __all__ = ["SOLVERS", "check_solver", "lower_indexed", "one_coordinate", "with_control"]
 
 SOLVERS = ("fixed-point", "newton")
-"""Of the equations of a step: sweeps, and what takes their place."""
+"""Solvers of the equations of a step of an indexed system."""
 
 
 def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) -> None:
-    """Refuse what is none of :data:`SOLVERS`."""
+    """Raise an error unless the solver is one of :data:`SOLVERS`."""
     if solver not in SOLVERS:
         raise error(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
 
 
 def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
-    """A system of the same form: what a method's tables are taken from."""
+    """Return a system with one coordinate and the same form, from which a method's tables are taken."""
     if system.momenta:
-        hamiltonian = "(x**2 + p_x**2)**2"  # of no other form
+        hamiltonian = "(x**2 + p_x**2)**2"  # of no special form
         return HamiltonianSystem.from_text(name=system.name, coordinates=["x"], hamiltonian=hamiltonian)
     return LagrangianSystem.from_text(name=system.name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
 
 
 def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton: bool = False) -> IndexedProgram:
-    """The program of a system by a method, with Newton's iteration in place of sweeps if that is wanted.
+    """Return the program of a system by a method, by fixed-point iteration or Newton's method.
 
     Raises:
-        MethodError: for a method that solves its equations neither explicitly nor by sweeps over positions.
+        MethodError: for a method that is neither explicit nor solved by fixed-point iteration over positions.
     """
     one = one_coordinate(system)
     held = held_steps(system, discretise(one, method), method) if system.constraints else None
@@ -104,7 +104,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
 
 
 def with_control(program: IndexedProgram) -> IndexedProgram | None:
-    """The same with steps that choose their length; ``None`` where its curves tell no error."""
+    """Return the program with adaptive steps; ``None`` if there is no error estimate."""
     if program.sweep is None or not program.error_power:
         return None
     return replace(program, control=control_of_sweep(program.sweep))
@@ -141,7 +141,7 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
 
 
 def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedKernel:
-    """Forces beside L or H."""
+    """Return the kernel of a generalised force."""
     moving = (*system.state, *system.velocities)
     u = [slot for slot, access in force.slots if access.array in moving]
     values = [formula for _, formula in force.targets]
@@ -156,14 +156,14 @@ def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedK
 
 
 def curvature(system: IndexedSystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
-    """The derivatives of forces by positions: times a direction, and their diagonals, by families."""
+    """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
     found = [_derived(system, term, number) for number, term in enumerate(_acting(system))]
     pairs = [pair for pair in found if pair]
     return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
 
 
 def _acting(system: IndexedSystem) -> Iterator[IndexedForce]:
-    """All forces, those of the potentials by their slots."""
+    """Yield all forces, those of the potentials by their slots."""
     for term in system.potentials:
         moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
         slopes = gradient(term.formula, [slot for slot, _ in moving])
@@ -173,7 +173,7 @@ def _acting(system: IndexedSystem) -> Iterator[IndexedForce]:
 
 
 def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
-    """Those of a force; nothing where it does not depend on positions."""
+    """Return the kernels of a force for :func:`curvature`; ``None`` if it does not depend on positions."""
     moving = [(slot, access) for slot, access in force.slots if access.array in system.state]
     u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
     rows = [gradient(formula, u) for _, formula in force.targets]

@@ -1,17 +1,17 @@
-"""Steps of sums over indices that constraints hold: RATTLE, and its symmetric compositions.
+"""Constrained steps of indexed systems: RATTLE, and its symmetric compositions.
 
-A step of h is, with G0 and G1 the slopes of the constraints at its ends,
+A step of h is, with G0 and G1 the derivatives of the constraints at its ends,
 
     p = p0 + h/2 (F0 + G0^T lambda),  q1 = q0 + h M^-1 p  with  g(q1) = 0,
     p1 = p + h/2 (F1 + G1^T mu)                           with  G1 M^-1 p1 + g_t = 0,
 
-symmetric and symplectic on the constrained phase space; compositions of such steps keep constraints after each, and
-have their order where no steps of their own would reach it. Both systems of multipliers are solved by corrections with
-G M^-1 G^T of the step's beginning or end, a sparse matrix whose pattern the tables of a run have.
+symmetric and symplectic on the constrained phase space; compositions of such steps satisfy the constraints after each
+of them and attain their order. Both systems of multipliers are solved iteratively with G M^-1 G^T at the start or end
+of the step, a sparse matrix whose pattern is computed once per run.
 
 Sources: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983);
-S. Reich, SIAM J. Numer. Anal. 33 (1996), of compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
-Chem. 16 (1995), of such corrections.
+S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
+Chem. 16 (1995), on the iteration.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ __all__ = ["held_steps"]
 
 
 def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> HeldSteps:
-    """What such steps need.
+    """Return the kernels and fractions of constrained steps.
 
     Raises:
-        MethodError: for other methods, and for forces of velocities.
+        MethodError: for other methods, and for velocity-dependent forces.
     """
     if system.velocities:
         raise MethodError("with constraints, sums over indices have forces of positions and time alone")
@@ -50,7 +50,7 @@ def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> He
 
 
 def _parts(stages: StageSystem, method: Method) -> Vector:
-    """Of a step by RATTLE: its own parts of h."""
+    """Return the fractions of h of the RATTLE steps of which a step is composed."""
     shape = stages.shape
     if method.fractions and not getattr(method, "drifts_first", False):
         return method.fractions
@@ -63,7 +63,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
 
 
 def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
-    """Of each constraint: its condition, and how straight motions bend away from it."""
+    """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
     for number, term in enumerate(system.constraints):
         held = held_slots(term, system.coordinates)
         u, accesses = [slot for slot, _ in held], tuple(access for _, access in held)

@@ -1,4 +1,4 @@
-"""Kernels of sums over indices: what moves is their arguments, other entries of arrays the last of their parameters."""
+"""Kernels of indexed systems: arguments are the variables, other entries of arrays the last parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["given_of", "kernel_of"]
 
 
 def given_of(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
-    """The entries that do not move."""
+    """Return the entries that are not variables."""
     return tuple(access for slot, access in slots if slot not in u)
 
 
@@ -28,7 +28,7 @@ def kernel_of(
     u: Sequence[Symbol],
     purpose: str,
 ) -> Kernel:
-    """Values of slots, of which ``u`` move."""
+    """Return the kernel of functions of the slots, of which ``u`` are variables."""
     kernel = lower_kernel(
         name,
         arguments=tuple(u),

@@ -1,4 +1,4 @@
-"""Kernels of a system: what every one of them is given beside its formulas."""
+"""Kernels of a system, as functions of its time and parameters."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["damping_kernel", "integrand_kernel", "system_kernel"]
 
 
 def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
-    """What a run of the system integrates along its curve, at the arguments u; ``None`` if nothing."""
+    """Return the kernel of the functions that a run integrates along its curve; ``None`` if there are none."""
     if not system.integrands:
         return None
     return system_kernel(system, name, system.integrands, of=of, purpose="What is integrated along the curve.")
 
 
 def damping_kernel(system: MechanicalSystem) -> Kernel | None:
-    """The rate of a uniform damping; ``None`` without one."""
+    """Return the kernel of the rate of a uniform damping; ``None`` without damping."""
     if system.damping == 0:
         return None
     return system_kernel(system, "damping", (system.damping,), of=(), purpose="The rate gamma of the damping.")
@@ -37,14 +37,14 @@ def system_kernel(
     slopes: Iterable[Expr] = (),
     purpose: str = "",
 ) -> Kernel:
-    """The kernel ``name`` of a system's time and parameters.
+    """Return the kernel ``name`` as a function of the time and parameters of a system.
 
     Args:
-        system, name: whose, and the C identifier.
-        values: what it gives.
-        of: its arguments u.
-        slopes: what it gives beside the values.
-        purpose: what it computes, one sentence, for the comment above it.
+        system, name: the system, and the C identifier.
+        values: expressions of the values.
+        of: the arguments u.
+        slopes: expressions of derivatives, stored after the values.
+        purpose: one sentence on what it computes, for the comment above it.
     """
     kernel = lower_kernel(
         name,

@@ -1,4 +1,4 @@
-"""Which sums over indices couple places of lattices at constant distances, and how far."""
+"""Lattices: indexed systems whose forces couple places at constant distances."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ __all__ = ["reach_of"]
 
 
 def reach_of(arrays: Iterable[Array], families: Iterable[LoopedKernel]) -> int:
-    """How far on an axis forces depend on other places.
+    """Return the largest distance on an axis of places that forces couple.
 
     Args:
-        arrays: of coordinates: lattices are those whose first axes are named sizes, and whose last whole numbers.
-        families: of forces, with the coordinates that each depends on.
+        arrays: of coordinates; in a lattice the first axes are named sizes, the last ones integers.
+        families: term groups of forces, with the coordinates that each depends on.
 
     Returns:
-        0 where no place depends on another, where an array is no lattice, or where a family couples places by a table
-        or all pairs.
+        0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table or all
+        pairs.
     """
     if not all(is_lattice(array) for array in arrays):
         return 0
@@ -39,13 +39,13 @@ def reach_of(arrays: Iterable[Array], families: Iterable[LoopedKernel]) -> int:
 
 
 def is_lattice(array: Array) -> bool:
-    """Whether it has named axes, all before those of whole numbers."""
+    """Return whether an array has named axes, all before those of integer size."""
     named = [bool(axis.name) for axis in array.axes]
     return named[0] and named == sorted(named, reverse=True)
 
 
 def _same_loops(one: Access, other: Access) -> bool:
-    """Whether two entries move together on every axis that both have."""
+    """Return whether two entries have the same index on every axis that both have."""
     pairs = list(zip(one.places, other.places, strict=False))
     return not any(a.table or b.table or a.index != b.index for a, b in pairs)
 

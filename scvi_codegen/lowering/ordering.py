@@ -1,8 +1,9 @@
-"""An order of the coordinates in which those that meet in the equations stand near each other.
+"""Bandwidth-reducing ordering of the coordinates.
 
-Two coordinates meet where a second derivative of the Lagrangian by both does not vanish. The Newton matrix has a block
-for every pair that meets; in a good order the blocks lie in a narrow band, outside of which nothing is stored or
-computed. A chain has bandwidth 1, a ring 2, and where all meet the band is the whole matrix.
+Two coordinates are coupled if a mixed second derivative of the Lagrangian does not vanish. The Newton matrix has a
+block for every coupled pair; in a good ordering the blocks are in a narrow band, outside of which nothing is stored or
+computed. An open chain has bandwidth 1, a closed one 2, and if all coordinates are coupled the band is the whole
+matrix.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Pairs = Iterable[tuple[int, int]]
 
 
 def bandwidth(pairs: Pairs, places: tuple[int, ...]) -> int:
-    """Largest distance of two coordinates that meet, each in its place.
+    """Return the largest distance of two coupled coordinates in an ordering.
 
     >>> bandwidth([(0, 2), (1, 2)], (0, 1, 2))
     2
@@ -26,7 +27,7 @@ def bandwidth(pairs: Pairs, places: tuple[int, ...]) -> int:
 
 
 def places(pairs: Pairs, count: int) -> tuple[int, ...]:
-    """The place of each of ``count`` coordinates: the given order, or the one of Cuthill and McKee if it is narrower.
+    """Return the position of each coordinate: the original order, or reverse Cuthill-McKee if that is narrower.
 
     >>> places([(0, 2), (1, 2)], 3)
     (2, 0, 1)
@@ -40,7 +41,7 @@ def places(pairs: Pairs, count: int) -> tuple[int, ...]:
 
 
 def _cuthill_mckee(met: set[tuple[int, int]], count: int) -> tuple[int, ...]:
-    # Imported here because SciPy is slow to import and most systems do not come here.
+    # Imported here because SciPy is slow to import and most systems do not need it.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 

@@ -1,17 +1,4 @@
-"""Symbolic to program: expressions become straight-line arithmetic, tables and loops are listed.
-
-A kernel's expressions are read into one graph in which equal nodes are the same node. Three rules make sharing cheap
-and complete enough that no separate search for common subexpressions is needed:
-
-* the factors of a product are multiplied left to right in a fixed order (numbers, parameters, composites, coordinates),
-  so 3 mu r^-5 x and 3 mu r^-5 y share all but the last factor;
-* a sum is normalised to content 1 and a positive first term, so a - b, b - a and 2 a - 2 b are one node;
-* every negative power of x is built from 1/x and every half-integer power from sqrt(x); x^(-k/2) for k = 1, 3, 5, 7,
-  frequent in mechanics, are functions of their own, for which vectors have something faster; odd quarters are these
-  times x^(1/4) or x^(-1/4), a root of a root.
-
-Nothing here changes a value but by rounding; ``tests/test_lowering.py`` reads kernels back and compares.
-"""
+"""Lowering of a symbolic system and a method to a program: kernels, tables and loops (:mod:`scvi_codegen.ir`)."""
 
 from __future__ import annotations
 
@@ -60,18 +47,18 @@ def lower(
     rattle: Rattle | None = None,
     symmetries: Sequence[Symmetry] = (),
 ) -> Program:
-    """The program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
+    """Return the program of one step of ``method`` for ``system``; exported C names begin with ``prefix``.
 
     Args:
-        system, method: what is lowered.
+        system, method: the system and the method.
         stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
         sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.sweep_of`).
         splitting: the explicit solver that replaces both
-        (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
-        newton: whether Newton's iteration is emitted; with it the discrete Legendre transforms.
-        rattle: what is tried before Newton's iteration, if a step is one of RATTLE.
-        symmetries: whose momentum maps are emitted.
+            (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
+        newton: whether Newton's method is included; with it the discrete Legendre transforms.
+        rattle: tables of RATTLE, which is tried before Newton's method, if applicable.
+        symmetries: whose momentum maps are included.
     """
     m, sites = system.dimension, sites_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
@@ -131,7 +118,10 @@ def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
 
 
 def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
-    """The paper's numbers: of the last ``count`` rows, where those before them give what occurs in no other; q1, p1."""
+    """Return the paper's equation numbers of the last ``count`` rows, of q1 and of p1.
+
+    The rows before these determine unknowns that occur in no other row.
+    """
     paper = method.paper_form(system)
     known = dict.fromkeys(row.number for row in paper.rows[-count:] if row.number[:1].isdigit())
     rows = ", ".join(f"({number})" for number in known)
@@ -140,10 +130,11 @@ def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str,
 
 
 def _stage_curve(stages: StageSystem) -> StageCurve | None:
-    """Where the unknowns are two or more velocities along the curve, or its first velocity and its accelerations.
+    """Return the error estimate for unknowns that are velocities along a curve, or a first velocity and accelerations.
 
-    Constraints give the velocity at the end by itself, as good as the step. What that of the curve is off it by is the
-    first coefficient that the curve does not have: it tells more than the last that it has, and of one velocity, too.
+    With constraints, the velocity at the end is determined separately, with the accuracy of the step. Its difference
+    from that of the curve is the first Legendre coefficient that the curve does not have: a better estimate than the
+    last one that it has, and also available for one velocity.
     """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
     held = any(block.name == END_VELOCITY for block in stages.blocks)
@@ -169,7 +160,7 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
 
 
 def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:
-    """The highest coefficient of the accelerations that velocities tell, and the one below; 0 beside a known end."""
+    """Return the weights of the leading coefficient of the accelerations, and of the next lower one."""
     if degree is None:
         line = (*(-x for x in cardinal_values(shape.blocks, (mp.one,))[0]), mp.one)
         return [tuple((4 * len(shape.blocks) - 2) * x for x in line), (mp.zero,) * len(line)]
@@ -178,7 +169,7 @@ def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:
 
 
 def _moves(stages: StageSystem, shape: Velocities) -> bool:
-    """Whether the velocities, the first blocks, are all that moves positions."""
+    """Return whether the velocities, the first blocks, are the only unknowns that displace positions."""
     own = len(shape.blocks)
     return own == len({*shape.blocks}) and all(block.moves == (b < own) for b, block in enumerate(stages.blocks))
 
@@ -200,7 +191,7 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
 
 
 def _exchanges(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
-    """What forces give, by names, where a method integrates along a curve."""
+    """Return the names of work and impulses of forces, if the method integrates along a curve."""
     integrates = any(family.in_action for family in stages.families)
     return tuple(each.name for each in exchanges(system)) if integrates else ()
 
@@ -220,14 +211,14 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
 
 
 def _energy_kernel(system: MechanicalSystem) -> Kernel:
-    """The function of the system, from which and the Legendre transform follows the energy."""
+    """Return the kernel of the Lagrangian or Hamiltonian, which with the Legendre transform gives the energy."""
     name, purpose = ("hamiltonian", "H at u = (q, p).") if system.auxiliaries else ("lagrangian", "L at u = (q, v).")
     arguments = forms_of(system).legendre_arguments
     return system_kernel(system, name, (system.formula,), of=arguments, purpose=purpose)
 
 
 def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -> Kernel | None:
-    """Momentum maps, then the sums of the squares of their terms."""
+    """Return the kernel of the momentum maps, then of the sums of the squares of their terms."""
     if not symmetries:
         return None
     maps = [symmetry.momentum_map for symmetry in symmetries]
@@ -242,12 +233,12 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
 
 
 def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:
-    """Pairs of coordinates with a non-zero slope."""
+    """Return the pairs of coordinates with a nonzero derivative."""
     return [pair for family in families for block in family.blocks for pair in block.entries]
 
 
 def comment_text(text: str) -> str:
-    """One printable line that neither ends nor begins a C comment."""
+    """Return one printable line that neither ends nor begins a C comment."""
     line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
     return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
 
@@ -268,7 +259,7 @@ def _geometry(method: Method, system: MechanicalSystem) -> str:
 
 
 def _required_extrapolation(stages: StageSystem, columns: Sequence[int]) -> Matrix:
-    """That of some blocks by themselves, transposed."""
+    """Return the extrapolation table of a group of blocks, transposed."""
     if stages.extrapolation is None or any(block.power != 1 for block in stages.blocks):
         raise TypeError("only stage systems with velocities as unknowns can be lowered")
     return tuple(tuple(stages.extrapolation[i][j] for i in columns) for j in columns)

@@ -1,4 +1,4 @@
-"""Families of terms in loops: what a program computes of a system's large part, added to what is written out."""
+"""Term groups rolled into loops, added to the program of the remaining terms."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["with_sums"]
 
 
 def with_sums(program: Program, of: Rolled) -> Program | None:
-    """The program of ``of.rest`` with the forces and the energy of the families.
+    """Return the program of ``of.rest`` with the forces and the energy of the term groups.
 
-    ``None`` where forces enter otherwise than as values of kernels: in Newton's iteration, in shooting.
+    ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
     """
     forces = tuple(_forces(of, family, number) for number, family in enumerate(of.families))
     energies = tuple(_energy(of, family, number) for number, family in enumerate(of.families))

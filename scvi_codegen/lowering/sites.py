@@ -1,4 +1,4 @@
-"""Where unknowns and equations stand: at the coordinates, or at sites of their own where they have another size."""
+"""Layout of the unknowns: one group of sites per coordinate, then one per component of other unknowns."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["Sites", "sites_of"]
 
 @dataclass(frozen=True, slots=True)
 class Sites:
-    """Groups of blocks of one size, each at as many sites: first those of m components, at the coordinates.
+    """Groups of blocks of the same size, each at as many sites: first those with m components, at the coordinates.
 
     Attributes:
-        first: of each size the first site.
-        columns: of each size the numbers of its blocks, B of them.
-        rows: of each size the numbers of its rows, B of them.
-        count: all sites.
+        first: the first site, by size.
+        columns: the indices of the B blocks, by size.
+        rows: the indices of the B rows, by size.
+        count: number of sites.
     """
 
     first: dict[int, int]
@@ -29,10 +29,10 @@ class Sites:
 
 
 def sites_of(stages: StageSystem, dimension: int) -> Sites:
-    """The sites of stage equations.
+    """Return the sites of stage equations.
 
     Raises:
-        MethodError: unless there are as many blocks, and as many rows, of every size.
+        MethodError: unless there are as many blocks as rows, and equally many, of every size.
     """
     blocks, rows = stages.block_sizes(dimension), stages.row_sizes(dimension)[:-1]
     sizes = [dimension, *sorted({*blocks, *rows} - {dimension})]

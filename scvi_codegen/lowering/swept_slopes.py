@@ -1,4 +1,4 @@
-"""What the forces and momenta of a step by sweeps depend on at its points: kernels, so that changes are swept, too."""
+"""Kernels of the derivatives of forces and momenta at the points, for tangent vectors by fixed-point iteration."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 __all__ = ["swept_slopes"]
 
 MOST_SLOPES = 4096
-"""At a point, of which a step keeps those of all on the stack: a quarter of a megabyte of vectors."""
+"""Largest number of derivatives at a point; those of all points are on the stack, a quarter of a megabyte."""
 NOTHING: Entries = {(0, 0): S.Zero}
-"""In place of no entries: C has no empty arrays."""
+"""Replacement for an empty set of entries: C has no empty arrays."""
 
 
 def swept_slopes(system: MechanicalSystem, sweep: Sweep) -> SweptSlopes | None:
-    """Of a system whose steps the sweep solves; ``None`` where it does not carry changes, or there are too many."""
+    """Return the kernels for a system whose steps are solved by the iteration; ``None`` if unsupported or too large."""
     twin, make = lagrangian_twin(system), MAKERS.get(sweep.changes_part)
     found = make(twin) if twin and make else None
     return found if found and found.count + len(found.given.entries) <= MOST_SLOPES else None
 
 
 def _separable(system: LagrangianSystem) -> SweptSlopes:
-    """By the slopes of forces at u = q; and those of constant masses by parameters."""
+    """Return the derivatives of forces at u = q, and those of constant masses with respect to parameters."""
     forms, q = forms_of(system), tuple(system.coordinates)
     slopes = jacobian(forms.force, q) or NOTHING
     different = tuple(dict.fromkeys(slopes.values()))
@@ -49,7 +49,7 @@ def _separable(system: LagrangianSystem) -> SweptSlopes:
 
 
 def _coupled(system: LagrangianSystem) -> SweptSlopes:
-    """By the slopes of (L_q, -L_v) at u = (q, v), those of L_v by v apart: these are the mass."""
+    """Return the derivatives of (L_q, -L_v) at u = (q, v); those of L_v with respect to v, the mass, separately."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     m = system.dimension
     slopes = jacobian(forms.force, of)
@@ -89,7 +89,7 @@ def _by_given(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Sy
 def _products(
     system: LagrangianSystem, slopes: Entries, different: tuple[Expr, ...], *, size: int
 ) -> tuple[Kernel, Kernel]:
-    """The matrix of slopes, by their different values, times x, and its transpose; one kernel if they are the same."""
+    """Return kernels of the matrix of derivatives times x, and of its transpose; the same kernel if they are equal."""
     number = {value: k for k, value in enumerate(different)}
     x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
     values = [Symbol(f"slope[{k}]", real=True) for k in range(len(different))]

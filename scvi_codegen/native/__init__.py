@@ -1,1 +1,1 @@
-"""C text to a callable module: compilers, flags, cffi, options, and the arguments that cross the border."""
+"""Compilation and loading of C source: compilers, flags, cffi, options, arguments."""

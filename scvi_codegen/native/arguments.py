@@ -14,14 +14,14 @@ __all__ = ["checked_number", "checked_step", "empty_array", "real_array"]
 
 LONGEST_SHOWN = 60
 REAL_KINDS = "iufO"
-"""Not complex numbers, which lose half of themselves when they are converted, nor dates, text and truth values."""
+"""Accepted kinds of numbers: not complex ones, whose imaginary part would be lost, dates, text or truth values."""
 
 
 def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
-    """A contiguous copy in binary64 of real numbers of any shape, layout and byte order; not yet checked to be finite.
+    """Return a contiguous copy in binary64 of real numbers of any shape, layout and byte order, possibly not finite.
 
     Raises:
-        StateError: for anything but real numbers, and where entries are masked.
+        StateError: for anything but real numbers, and for masked entries.
     """
     for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
         unit = getattr(value, word) if hasattr(type(value), word) else None
@@ -46,7 +46,7 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def _shown(value: Any, kind: np.dtype[Any] | None = None) -> str:
-    """A value, or the beginning of it, with the kind of its entries; of text that it is to be left without quotes."""
+    """Return a value, or its beginning, with the kind of its entries; for text with the advice to remove the quotes."""
     said = repr(value)
     said = said if len(said) <= LONGEST_SHOWN else f"{said[:LONGEST_SHOWN]} .."
     if kind is None:
@@ -55,7 +55,7 @@ def _shown(value: Any, kind: np.dtype[Any] | None = None) -> str:
 
 
 def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Room for states; StateError if there is not as much memory."""
+    """Return memory for states; raise StateError if there is not enough."""
     try:
         return np.empty(shape)
     except (MemoryError, ValueError) as error:
@@ -63,7 +63,7 @@ def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def checked_number(value: Any, name: str) -> float:
-    """A finite float."""
+    """Return a finite float."""
     array = real_array(value, name) if type(value) is not float else None
     if array is not None and array.shape != ():
         raise StateError(f"{name} must be a real number, not {value!r}")
@@ -74,7 +74,7 @@ def checked_number(value: Any, name: str) -> float:
 
 
 def checked_step(h: float) -> float:
-    """A finite step other than 0."""
+    """Return a finite step size other than 0."""
     number = checked_number(h, "the step h")
     if number == 0.0:
         raise StateError("the step h is 0: it must be positive, or negative to go back")

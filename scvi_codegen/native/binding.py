@@ -1,7 +1,7 @@
-"""The compiled library as Python calls it: functions, structs, pointers into arrays.
+"""Binding of a compiled library: functions, structs, pointers into arrays.
 
-A library of sweeps alone borrows Newton's iteration from another, which is compiled when a call first asks for it
-(:mod:`scvi_codegen.rendering.fallback`); that call is then made again, from where it began.
+A library with only the fixed-point iteration uses Newton's method of a second library, which is compiled when a call
+first requests it (:mod:`scvi_codegen.rendering.fallback`); that call is then repeated from its start.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ __all__ = ["Binding"]
 
 
 class Binding:
-    """Names and types of one C text.
+    """Names and types of one C source.
 
     Args:
-        library: the text, compiled.
+        library: the compiled source.
         prefix: of its names.
-        workspace: doubles that a call needs.
-        fallback: compiles the library that lends Newton's iteration, if it is borrowed.
+        workspace: doubles that a call requires.
+        fallback: compiles the library with Newton's method, if the source uses a second library.
         origin: an object that can be pickled and the name of its attribute that is this binding.
     """
 
@@ -53,13 +53,13 @@ class Binding:
         return getattr, self._origin
 
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
-        """``<prefix>_<name>``, of this memory if one is given; releases the GIL while it runs."""
+        """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
         own = () if memory is None else (memory,)
         return self._borrowing(function, *own) if self._lacks_fallback else partial(function, *own)
 
     def with_function(self, name: str) -> Self:
-        """This one, or that of the fallback where the function is there alone; MethodError where it is in neither."""
+        """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
         if self._has(name):
             return self
         if self._fallback is None:
@@ -74,12 +74,12 @@ class Binding:
         return self._lender
 
     def with_workspace(self, size: int) -> Self:
-        """This one, whose calls need so many doubles."""
+        """Return this binding with the given number of doubles of workspace."""
         self._workspace = size
         return self
 
     def borrow_fallback(self) -> None:
-        """Compile Newton's iteration, if that is borrowed and was not needed yet."""
+        """Compile the library with Newton's method if it is used and was not required yet."""
         if self._lacks_fallback:
             lender = self.with_function("lent_fallback")
             getattr(self._lib, f"{self._prefix}_borrow_fallback")(lender.function("lent_fallback")())
@@ -89,7 +89,7 @@ class Binding:
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
     def _borrowing(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
-        """The function; a call that asks for the fallback is made again with it, on the memory it began with."""
+        """Return the function; a call that requests the fallback is repeated with it, on the initial memory."""
         memory = self._ffi.buffer(*own) if own else bytearray()
 
         def call(*arguments: Any) -> Any:
@@ -104,23 +104,23 @@ class Binding:
         return call
 
     def constant(self, name: str) -> int:
-        """``<PREFIX>_<NAME>``, of an enumeration."""
+        """Return the enumeration constant ``<PREFIX>_<NAME>``."""
         return int(getattr(self._lib, f"{self._prefix.upper()}_{name}"))
 
     def new(self, what: str) -> Any:
-        """A zeroed ``<prefix>_<what>``, as in ``"run *"``."""
+        """Return a zeroed ``<prefix>_<what>``, as in ``"run *"``."""
         return self._ffi.new(f"{self._prefix}_{what}")
 
     def numbers(self, what: str) -> Any:
-        """Zeroed numbers of C, as in ``"long long *"`` and ``"double[3]"``."""
+        """Return zeroed numbers of C, as in ``"long long *"`` and ``"double[3]"``."""
         return self._ffi.new(what)
 
     def buffer(self, struct: Any) -> Any:
-        """The bytes of a struct, writable."""
+        """Return the bytes of a struct, writable."""
         return self._ffi.buffer(struct)
 
     def records(self, structs: Any) -> NDArray[np.void]:
-        """An array of structs, by the names of their fields; the same memory."""
+        """Return an array of structs, by the names of their fields, in the same memory."""
         item = self._ffi.typeof(structs).item
         layout: Any = {
             "names": [name for name, _ in item.fields],
@@ -132,17 +132,17 @@ class Binding:
         return found
 
     def pointer(self, array: NDArray[Any]) -> Any:
-        """To the first element of a contiguous float64 or int32 array; NULL for an empty one."""
+        """Return a pointer to the first element of a contiguous float64 or int32 array; NULL for an empty one."""
         if not array.size:
             return self.null
         return self._ffi.from_buffer("int[]" if array.dtype == np.int32 else "double[]", array)
 
     def workspace(self) -> Any:
-        """Memory for one call."""
+        """Return memory for one call."""
         return self.pointer(np.empty(self._workspace))
 
     def options(self, options: SolverOptions | None) -> Any:
-        """The C struct, NULL for the defaults."""
+        """Return the C struct, NULL for the defaults."""
         if options is None or checked_options(options) is None:
             return self.null
         return self._ffi.new(
@@ -152,7 +152,7 @@ class Binding:
 
 
 def _format(kind: Any) -> tuple[Any, tuple[int, ...]]:
-    """Of a number or an array of numbers of C: what NumPy calls it, and its shape."""
+    """Return the NumPy type and the shape of a number or an array of numbers of C."""
     shape: tuple[int, ...] = ()
     while kind.kind == "array":
         shape, kind = (*shape, kind.length), kind.item

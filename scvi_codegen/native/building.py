@@ -1,11 +1,11 @@
-"""C text to a loaded library: the compiler's work, the cache, cffi.
+"""Compilation of C source to a loaded library: compiler, cache, cffi.
 
 An integrator is compiled once into a shared library, and its declarations once into cffi's description of them (ABI
-mode: no compiled binding, so no headers of Python, at the price of .2 microseconds a call). Both are kept in the user's
-cache folder under a name made from everything that determines them (:mod:`scvi_codegen.native.fingerprint`). They are
-built in a temporary folder inside the cache and renamed into place, so processes may race without locks; what does not
-match its recorded checksum is built anew. A cache that cannot be written, or that others can write, falls back to a
-temporary folder (:mod:`scvi_codegen.files.cache`).
+mode: no compiled binding, so no headers of Python, at a cost of .2 microseconds per call). Both are stored in the
+user's cache folder under a name that is a digest of everything that determines them
+(:mod:`scvi_codegen.native.fingerprint`). They are built in a temporary folder inside the cache and renamed into place,
+so processes may race without locks; an entry that does not match its recorded checksum is built again. If the cache
+cannot be written, or others can write it, a temporary folder is used (:mod:`scvi_codegen.files.cache`).
 """
 
 from __future__ import annotations
@@ -58,41 +58,47 @@ __all__ = [
 ]
 
 TUNED_FLAGS = ("-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
-"""For a stepper used where it is compiled; no ``-ffast-math``: NaN, infinities and the order of sums are kept."""
+"""Flags of a stepper used where it is compiled, without ``-ffast-math``: NaN, infinities and orders of sums are kept.
+"""
 
 PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
-"""For code that must give the same bits on every IEEE 754 machine with the same libm."""
+"""Flags of code that must give the same bits on every IEEE 754 machine with the same libm."""
 
 DECLARATIONS, DIRECTIVE = "declarations.h", re.compile("^#", re.MULTILINE)
-"""What Python is told of a library, and what in it depends on the processor."""
+"""File of the declarations for cffi, and a pattern of the directives in it that depend on the processor."""
 
 CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
-"""With -O3, for text with kernels cut into functions: these passes take gcc a tenth of its time and look for common
-parts, which were found before; steps take as long without them."""
+"""Flags in addition to -O3 for kernels divided into functions.
+
+These passes take a tenth of gcc's time and search for common subexpressions, which are already shared; steps take as
+long without them.
+"""
 
 ROLLED_FLAGS = ("--param=max-completely-peel-times=4",)
-"""With -O3, for one trajectory: loops over more coordinates stay loops, which gcc turns into vectors; written out they
-become a heap of scalars (leapfrog of 8 masses: half as long again). The lanes of ensembles must be written out."""
+"""Flags in addition to -O3 for one trajectory: without unrolling, gcc vectorises loops over coordinates.
+
+Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The lanes of ensembles must be unrolled.
+"""
 
 WRITTEN_OUT = frozenset({"support/newton_solver.h", "support/shooting_sweep.h"})
-"""Steps of one trajectory whose short loops, over unknowns or functions of points, take a tenth longer as loops."""
+"""Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
 
 SHARED_BY_THREADS, THREADS = "support/indexed_threads.h", ("-DSCVI_THREADS", "-pthread")
-"""A part of a text whose steps threads may share, and what it is compiled and linked with for that."""
+"""Header of sources whose steps threads may share, and the flags for them."""
 
 COMPILE_SECONDS = 600
 NOT_RUN = (126, 127)
 ATTEMPTS = 3
-"""To load what another process may remove at any time."""
+"""Number of attempts to load an entry that another process may remove at any time."""
 _loaded: dict[str, Library] = {}
 _locks: dict[str, threading.Lock] = {}
-"""One a library, so that threads compile it once; a process that is forked off starts with none held."""
+"""One lock per library, so that threads compile it once; a forked process starts with none."""
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_locks.clear)
 
 
 class Library(NamedTuple):
-    """A loaded library: ``lib`` has its functions, ``ffi`` their types, ``path`` is where it was loaded from."""
+    """A loaded library: its functions ``lib``, their types ``ffi``, and the ``path`` it was loaded from."""
 
     lib: Any
     ffi: Any
@@ -100,12 +106,12 @@ class Library(NamedTuple):
 
 
 def load(source: Source, *, flags: tuple[str, ...] = TUNED_FLAGS) -> Library:
-    """The library of a source, from memory, from the cache or built now.
+    """Return the library of a source, from memory, from the cache or compiled now.
 
-    Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` follow, and so override, those given.
+    Flags in the environment variable ``SCVI_CODEGEN_CFLAGS`` are appended, and so override, those given.
 
     Raises:
-        BuildError: without a compiler, or if it refuses the text.
+        BuildError: without a compiler, or if it rejects the source.
     """
     compiler = find_compiler()
     key = fingerprint(source, flags=flags)
@@ -129,14 +135,14 @@ def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, 
 
 
 def _load_from(folder: Path, source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> Library:
-    """The library in a folder, put there first if need be; OSError if that cannot be done."""
+    """Return the library in a folder, compiled if necessary; raise OSError if that is impossible."""
     entry = folder / name
     for _ in range(ATTEMPTS):
         if _is_intact(entry):
             try:
                 library = _open(entry)
             except ImportError:
-                discard(entry)  # a foreign library: build it anew
+                discard(entry)  # a library of another platform: build it again
             else:
                 touch(entry)
                 return library
@@ -159,12 +165,12 @@ def _binding(entry: Path) -> Path:
 
 
 def _checksum(entry: Path) -> str:
-    """Of the library and its binding."""
+    """Return the checksum of the library and its binding."""
     return hashlib.sha256(_library(entry).read_bytes() + _binding(entry).read_bytes()).hexdigest()
 
 
 def _is_intact(entry: Path) -> bool:
-    """Whether library and binding are there, are those that were recorded, and nobody else can have put them there."""
+    """Return whether library and binding exist, match the recorded checksum, and are not writable by others."""
     try:
         recorded = json.loads((entry / "manifest.json").read_text())
         found = _checksum(entry)
@@ -175,10 +181,10 @@ def _is_intact(entry: Path) -> bool:
 
 
 def _open(entry: Path) -> Library:
-    """The library of an entry; ImportError if there is none that can be loaded."""
+    """Return the library of an entry; raise ImportError if none can be loaded."""
     described = ModuleType(entry.name)
     try:
-        loader = SourceFileLoader(entry.name, str(_binding(entry)))  # not imported, which would write beside it
+        loader = SourceFileLoader(entry.name, str(_binding(entry)))  # not imported, which would write a cache file
         exec(loader.source_to_code(_binding(entry).read_bytes(), str(_binding(entry))), described.__dict__)
         return Library(described.ffi.dlopen(str(_library(entry))), described.ffi, _library(entry))
     except (OSError, ValueError) as error:
@@ -186,7 +192,7 @@ def _open(entry: Path) -> Library:
 
 
 def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], entry: Path) -> None:
-    """Build beside the entry and rename into place; a racing process that was first wins."""
+    """Build in a temporary folder and rename into place; if another process was first, its entry is used."""
     make_folder(entry.parent)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=entry.parent, ignore_cleanup_errors=True) as folder:
         built = Path(folder) / entry.name
@@ -214,7 +220,7 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 
 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
-    """The parts at the same time, each in a process; then one library of them, and what describes it."""
+    """Compile the parts concurrently, one process each; then link them, and write the binding."""
     source.write(folder)
     is_cut = any("support/parts.h" in each.files for each in source.sources)
     cut = CUT_FLAGS if is_cut and _takes_flags(compiler, CUT_FLAGS) else ()
@@ -244,7 +250,7 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
 
 
 def _declarations(source: Source, command: list[str], folder: Path) -> str:
-    """What Python is told of a library; where that depends on the processor, as the compiler takes it."""
+    """Return the declarations for cffi; those that depend on the processor are preprocessed by the compiler."""
     text = "".join(each.declarations for each in source.sources)
     if not DIRECTIVE.search(text):
         return text
@@ -259,7 +265,7 @@ def _declarations(source: Source, command: list[str], folder: Path) -> str:
 
 def _write_binding(declarations: str, folder: Path) -> None:
     from cffi import FFI  # only building needs the parser; loading does not
-    from cffi.recompiler import make_py_source  # what FFI.emit_python_code calls, without its message on stdout
+    from cffi.recompiler import make_py_source  # called by FFI.emit_python_code, without its message on stdout
 
     binding = FFI()
     binding.cdef(declarations)
@@ -269,7 +275,7 @@ def _write_binding(declarations: str, folder: Path) -> None:
 
 @cache
 def _takes_flags(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
-    """Whether the compiler knows them: clang refuses most passes of gcc."""
+    """Return whether the compiler accepts flags: clang rejects most passes of gcc."""
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder, "empty.c")
         empty.touch()
@@ -281,7 +287,7 @@ def _takes_flags(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
 
 
 def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple[str, ...]:
-    """What gcc does otherwise than -O3 says."""
+    """Return further flags of gcc for a source, with -O3."""
     if "-O3" not in flags:
         return ()
     rolled = ROLLED_FLAGS if "support/run.h" in part.files and WRITTEN_OUT.isdisjoint(part.files) else ()
@@ -289,7 +295,7 @@ def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple
 
 
 def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
-    """Definitions and libraries to try in turn: glibc's vector functions in a tuned build on x86-64, then libm."""
+    """Return definitions and libraries to try in turn: glibc's vector functions if tuned for x86-64, then libm."""
     plain: tuple[list[str], list[str]] = ([], ["-lm"])
     name, version = platform.libc_ver()
     modern = name == "glibc" and tuple(int(part) for part in version.split(".")[:2]) >= (2, 22)
@@ -299,14 +305,14 @@ def _mathematics(flags: tuple[str, ...]) -> list[tuple[list[str], list[str]]]:
 
 
 def run_compiler(command: list[str], folder: Path) -> None:
-    """Run it in a folder; BuildError if it fails."""
+    """Run a compiler in a folder; raise BuildError if it fails."""
     with _finished(command, folder):
         pass
 
 
 @contextmanager
 def _finished(command: list[str], folder: Path) -> Iterator[None]:
-    """A command that runs beside what is done in the context, whose end waits for it; BuildError where it fails."""
+    """Context in which a command runs concurrently, and which waits for it; raises BuildError if it fails."""
     with running(command, folder) as process:
         yield
         try:

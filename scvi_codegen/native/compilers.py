@@ -1,4 +1,4 @@
-"""Which command compiles C, what it says of itself, and what to try where there is none that works."""
+"""C compilers: search, version, and advice if none works."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WHEEL = "take one from a wheel: pip install 'scvi-codegen[compiler]' (ziglang)"
 
 
 def find_compiler() -> tuple[str, ...]:
-    """The command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
+    """Return the command that compiles C: ``$CC``, else cc, gcc or clang, else the ``ziglang`` wheel.
 
     Raises:
         BuildError: if there is none.
@@ -44,7 +44,7 @@ def find_compiler() -> tuple[str, ...]:
 
 
 def words_of(variable: str) -> tuple[str, ...]:
-    """The words of an environment variable, as a shell splits them.
+    """Return the words of an environment variable, split as by a shell.
 
     Raises:
         BuildError: if a quote is not closed.
@@ -60,12 +60,12 @@ def words_of(variable: str) -> tuple[str, ...]:
 
 
 def from_wheel(compiler: tuple[str, ...]) -> bool:
-    """Whether a command is the compiler of the extra ``compiler``."""
+    """Return whether a command is the compiler of the extra ``compiler``."""
     return "ziglang" in compiler
 
 
 def compiler_title() -> str:
-    """The first line that the compiler says of its version."""
+    """Return the first line of the compiler's version."""
     return _title_of(find_compiler())
 
 
@@ -76,7 +76,7 @@ def _title_of(command: tuple[str, ...]) -> str:
 
 @cache
 def compiler_version(compiler: tuple[str, ...]) -> str:
-    """What tells compilers apart: the file that is run, or what a command of several words says of itself."""
+    """Return an identification of the compiler: its file, or the version printed by a command of several words."""
     if len(compiler) == 1:
         file = Path(shutil.which(compiler[0]) or compiler[0]).resolve()
         with suppress(OSError):
@@ -86,7 +86,7 @@ def compiler_version(compiler: tuple[str, ...]) -> str:
 
 
 def _said_by(compiler: tuple[str, ...]) -> str:
-    """What it says of its version."""
+    """Return the version that the compiler prints."""
     settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
     try:
         return str(subprocess.run([*compiler, "--version"], check=False, **settings).stdout)
@@ -95,7 +95,7 @@ def _said_by(compiler: tuple[str, ...]) -> str:
 
 
 def another_compiler(command: list[str]) -> str:
-    """What to try where this compiler, its headers or its linker are not whole."""
+    """Return advice for an incomplete compiler, e.g. without headers or linker."""
     if from_wheel(tuple(command)):
         return ""
     return f"\nif this compiler is not whole, {WHEEL}, and set CC='python -m ziglang cc'"

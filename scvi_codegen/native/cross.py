@@ -1,4 +1,4 @@
-"""A source as a library for another machine, by the cross compiler of the extra ``compiler``."""
+"""Cross-compilation of a source for another platform, by the compiler of the extra ``compiler``."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ TARGETS = {
     "x86_64-linux": "x86_64-linux-gnu.2.17",
     "x86_64-windows": "x86_64-windows-gnu",
 }
-"""What the compiler calls the platforms that FMI names; for Linux with the oldest C library that one of the two has."""
+"""Compiler's names of the platforms of FMI; for Linux with the oldest C library that both architectures support."""
 
 
 def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> bytes:
-    """A shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
+    """Return a shared library for a platform of :data:`TARGETS`: equal sources and flags give equal bytes.
 
     Raises:
-        BuildError: without the extra ``compiler``, or if it refuses the text.
+        BuildError: without the extra ``compiler``, or if it rejects the source.
     """
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError(f"for {platform} it takes a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)")

@@ -1,4 +1,4 @@
-"""The name of compiled code: digits made from everything that determines it, so that none is taken for another."""
+"""Fingerprint of compiled code: a digest of everything that determines it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scvi_codegen.rendering.source import Source
 __all__ = ["FLAGS_VARIABLE", "fingerprint"]
 
 FLAGS_VARIABLE = "SCVI_CODEGEN_CFLAGS"
-"""Not ``CFLAGS``, which package managers set for other ends: an ``-march`` in it would undo the tuning unseen."""
+"""Variable of further flags; not ``CFLAGS``, where package managers may set an ``-march`` that overrides the tuning."""
 
 
 def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
-    """Return 24 digits made from all that determines the compiled code: text, compiler, flags, cffi, processor.
+    """Return 24 digits of a digest of everything that determines the compiled code: source, compiler, flags, processor.
 
     Raises:
         BuildError: without a compiler.
@@ -41,19 +41,19 @@ def fingerprint(source: Source, *, flags: tuple[str, ...]) -> str:
 
 
 def _tuned(compiler: tuple[str, ...], flags: tuple[str, ...]) -> bool:
-    """Whether any flag, wherever it stands, asks for the instructions of this processor (-march, -mcpu, -mtune)."""
+    """Return whether any flag selects the instructions of this processor (-march, -mcpu, -mtune)."""
     return "=native" in " ".join((*compiler, *flags, os.environ.get(FLAGS_VARIABLE, "")))
 
 
 @cache
 def _commands() -> str:
-    """Return the text of the module that chooses further flags and libraries by what the source includes."""
+    """Return the source of the module that chooses further flags and libraries."""
     return Path(__file__).with_name("building.py").read_text(encoding="utf-8")
 
 
 @cache
 def _processor() -> str:
-    """What ``-march=native`` depends on."""
+    """Return what ``-march=native`` depends on: model and features of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

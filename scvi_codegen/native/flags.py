@@ -1,7 +1,7 @@
-"""Compiler flags that a recorded run may name: choices of optimisation, precision, processor and warnings.
+"""Compiler flags that a recorded run may contain: optimisation, precision, processor and warnings.
 
-A flag can make a compiler run another program (``-wrapper``, ``-fplugin=``) or read and write files, so a folder of
-somebody else names none but these. Others are given by their user, in the environment variable SCVI_CODEGEN_CFLAGS.
+A flag can make a compiler run another program (``-wrapper``, ``-fplugin=``) or read and write files, so a folder from
+somebody else may contain only these. Others can be set in the environment variable SCVI_CODEGEN_CFLAGS.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ALLOWED = re.compile(
 
 
 def check_flags(flags: Sequence[str], error: type[ValueError] = ValueError) -> None:
-    """Raise an error for a flag that is not among those allowed."""
+    """Raise an error for a flag that is not allowed."""
     for flag in flags:
         if not isinstance(flag, str) or not ALLOWED.fullmatch(flag):
             raise error(

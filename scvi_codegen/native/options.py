@@ -1,4 +1,4 @@
-"""What a caller may set and what a step may answer: solver options, status codes, advice for each failure."""
+"""Solver options, status codes of steps, and advice for each failure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["FAILURES", "NOT_CONVERGED", "STATUS", "SolverOptions", "checked_opti
 
 STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
 NEEDED = 6
-"""Newton's iteration is needed, and is not there (:mod:`scvi_codegen.native.binding`), or had no memory."""
+"""Status of a step that requires Newton's method (:mod:`scvi_codegen.native.binding`), or memory for it."""
 
 NOT_CONVERGED = "not converged"
 FAILURES = {
@@ -46,7 +46,7 @@ FAILURES = {
         "Free memory, or use solver='fixed-point' with a smaller step",
     ),
 }
-"""By status: what failed, and what to do."""
+"""Cause and remedy of a failure, by status."""
 
 
 MOST_ITERATIONS = 10**6
@@ -54,7 +54,7 @@ MOST_ITERATIONS = 10**6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverOptions:
-    """When the iteration on the stage equations has converged.
+    """Convergence criterion of the iteration on the stage equations.
 
     Attributes:
         tolerance: size of the last update relative to the state (default: round-off), or absolute.
@@ -75,7 +75,7 @@ class SolverOptions:
 
 
 def checked_options(options: SolverOptions | None) -> SolverOptions | None:
-    """The options, or StateError for something else."""
+    """Return the options; raise StateError for another type."""
     if options is not None and not isinstance(options, SolverOptions):
         raise StateError(f"options must be SolverOptions(...), not {options!r}")
     return options
@@ -90,7 +90,7 @@ def step_failure(
     kept: object = None,
     failures: Mapping[str, tuple[str, str]] = FAILURES,
 ) -> StepFailedError:
-    """The exception for a failed step: which, when, by what h (0: its own), why, what to do; what was ``kept``."""
+    """Return the exception for a failed step: number, time, step size (0: adaptive), cause, remedy, results so far."""
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
     what, remedy = failures[word]

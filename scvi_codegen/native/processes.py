@@ -1,4 +1,4 @@
-"""Programs that must not outlive what waits for them: compilers, with all the processes that they start."""
+"""Child processes that end with their parent: compilers, with all the processes that they start."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from scvi_codegen.errors import BuildError
 __all__ = ["running"]
 
 GUARDED = 'exec 3<&0 </dev/null; (read -r end <&3; kill -KILL 0) >/dev/null 2>&1 & exec 3<&-; exec "$@"'
-"""The program, and beside it in its process group what ends them all when the pipe from Python closes, as it does also
-where Python is killed."""
+"""Shell command that runs a program and kills its process group when the pipe from Python closes."""
 
 
 @contextmanager
 def running(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program in a folder, its temporary files there too; ended with all its children when the context is left.
+    """Context in which a program runs in a folder; it is killed with its children at the end.
 
-    A program that cannot be run has the status 126 or 127, as of a shell. Without POSIX it is the program alone that is
-    ended, and not where Python is killed.
+    Its temporary files are in the folder, too. A program that cannot be run has the status 126 or 127, as in a shell.
+    Without POSIX only the program itself is killed, and not if Python is killed.
     """
     with (_guarded if os.name == "posix" else _alone)(command, folder) as process:
         yield process

@@ -19,13 +19,13 @@ LOGGER = logging.getLogger("scvi_codegen")
 
 
 def _print(what: str) -> None:
-    """A line on stderr, be it a terminal or a file."""
+    """Print a line on stderr, also if it is a file."""
     if sys.stderr is not None:
         print(f"scvi-codegen: {what} ...", file=sys.stderr, flush=True)
 
 
 def _tell_the_terminal(what: str) -> None:
-    """A line where a person waits for it."""
+    """Print a line on stderr if it is a terminal."""
     if sys.stderr is not None and sys.stderr.isatty():
         _print(what)
 
@@ -34,13 +34,13 @@ _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 
 
 def tell(what: str) -> None:
-    """Say it now, also where nobody looks until the work is done: how long that takes, say."""
+    """Announce a message now, e.g. the expected duration of a computation."""
     (_listener.get() or _print)(what)
 
 
 @contextmanager
 def waiting_for(what: str) -> Iterator[None]:
-    """Announce what is being done if it takes longer than a second."""
+    """Announce a computation if it takes longer than a second."""
     listener = _listener.get() or _tell_the_terminal
 
     def announce() -> None:
@@ -58,7 +58,7 @@ def waiting_for(what: str) -> Iterator[None]:
 
 @contextmanager
 def told_to(listener: Callable[[str], None]) -> Iterator[None]:
-    """Have it said to a function, from a thread of its own, instead of on a terminal's stderr."""
+    """Context in which announcements are passed to a function, from a separate thread, instead of stderr."""
     token = _listener.set(listener)
     try:
         yield

@@ -1,1 +1,1 @@
-"""Program to C text: expressions printed, templates filled, texts remembered."""
+"""Rendering of programs as C source: printing of expressions, templates, cache of sources."""

@@ -1,4 +1,4 @@
-"""Steps that choose their own length as C: the header with the ladder's tables."""
+"""Adaptive steps as C: the header with the predictor tables."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ HEAD = "/* From what is kept of former steps to a guess of the next: by changes 
 
 
 def ladder_text(ladder: Ladder) -> str:
-    """The header."""
+    """Return the header."""
     return HEAD + "".join(f"{table}\n" for table in _tables(ladder))
 
 
 def _tables(ladder: Ladder) -> Iterator[str]:
-    """From what is kept of former steps to the next: of the last one, and of each of the last two."""
+    """Yield the tables from stored values to predicted ones: of the last step, and of each of the last two."""
     changes, size = len(ladder.alone), "[POINTS * GROUPS]"
     yield table(f"static const lanes LADDER_ALONE[{changes}]{size}", [_columns(each) for each in ladder.alone])
     for name, lines in (("LAST", ladder.last), ("BEFORE", ladder.before)):
@@ -29,5 +29,5 @@ def _tables(ladder: Ladder) -> Iterator[str]:
 
 
 def _columns(rows: NumberTable) -> list[str]:
-    """Column by column, what point j gives to all."""
+    """Return the table by columns: the contributions of point j to all points."""
     return [print_number(number) for column in zip(*rows, strict=True) for number in column]

@@ -1,4 +1,4 @@
-"""The Jinja environment of the C templates: its filters and what they know of C."""
+"""Jinja environment of the C templates, with its filters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Rows: TypeAlias = Sequence[Sequence[Number]]
 
 
 def _power_of_h(k: int) -> str:
-    """C text of h^k as a factor."""
+    """Return C source of h^k as a factor."""
     product = " * ".join(["h"] * abs(k))
     if k == 0:
         return "1"
@@ -40,30 +40,30 @@ def _numbers(context: Context, values: Sequence[Number]) -> list[str]:
 
 @pass_context
 def _vector(context: Context, name: str, values: Sequence[Number]) -> str:
-    """A table of numbers."""
+    """Return a table of numbers."""
     return table(f"static const {context['target'].scalar} {name}[{len(values)}]", _numbers(context, values))
 
 
 @pass_context
 def _matrix(context: Context, name: str, rows: Rows) -> str:
-    """A table of rows of numbers."""
+    """Return a table of rows of numbers."""
     size = f"[{len(rows)}][{len(rows[0])}]"
     return table(f"static const {context['target'].scalar} {name}{size}", [_numbers(context, row) for row in rows])
 
 
 @pass_context
 def _rests(context: Context, rows: Rows) -> Rows:
-    """What rounding cuts off a table of rows of numbers."""
+    """Return the low words of a table: the rounding errors of its numbers."""
     return [list(map(context["target"].rest, row)) for row in rows]
 
 
 def _integers(name: str, values: Sequence[int]) -> str:
-    """A table of whole numbers; the name has its size."""
+    """Return a table of integers; the name includes its size."""
     return table(f"static const int {name}", list(map(str, values)))
 
 
 def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
-    """A table of pairs of places."""
+    """Return a table of pairs of indices."""
     return table(f"static const int {name}[{len(entries)}][2]", [f"{{{i}, {j}}}" for i, j in entries])
 
 
@@ -106,7 +106,7 @@ FILTERS: dict[str, Callable[..., object]] = {
 
 @cache
 def template_environment() -> Environment:
-    """The templates with the filters they use, loaded once."""
+    """Return the environment, which is created once."""
     environment = Environment(
         loader=FileSystemLoader(template_folder()),
         undefined=StrictUndefined,
@@ -122,5 +122,5 @@ def template_environment() -> Environment:
 
 @cache
 def support_text(name: str) -> str:
-    """The text of a support header, by its name ``support/<what it holds>.h``."""
+    """Return the source of a support header ``support/<name>.h``."""
     return (template_folder() / name).read_text(encoding="utf-8")

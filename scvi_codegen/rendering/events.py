@@ -1,17 +1,16 @@
-"""Events in C: formulas to a kernel, and the search for its zeros beside the text of an integrator.
+"""Event functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
 
-The search uses nothing of an integrator but its public functions, so that it stands behind every method and solver, and
-the text without events stays what it is. What it does on a step is said in ``templates/support/events.h``:
+The search uses only the public functions of an integrator, so that it is available for every method and solver, and the
+source without events does not change. On a step (``templates/support/events.h``):
 
-* the functions are evaluated at its ends and at three states between them, each a step of a part of h, and polynomials
-  of degree 4 drawn through the values;
-* a polynomial tells how often its function crosses zero. Where an extremum is so near zero that its sign is in doubt
-  (nearer than the last two Chebyshev coefficients), the step is split there, some times over, and the function
-  decides;
-* each crossing is enclosed by steps of parts of h until the ends are neighbouring numbers.
+* the functions are evaluated at its ends and at three states between them, each by a step of a fraction of h, and
+  interpolated by polynomials of degree 4;
+* the polynomial determines the number of zero crossings. At an extremum so near zero that its sign is uncertain (nearer
+  than the last two Chebyshev coefficients), the step is subdivided, several times if necessary;
+* each crossing is enclosed by partial steps until the ends are neighbouring numbers.
 
-No pair of crossings is missed where a function is a polynomial of degree 4 in time along a step. Of others those are
-found that their polynomials of degree 4 hint at; one that turns back and forth more often within a step can hide some.
+All crossings are detected if a function is a polynomial of degree 4 in time along a step. Of other functions those are
+detected that the polynomials indicate; a function that oscillates faster within a step can have undetected crossings.
 """
 
 from __future__ import annotations
@@ -44,22 +43,22 @@ DEGREE = 4
 
 @lru_cache(maxsize=64)
 def with_events(source: Source, interface: Interface, functions: tuple[str | Expr, ...]) -> Source:
-    """The text of an integrator with the search for zeros of functions of its state beside it.
+    """Return the source of an integrator with the search for zeros of functions of its state.
 
     Args:
         source, interface: of the integrator, without events.
-        functions: text of the grammar or SymPy expressions in the names that the interface has.
+        functions: formulas as text or SymPy expressions in the names of the interface.
 
     Raises:
         ExpressionError: for text outside the grammar, with its column.
-        EventError: naming the symbol or function at fault.
+        EventError: naming the invalid symbol or function.
     """
     kernel, uses_velocity = _kernel(interface, functions)
     return replace(source, beside=render_events(_search(interface, kernel, uses_velocity)))
 
 
 def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kernel, bool]:
-    """The functions at u = (q, p, v), and whether any velocity occurs in them."""
+    """Return the kernel of the functions at u = (q, p, v), and whether any velocity occurs in them."""
     names = _names(interface)
     driven = input_formulas(interface.inputs, symbol(TIME))
     values = [_expression(function, names).xreplace(driven) for function in functions]
@@ -78,7 +77,7 @@ def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kern
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:
-    """What a function may use; a momentum's default name gives way to a coordinate or parameter of that name."""
+    """Names that a function may use; coordinates and parameters take precedence over default names of momenta."""
     velocities = [name + DOT for name in interface.coordinates]
     return {
         name: symbol(name)
@@ -94,7 +93,7 @@ def _names(interface: Interface) -> dict[str, Symbol]:
 
 
 def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
-    """One function in canonical symbols."""
+    """Return one function in canonical symbols."""
     if isinstance(function, str):
         found = parse_expression(function, names)
     elif isinstance(function, Expr):
@@ -116,7 +115,7 @@ def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
 
 
 def _translated(function: Expr) -> Expr:
-    """Functions of time, their derivatives and other symbols by their names."""
+    """Return the expression with functions of time, their derivatives and symbols as canonical symbols."""
     rules: dict[Expr, Expr] = {free: symbol(identifier(free.name)) for free in function.free_symbols}
     for moving in function.atoms(AppliedUndef):
         rules[moving] = symbol(identifier(moving.func.__name__))
@@ -131,7 +130,7 @@ def _translated(function: Expr) -> Expr:
 
 
 def _search(interface: Interface, kernel: Kernel, uses_velocity: bool) -> EventSearch:
-    """Chebyshev's points of the second kind on [0, 1], and from values there to coefficients of powers on [-1, 1]."""
+    """Return the data of the search: Chebyshev points of the second kind, and the inverse Vandermonde matrix."""
     points = chebyshev_lobatto(DEGREE).points
     inverse = mp.matrix([[x**k for k in range(DEGREE + 1)] for x in points]) ** -1
     coefficients = tuple(tuple(inverse[k, j] for j in range(DEGREE + 1)) for k in range(DEGREE + 1))

@@ -1,9 +1,10 @@
-"""Where Newton's iteration stands, which is tried where sweeps fail.
+"""Fallback to Newton's method where the fixed-point iteration fails, in the same or in a second library.
 
-Its kernels have second derivatives of the Lagrangian: of larger systems they are most of the text, and of the time that
-deriving and compiling takes, and most runs never need them. So a text that is compiled here has sweeps alone, and
-borrows the iteration from a second library, compiled when a sweep first fails; a text to be taken away has its own.
-A library borrows once, for all steppers of its text: one generator makes one iteration for the same sweeps.
+Its kernels contain second derivatives of the Lagrangian: for larger systems they are most of the source, and of the
+time of derivation and compilation, and most runs never need them. So a source that is compiled here has only the
+fixed-point iteration and uses a second library, compiled when the iteration first fails; an exported source includes
+Newton's method. The second library is set once, for all steppers of a source: one generator makes one Newton solver for
+the same iteration.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Literal, TypeAlias
 __all__ = ["HEADERS", "Fallback"]
 
 Fallback: TypeAlias = Literal["own", "borrowed", "lent", "none"]
-"""Of a text: its own; that of another; its own, lent to another; or none."""
+"""Fallback of a source: ``own``; that of another library (``borrowed``); its own, also for others (``lent``); none."""
 
 HEADERS: dict[Fallback, tuple[str, ...]] = {
     "own": ("newton_fallback",),
@@ -21,4 +22,4 @@ HEADERS: dict[Fallback, tuple[str, ...]] = {
     "lent": ("fallback", "newton_fallback"),
     "none": ("no_fallback",),
 }
-"""Support headers before the solver by sweeps, in order."""
+"""Support headers before the solver by fixed-point iteration, in order."""

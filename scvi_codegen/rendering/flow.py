@@ -1,6 +1,7 @@
-"""Many steps as one function in C, with its derivatives, behind the text that has those of a step.
+"""Flow of many steps as one C function with its derivatives, added to a source that has those of a step.
 
-Support headers hold all of it: ``flow.h`` the function, ``xla_flow.h`` and ``casadi_flow.h`` how frameworks call it.
+The support headers contain all of it: ``flow.h`` the function, ``xla_flow.h`` and ``casadi_flow.h`` the interfaces of
+frameworks.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from scvi_codegen.rendering.source import Source, included
 __all__ = ["casadi_name", "with_casadi_flow", "with_flow_of_rows", "with_xla_flow"]
 
 XLA_PARTS = ("states", "push", "pull")
-"""Values, changes of values, slopes by what is given."""
+"""XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
 XLA_SECOND = "bend"
-"""Changes of slopes by what is given."""
+"""XLA handler of derivatives of gradients."""
 
 
 def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) -> Source:
-    """A text with derivatives of steps, and the flow as XLA calls it, ``<prefix>_xla_states``, ``_push``, ``_pull``.
+    """Return a source with the XLA custom calls ``<prefix>_xla_states``, ``_push``, ``_pull``.
 
     Args:
-        derivatives: the text.
-        version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a text belongs to one of them.
-        second: whether the text has second derivatives, for ``_bend``.
+        derivatives: a source with derivatives of steps.
+        version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a source is specific to one version.
+        second: whether to add second derivatives, ``_bend``, which the source must have.
     """
     parts = (*XLA_PARTS, *([XLA_SECOND] if second else ()))
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
@@ -34,11 +35,11 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
 
 
 def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
-    """A text with derivatives of steps, and the flow of many rows, ``<prefix>_flow_rows``.
+    """Return a source with the flow of many rows, ``<prefix>_flow_rows``.
 
     Args:
-        derivatives: the text.
-        second: whether it has second derivatives, for ``<prefix>_bend_rows``.
+        derivatives: a source with derivatives of steps.
+        second: whether to add second derivatives, ``<prefix>_bend_rows``, which the source must have.
     """
     prefix = derivatives.prefix
     shape, rest = (
@@ -55,17 +56,17 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
 
 
 def casadi_name(prefix: str) -> str:
-    """Of the function that CasADi finds in a library."""
+    """Return the name of the function that CasADi looks up in a library."""
     return f"{prefix}_flow"
 
 
 def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second: bool = False) -> Source:
-    """A text with derivatives of steps, and the flow of so many, with its own, by CasADi's naming convention.
+    """Return a source with the flow of ``steps`` steps and its derivatives, by CasADi's naming convention.
 
     Args:
-        derivatives: the text.
-        steps: how many; save_every: so many from one kept state to the next.
-        second: whether the text has second derivatives, for the Jacobian of the adjoint.
+        derivatives: a source with derivatives of steps.
+        steps: number of steps; save_every: steps between stored states.
+        second: whether to add the Jacobian of the adjoint, from second derivatives that the source must have.
     """
     name = casadi_name(derivatives.prefix)
     fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"

@@ -1,4 +1,4 @@
-"""The co-simulation interface of FMI 3.0 behind an integrator: C beside its text, of its public functions alone."""
+"""Co-simulation interface of FMI 3.0 for an integrator, in C, by its public functions."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["with_fmu"]
 def with_fmu(
     source: Source, interface: Interface, start: ExampleRun, *, by_velocity: bool, places: Sequence[int], token: str
 ) -> Source:
-    """The text of an integrator with FMI's functions beside it.
+    """Return the source of an integrator with the functions of FMI.
 
     Args:
         source, interface: of the integrator.
-        start: initial state, velocities in the place of p if ``by_velocity``; parameters, time, and the step.
-        by_velocity: whether an importer gives velocities at the start, not momenta.
-        places: where the parameters of each input begin.
-        token: by which the FMU knows its own description.
+        start: initial state, with velocities instead of p if ``by_velocity``; parameters, time, and the step size.
+        by_velocity: whether initial velocities are set instead of momenta.
+        places: index of the first parameter of each input.
+        token: instantiation token of the model description.
     """
     context = {
         "interface": interface,

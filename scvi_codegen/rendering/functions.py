@@ -1,6 +1,6 @@
-"""Kernels as C functions, of numbers and of vectors. All have the same arguments, whether they use them or not.
+"""Kernels as C functions of numbers and of vectors. All have the same arguments, whether they use them or not.
 
-A kernel that is cut calls its parts, functions of their own with the arguments that they use.
+A kernel that is divided calls its parts, separate functions with only the arguments that they use.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from scvi_codegen.rendering.target import DOUBLE, Target
 __all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]
 
 LAID_OUT = "  /* clang-format off */\n{}\n  /* clang-format on */"
-"""Around statements of several lines, which are broken where they are full, not where their structure says."""
+"""Wrapper for statements of several lines, whose layout differs from that of clang-format."""
 
 PART = "static SCVI_NOINLINE"
 
 
 def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
-    """A function of numbers, with its comment; ``slopes`` asks for their argument also where there are none."""
+    """Return a function of numbers, with its comment; ``slopes``: always with the argument for derivatives."""
     real = target.scalar
     declared = {name: f"{real} *{name}" for name in ARRAYS}
     declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
@@ -37,7 +37,7 @@ def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
 
 
 def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
-    """A function of vectors."""
+    """Return a function of vectors."""
     declared = {name: f"lanes *{name}" for name in ARRAYS}
     declared |= {"u": "const lanes *u", "t": f"{lanes.type_of('t')} t", "kept": "lanes *restrict kept"}
     declared["parameters"] = f"const {lanes.type_of('parameters')} *parameters"
@@ -54,7 +54,7 @@ def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
 
 
 def lane_mass_text(kernel: Kernel, sweep: Sweep, lanes: Lanes, target: Target) -> str:
-    """The constant masses: numbers of one trajectory, or vectors of many."""
+    """Return the function of constant masses: of numbers for one trajectory, or of vectors for many."""
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
 
 
@@ -63,7 +63,7 @@ def _table_name(each: IndexedSum, what: str) -> str:
 
 
 def _tables(each: IndexedSum, target: Target) -> Iterator[str]:
-    """The index tables of a loop, and the constants of its rows."""
+    """Yield the index tables of a loop, and the constants of its rows."""
     yield _rows(_table_name(each, "places"), each.table)
     if each.targets:
         yield _rows(_table_name(each, "targets"), each.targets)
@@ -79,7 +79,7 @@ def _rows(name: str, rows: Sequence[Sequence[int]]) -> str:
 
 
 def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
-    """Statements of loops: slots are gathered, the term is evaluated, what it gives is added."""
+    """Return the statements of loops: gather slots, evaluate the term, add its values."""
     lines = []
     for each in kernel.sums:
         slots, values = len(each.table[0]), each.term.values
@@ -99,7 +99,7 @@ def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
 
 
 def _constant(each: IndexedSum, k: int, real: str, sources: Sequence[str]) -> str:
-    """What a row is given for its k-th constant."""
+    """Return the C expression of the k-th constant of a row."""
     entry = f"{_table_name(each, f'given_{k}')}[e]"
     is_number = isinstance(each.given[k][0], Constant)
     text = entry if is_number else f"parameters[{entry}]"
@@ -108,7 +108,7 @@ def _constant(each: IndexedSum, k: int, real: str, sources: Sequence[str]) -> st
 
 
 def _parts(kernel: Kernel) -> tuple[Part, ...]:
-    """The functions that a kernel calls, if it is cut into several."""
+    """Return the functions that a kernel calls if it is divided into several."""
     cut = parts(kernel)
     return cut if len(cut) > 1 else ()
 
@@ -123,7 +123,7 @@ def _arguments(kernel: Kernel, declared: Mapping[str, str], *, slopes: bool = Fa
 
 
 def _whole(storage: str, kernel: Kernel, arguments: Sequence[str], statements: Sequence[str]) -> str:
-    """A kernel with its comment; what it does not use is named first."""
+    """Return a kernel with its comment; unused arguments are cast to void first."""
     counts = ", ".join(f"{count} {operator}" for operator, count in kernel.operation_counts().items()) or "constants"
     names = [argument.split()[-1].lstrip("*") for argument in arguments]
     unused = ", ".join(f"(void){name}" for name in names if name != "value" and not kernel.uses(name))

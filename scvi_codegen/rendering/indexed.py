@@ -1,4 +1,4 @@
-"""Sums over indices as C: nests of loops around kernels."""
+"""Indexed systems as C: nested loops around kernels."""
 
 from __future__ import annotations
 
@@ -25,18 +25,21 @@ from scvi_codegen.rendering.waves import roots_of, waves_context
 __all__ = ["render_indexed", "render_indexed_example"]
 
 EXPLICIT_VECTORS, HELD_VECTORS, SWEEP_VECTORS = 4, 7, 4
-"""Of work: positions, forces, increments; where constraints hold steps reactions and what is tried, too; positions at
-the points, forces in this step and two before."""
+"""Number of vectors in ``work``.
+
+Positions, forces, increments; with constraints also constraint forces and trial increments; for iterations positions
+at the points, forces in this step and in two former ones.
+"""
 NEWTON_VECTORS = 4 + 17
-"""Beside these residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
+"""Further vectors: residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
 WAVE_VECTORS = 2
-"""Beside these scratch of transforms (templates/support/indexed_waves.h)."""
+"""Further vectors: scratch of Fourier transforms (templates/support/indexed_waves.h)."""
 HALVES_VECTORS = 6
-"""Beside these the state at the start of a step and two increments (templates/support/indexed_halves.h)."""
+"""Further vectors: the state at the start of a step and two increments (templates/support/indexed_halves.h)."""
 
 
 def render_indexed(program: IndexedProgram) -> Source:
-    """Header and source of a program. Equal programs give equal bytes."""
+    """Return header and source of a program. Equal programs give equal bytes."""
     environment = template_environment()
     terms = [(each, each.scalar) for each in program.forces if each.scalar]
     terms += [(each, each.kernel) for each in program.constants]
@@ -85,11 +88,11 @@ def render_indexed(program: IndexedProgram) -> Source:
 
 
 def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
-    """``main.c`` and ``Makefile`` that run the integrator from arrays in files beside them.
+    """Return ``main.c`` and ``Makefile`` that run the integrator from arrays in files of the same folder.
 
     Args:
         prefix: of the C names.
-        start: title, momenta (whether a Hamiltonian is given), numbers, sizes, fields and tables with their lengths,
+        start: title, momenta (whether the system is Hamiltonian), numbers, sizes, fields and tables with their lengths,
             moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
     """
     environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
@@ -98,7 +101,7 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
 
 
 def _work(program: IndexedProgram) -> int:
-    """Numbers of a coordinate: vectors over the points, or of leapfrog, four."""
+    """Return the number of doubles of ``work`` per coordinate."""
     if program.sweep is None:
         return HELD_VECTORS if program.held else EXPLICIT_VECTORS
     own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
@@ -114,7 +117,7 @@ def _sweep_text(program: IndexedProgram) -> SweepText | None:
 
 
 def _vector_functions(program: IndexedProgram) -> list[str]:
-    """Those of the vector library that occur in the forces of an explicit method."""
+    """Return the functions of the vector library that occur in the forces of an explicit method."""
     kernels = [each.kernel for each in program.forces] if program.sweep is None else []
     return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
@@ -125,7 +128,7 @@ def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
 
 
 def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
-    """A function that adds to the forces; of an explicit method so many times the forces."""
+    """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.sweep is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
     nest = Nest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
@@ -163,7 +166,7 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
 
 
 def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
-    """A function that says how threads share it."""
+    """Return a function that describes how threads share a term group."""
     how = sharing_text(looped)
     known = [*sizes_text(program, how), *(f"(void){name};" for name in ("run", "given", "n"))]
     head = f"static sharing share_{looped.kernel.name}(const run_memory *run, const problem *given, long long n)"
@@ -172,7 +175,7 @@ def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
 
 
 def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) -> str:
-    """A function that gives the sum of the terms."""
+    """Return a function that computes the sum of the terms."""
     nest = Nest(program, looped, "double", "q")
     lines = nest.text(
         prepare=lambda k: [],
@@ -184,7 +187,7 @@ def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) 
 
 
 def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
-    """A function that adds to the masses."""
+    """Return a function that adds to the masses."""
     nest = Nest(program, looped, "", "")
     place = nest.place_of(looped.targets[0])
     lines = nest.text(

@@ -1,4 +1,4 @@
-"""Constraints of sums over indices as C: what is evaluated at every element, and on which coordinates it acts."""
+"""Constraints of indexed systems as C: values, derivatives, and the coordinates they act on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CURSOR = "condition *now"
 
 
 def held_context(program: IndexedProgram) -> dict[str, Any]:
-    """What the template of an integrator needs of constraints; nothing without any."""
+    """Return the template's context for constraints."""
     held = program.held
     if held is None:
         return {"held": None}
@@ -36,7 +36,7 @@ def held_context(program: IndexedProgram) -> dict[str, Any]:
 
 
 def _texts(program: IndexedProgram, held: HeldSteps) -> tuple[list[str], list[str], list[str]]:
-    """A function a constraint that finds g, g_t and slopes, one that finds bends, one that finds places."""
+    """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
     return (
         [_condition(program, each) for each in held.conditions],
         [_bend(program, each) for each in held.bends],

@@ -1,7 +1,7 @@
-"""Sweeps in vectors as C: which support headers a sweep takes, and its tables, for either meaning of a lane.
+"""Fixed-point iterations in vectors as C: support headers and tables, for either meaning of a SIMD lane.
 
-A lane is a point of one trajectory's step, or a trajectory of many; the sweeps themselves are the same text for both
-(``templates/support``), and so are the kernels but for what differs from lane to lane.
+A lane is a point of a step of one trajectory, or one of many trajectories; the source of the iterations is the same for
+both (``templates/support``), and so are the kernels except for the variables that differ between lanes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scvi_codegen.rendering.target import DOUBLE
 __all__ = ["LIBRARY", "POINTS", "TRAJECTORIES", "Lanes", "SweepText", "sweep_text"]
 
 LIBRARY = ("sin", "cos", "exp", "log", "pow")
-"""What glibc's libmvec has for every x86-64 vector width since 2.22."""
+"""Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
 
 OF_TWO = ("pow", "atan2")
 
@@ -30,12 +30,12 @@ Values: TypeAlias = tuple[Number, ...]
 
 @dataclass(frozen=True, slots=True)
 class Lanes:
-    """What a lane means.
+    """Meaning of a lane.
 
     Attributes:
-        sources: loads of a kernel that differ from lane to lane.
+        sources: loads of a kernel that differ between lanes.
         meaning: its support header, before the tables.
-        before, memory: what sweeps in such lanes take beside, after the tables.
+        before, memory: further headers, after the tables.
     """
 
     sources: Sources
@@ -45,11 +45,11 @@ class Lanes:
 
     @property
     def are_points(self) -> bool:
-        """Whether they are points of one trajectory."""
+        """True if lanes are points of one trajectory."""
         return "t" in self.sources
 
     def type_of(self, source: str) -> str:
-        """Of the time or of a parameter."""
+        """Return the C type of the time or of a parameter."""
         return "lanes" if source in self.sources else "double"
 
 
@@ -59,20 +59,20 @@ TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("crowd_step",), "many
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepText:
-    """What the templates write of a sweep.
+    """Template data of a fixed-point iteration.
 
     Attributes:
-        lanes: where they are points, in one vector or in several, as the processor wants.
+        lanes: number of points, in one vector or in several, depending on the processor.
         whole: whether in one.
         meaning: of a lane.
-        defines: macro and value that the support headers want.
-        functions: lines that make functions of vectors.
-        tables: C text of each.
-        kernels: with lanes.
-        mass: the constant masses, if there are such.
-        damping: the rate of a damping that lanes have, each its own.
+        defines: macros and values that the support headers require.
+        functions: lines that define functions of vectors.
+        tables: C source of each.
+        kernels: on lanes.
+        mass: the constant masses, if any.
+        damping: the rate of a damping that differs between lanes.
         support: headers from the tables on.
-        error_defines, highest, next: macro and value, and the tables, that the error of a curve is found with.
+        error_defines, highest, next: macros and values, and the tables, of the error estimate.
     """
 
     lanes: int
@@ -91,12 +91,12 @@ class SweepText:
 
     @property
     def inverse_roots(self) -> bool:
-        """Whether there are some."""
+        """True if there are inverse roots."""
         return any("INVERSE_ROOT" in line for line in self.functions)
 
     @property
     def library(self) -> bool:
-        """Whether the vector library has functions that occur."""
+        """True if functions of the vector library occur."""
         return any("LIBRARY" in line for line in self.functions)
 
 
@@ -108,14 +108,14 @@ def sweep_text(
     kernels: Sequence[Kernel] | None = None,
     changes: bool = False,
 ) -> SweepText:
-    """A sweep in vectors.
+    """Return the template data of a fixed-point iteration.
 
     Args:
-        sweep: what is written.
+        sweep: the iteration.
         meaning: of a lane.
-        fallback: what is tried where it fails.
-        kernels: those applied to vectors, if they are not the sweep's own.
-        changes: whether it carries changes, too.
+        fallback: solver that is tried if it fails.
+        kernels: those applied to vectors, if they are not the iteration's own.
+        changes: whether it also propagates tangent and adjoint vectors.
     """
     kernels = tuple(sweep.kernels if kernels is None else kernels)
     mass = sweep.constant_mass
@@ -144,7 +144,10 @@ def sweep_text(
 
 
 def _kept(sweep: Sweep) -> dict[str, str]:
-    """What is kept of a step. Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations."""
+    """Return the macros of the error estimate.
+
+    Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations.
+    """
     velocities, degree = sweep.kept is Kept.VELOCITIES, sweep.guess.degree
     forces = sweep.kept is Kept.FORCES
     return {
@@ -157,7 +160,7 @@ def _kept(sweep: Sweep) -> dict[str, str]:
 
 
 def _function(name: str) -> str:
-    """The line that makes a function of vectors."""
+    """Return the line that defines a function of vectors."""
     if name.startswith(INVERSE_ROOT):
         k = int(name.removeprefix(INVERSE_ROOT))
         powers = " * ".join(["square"] * (k // 2) + ["y"])
@@ -166,7 +169,7 @@ def _function(name: str) -> str:
 
 
 def _solver(sweep: Sweep, fallback: Fallback) -> tuple[str, ...]:
-    """Headers of the solver around a sweep whose lanes are points, in order."""
+    """Return the headers of the solver around an iteration whose lanes are points, in order."""
     solver = (*HEADERS[fallback], "sweep_solver")
     if not sweep.integral_part:
         return solver
@@ -184,7 +187,7 @@ def _tables(sweep: Sweep, meaning: Lanes, *, changes: bool) -> Iterator[str]:
 
 
 def _rests(each: SweepTable) -> Values | NumberTable:
-    """What rounding cuts off the numbers of a table."""
+    """Return the low words of a table: the rounding errors of its numbers."""
     if each.is_matrix:
         return tuple(tuple(map(DOUBLE.rest, row)) for row in each.numbers)
     return tuple(map(DOUBLE.rest, each.numbers))
@@ -195,7 +198,7 @@ PrintMatrix: TypeAlias = Callable[[str, NumberTable], str]
 
 
 def _printers(meaning: Lanes, points: int) -> tuple[PrintVector, PrintMatrix]:
-    """How vectors and matrices over points are written: all points in a vector, or a number each."""
+    """Return the functions that print vectors and matrices over points: all points in a vector, or one number each."""
     if meaning.are_points:
         return _groups, _columns
     size = f"[{points}]"
@@ -214,12 +217,12 @@ def _numbers(values: Sequence[Number]) -> list[str]:
 
 
 def _groups(name: str, values: Values) -> str:
-    """A number for each point."""
+    """Return a table with a number for each point."""
     return table(f"static const lanes {name}[GROUPS]", _numbers(values))
 
 
 def _columns(name: str, rows: NumberTable) -> str:
-    """A table by columns, what point j gives to all."""
+    """Return a table by columns: the contributions of point j to all points."""
     columns = zip(*rows, strict=True)
     return table(f"static const lanes {name}[POINTS * GROUPS]", [_numbers(column) for column in columns], braces=False)
 

@@ -1,4 +1,4 @@
-"""C text on lines of at most 120 characters: tables of numbers, statements, comments."""
+"""C source on lines of at most 120 characters: tables of numbers, statements, comments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROTOTYPE = re.compile(r"^\w+ \w+\([^;{]*\);$", re.MULTILINE)
 
 
 def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]], *, braces: bool = True) -> str:
-    """``declaration = {...};`` of numbers, or of rows of numbers, in braces or not, on one line if they fit."""
+    """Return ``declaration = {...};`` of numbers, or of rows of numbers, in braces or not, on one line if they fit."""
     left, right = "{}" if braces else ("", "")
     braced = [row if isinstance(row, str) else f"{left}{', '.join(row)}{right}" for row in rows]
     line = f"{declaration} = {{{', '.join(braced)}}};"
@@ -34,13 +34,13 @@ def table(declaration: str, rows: Sequence[str] | Sequence[Sequence[str]], *, br
 
 
 def _entries(braced: Sequence[str]) -> list[str]:
-    """Full lines of entries, each of which is on one."""
+    """Return full lines of entries that are not broken."""
     joined = ", ".join(entry.replace(" ", "\0") for entry in braced)
     return [line.replace("\0", " ") for line in _lines(joined, "    ", "    ")]
 
 
 def _rows(braced: Sequence[str]) -> list[str]:
-    """A line a row, or several where it is too long."""
+    """Return one line per row, or several if it is too long."""
     lines: list[str] = []
     for k, row in enumerate(braced):
         lines += _lines(row + "," * (k + 1 < len(braced)), "    ", "     ")
@@ -48,30 +48,30 @@ def _rows(braced: Sequence[str]) -> list[str]:
 
 
 def wrapped(statement: str, indent: int = 2) -> str:
-    """A statement that continues on further lines where it is too long, after an operator or comma."""
+    """Return a statement, continued on further lines if it is too long, after an operator or comma."""
     first = " " * indent
     joined = OPERATOR.sub("\0\\1 ", statement)  # no break before an operator
     return "\n".join(_lines(joined, first, first + " " * CONTINUATION)).replace("\0", " ")
 
 
 def wrapped_comment(text: str) -> str:
-    """A comment in the first column."""
+    """Return a comment in the first column."""
     return "\n".join(_lines(f"/* {text} */", "", " * "))
 
 
 def wrapped_comment_lines(text: str) -> str:
-    """A comment of many lines, those broken that are too long."""
+    """Return a comment of several lines, with lines that are too long broken."""
     lines = (_lines(line, "", " * ") if len(line) > WIDTH else [line] for line in text.split("\n"))
     return "\n".join(part for parts in lines for part in parts)
 
 
 def wrapped_prototypes(text: str) -> str:
-    """The text with every prototype in it broken between arguments, and only where it is too long."""
+    """Return the source with every prototype that is too long broken between arguments."""
     return PROTOTYPE.sub(lambda found: wrapped_prototype(" ".join(found[0].split())), text)
 
 
 def wrapped_prototype(prototype: str) -> str:
-    """The head of a function, broken between arguments where it is too long."""
+    """Return the head of a function, broken between arguments if it is too long."""
     arguments = prototype.replace(" ", "\0").replace(",\0", ", ")  # no break within an argument
     return "\n".join(_lines(arguments, "", " " * CONTINUATION)).replace("\0", " ")
 

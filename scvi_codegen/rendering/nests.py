@@ -1,7 +1,7 @@
-"""Nests of loops around a kernel, as C.
+"""Nested loops around a kernel, as C.
 
-What a slot is read from, and what is added to it, stands in the innermost loop that moves its place: in a sum over
-pairs i < j what belongs to i is read before the loop over j, and added once behind it.
+A slot is read, and a sum is added to its target, in the innermost loop on whose index it depends: in a sum over pairs i
+< j the data of i are read before the loop over j, and added once after it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
 __all__ = ["DIRECTION", "Lines", "Nest"]
 
 DIRECTION = "V"
-"""What the slots along a direction are read from."""
+"""Name of the array that the slots along a direction are read from."""
 
 Lines: TypeAlias = Callable[[int], list[str]]
-"""Of a slot, by its number."""
+"""Function that returns the lines of a slot, by its number."""
 
 
 def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
-    """Where each array begins in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
+    """Yield the offset of each array in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
     sizes: list[str] = []
     for array in (*program.coordinates, *program.momenta, *program.velocities):
         yield array.name, " + ".join(sizes) or "0"
@@ -34,19 +34,19 @@ def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
 
 
 class Nest:
-    """The loops of a kernel, with arguments and parameters at the level where they are first known.
+    """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
 
-    The innermost loop runs over parts of its span. On each part the places of a ring stand at the same distance from
-    the index, whether that goes around or not, so that nothing is asked an element.
+    The innermost loop is divided into parts. On each part the neighbours across a periodic boundary have constant
+    distances from the index, so that no element needs a test.
 
     Args:
-        program: whose arrays they are.
+        program: with the arrays.
         looped: the kernel.
         scalar: type of the arguments.
-        source: what they are read from; nothing where they are not.
-        chunked: whether all values of a part are found before any is added, in loops without conflicts, which a
-            compiler turns into vectors.
-        sharing: how threads share it, of which a task is done; without any all of it is.
+        source: array that they are read from; empty if there are none.
+        chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
+            compiler vectorises.
+        sharing: how threads share it; without sharing, one task covers all.
     """
 
     def __init__(
@@ -66,22 +66,22 @@ class Nest:
         self.scalars = len(program.parameter_names)
 
     def level(self, access: Access) -> int:
-        """The depth of the innermost loop that moves it."""
+        """Return the depth of the innermost loop on whose index an entry depends."""
         return max((self.levels[index] for index in access.indices), default=0)
 
     def is_innermost(self, access: Access) -> bool:
-        """Whether an entry moves with the innermost loop."""
+        """Return whether an entry depends on the index of the innermost loop."""
         return self.level(access) == len(self.looped.loops)
 
     def text(
         self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]] = ()
     ) -> list[str]:
-        """The nest.
+        """Return the lines of the nested loops.
 
         Args:
-            prepare, finish: lines of targets before and behind the loops that do not move them.
+            prepare, finish: lines of targets before and after the loops that do not change them.
             innermost: lines in the innermost loop.
-            behind: lines, those of each target in a loop of its own over the same part.
+            behind: lines, those of each target in a separate loop over the same part.
         """
         return self._inside(0, prepare, innermost, finish, behind)
 
@@ -99,7 +99,7 @@ class Nest:
         return lines + [line for k in outer for line in finish(k)]
 
     def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
-        """The innermost loop, in parts where it needs some."""
+        """Return the innermost loop, divided into parts if necessary."""
         first, end = self._span(loop)
         offsets = self._offsets(loop)
         if not offsets and not self.chunked:
@@ -121,7 +121,7 @@ class Nest:
         ]
 
     def _span(self, loop: Loop) -> tuple[str, str]:
-        """From where to where a loop goes in a task."""
+        """Return the first index and the end of a loop in a task."""
         if self.sharing in (Sharing.IN_TURN, Sharing.IN_TILES) and loop is self.looped.loops[0]:
             return "here->of.first", "here->of.end"
         if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
@@ -129,7 +129,7 @@ class Nest:
         return _first(loop), size_text(loop.end)
 
     def adding(self, k: int, value: str) -> list[str]:
-        """What adds to the place of a target, if the task adds to that."""
+        """Return the lines that add to the element of a target, if the task adds to it."""
         if self.sharing is not Sharing.BY_PLACES:
             return [f"F[{self.place_of(self.looped.targets[k])}] += {value};"]
         named = [self._named(k)] if self._in_a_part(k) else []
@@ -139,17 +139,17 @@ class Nest:
         return f"const long long place_{k} = {self.place_of(self.looped.targets[k])};"
 
     def _in_a_part(self, k: int) -> bool:
-        """Whether a place is known in the loops over a part alone."""
+        """Return whether an element is only known in the loops over a part."""
         return self.chunked and self.is_innermost(self.looped.targets[k])
 
     def _passed_over(self) -> list[str]:
-        """What goes past an element that adds to nothing in a task."""
+        """Return the lines that skip an element that adds to nothing in a task."""
         wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.targets))]
         past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
         return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
 
     def _part_passed_over(self, loop: Loop) -> list[str]:
-        """The same of a part of the innermost loop."""
+        """Return the lines that skip a part of the innermost loop that adds to nothing in a task."""
         if self.sharing is not Sharing.BY_PLACES:
             return []
         places = range(len(self.looped.targets))
@@ -159,14 +159,14 @@ class Nest:
         return ["int wanted = whole;", *look, "if (!wanted)", "  continue;"]
 
     def _offsets(self, loop: Loop) -> list[int]:
-        """At which places of a ring stand from an index."""
+        """Return the distances of neighbours across a periodic boundary."""
         accesses = (*self.looped.slots, *self.looped.targets, *self.looped.given)
         places = [place for access in accesses for place in access.places]
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         return sorted(moved - {0}) if loop.periodic else []
 
     def _found(self, level: int) -> Iterator[str]:
-        """What is known at a level: arguments, parameters, places that are not added to in every task."""
+        """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
         for k, target in enumerate(self.looped.targets if self.sharing is Sharing.BY_PLACES else ()):
             if self.level(target) == level and not self._in_a_part(k):
                 yield self._named(k)
@@ -181,11 +181,11 @@ class Nest:
                 yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
 
     def place_of(self, access: Access) -> str:
-        """Where an entry stands in the state."""
+        """Return the index of an entry in the state."""
         return f"start_{access.array.name} + {self.place(access)}"
 
     def place(self, access: Access) -> str:
-        """Where an entry stands in its array, the last axis running fastest."""
+        """Return the index of an entry in its array, in row-major order."""
         text = ""
         for place, axis in zip(access.places, access.array.axes, strict=True):
             here = self.index(place)
@@ -194,7 +194,7 @@ class Nest:
         return text
 
     def index(self, place: Place) -> str:
-        """A place on an axis."""
+        """Return an index on an axis."""
         if place.table:
             columns = next(table for table in self.program.tables if table.name == place.table).axes[1].number
             return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
@@ -209,7 +209,7 @@ class Nest:
         return f"place_on_ring({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
 
     def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
-        """The nest as a function; without values nothing is evaluated."""
+        """Return the loops as a function; without values no kernel is evaluated."""
         known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
         body = [*sizes_text(self.program, "\n".join([*known, *lines])), *known, *lines]
         text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
@@ -218,7 +218,7 @@ class Nest:
         return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
 
     def _unknowns(self) -> Iterator[str]:
-        """The arguments of the kernel, if it has any."""
+        """Yield the declaration of the arguments of the kernel, if it has any."""
         if self.source and self.looped.slots:
             yield f"{self.scalar} u[{len(self.looped.slots)}];"
         elif self.source:
@@ -226,14 +226,14 @@ class Nest:
             yield f"(void){self.source};"
 
     def _parameters(self, values: str) -> Iterator[str]:
-        """Of the kernel, and where its values go."""
+        """Yield the declarations of the parameters and values of the kernel."""
         if values:
             yield f"{values};"
             yield f"double parameters[{max(1, self.scalars + len(self.looped.given))}] = {{0}};"
             yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
 
     def _arrays(self, text: str) -> Iterator[str]:
-        """Where those begin that occur."""
+        """Yield the offsets of the arrays that occur."""
         for name, start in _starts(self.program):
             if re.search(rf"\bstart_{name}\b", text):
                 yield f"const long long start_{name} = {start};"
@@ -252,7 +252,7 @@ def _shift(index: str, offset: int) -> str:
 
 
 def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
-    """A loop from first to the one before end."""
+    """Return a loop over first <= index < end."""
     name = f"index_{loop.index}"
     head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
     body = [f"  {line}" for line in lines]

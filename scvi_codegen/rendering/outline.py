@@ -1,7 +1,7 @@
-"""Reads the generated C as far as an outline needs it: functions, the comments above them, and who calls whom.
+"""Outline of the generated C: functions, the comments above them, and the call graph.
 
-Not a C parser: it relies on what the templates write, a function's head in the first column and its closing brace alone
-on a line.
+Not a C parser: it relies on the layout of the templates, with a function's head in the first column and its closing
+brace alone on a line.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ WIDTH = 100
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One function of the text.
+    """A function of the source.
 
     Attributes:
         name: as it is called.
         arguments: their names in order.
-        comment: the one above it, on one line, or nothing.
-        body: what stands between its braces.
+        comment: the one above it, on one line, or empty.
+        body: between its braces.
         text: all of it, without the comment.
-        calls: the functions of the same text that it calls, in order of first call.
+        calls: the functions of the same source that it calls, in order of first call.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Function:
 
 
 def functions_of(code: str) -> dict[str, Function]:
-    """Every function with a body, by name, in the order of the text; of alternatives of the preprocessor the first."""
+    """Return every function with a body, by name, in order; of preprocessor alternatives the first."""
     found: dict[str, re.Match[str]] = {}
     for match in HEAD.finditer(_preprocessed(code)):
         found.setdefault(match["name"], match)
@@ -53,7 +53,7 @@ def functions_of(code: str) -> dict[str, Function]:
 
 
 def _preprocessed(code: str) -> str:
-    """With the macros in function heads replaced: NAME begins exported names, HOT and SELDOM say how to optimise."""
+    """Return the source with the macros NAME (prefix of exported names), HOT and SELDOM in function heads replaced."""
     prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
     text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code
     text = re.sub(r"^(static )?SELDOM ", r"\1", text, flags=re.MULTILINE)
@@ -78,7 +78,7 @@ def _last_word(argument: str) -> str:
 
 
 def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ...]:
-    """``start`` and what it calls, each once, each before what it calls itself."""
+    """Return ``start`` and the functions that it calls, directly or not, each once, callers first."""
     found: dict[str, Function] = {}
     pending = [start]
     while pending:
@@ -90,10 +90,9 @@ def reached(functions: Mapping[str, Function], start: str) -> tuple[Function, ..
 
 
 def outline(functions: Mapping[str, Function], start: str) -> str:
-    """The tree of calls below ``start``: heads, and the first sentences of comments.
+    """Return the call tree below ``start``: heads, and the first sentences of comments.
 
-    A function without a comment is left out, and what it calls stands in its place; one that has been shown is not
-    shown again.
+    A function without a comment is replaced by the functions that it calls; each function is shown once.
     """
     return "\n".join(_lines(functions, start, 0, set()))
 

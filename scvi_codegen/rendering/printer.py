@@ -1,4 +1,4 @@
-"""IR expressions to C text. Prints what it is given: no rewriting, only names, literals and parentheses."""
+"""Printing of expressions as C: names, literals and parentheses, without rewriting."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ __all__ = [
 ]
 
 Sources: TypeAlias = tuple[str, ...]
-"""Loads that differ from lane to lane: ``("u", "t")`` where lanes are points, ``("u", "parameters")`` where they are
-trajectories."""
+"""Loads that differ between lanes: ``("u", "t")`` for points, ``("u", "parameters")`` for trajectories."""
 
 ARRAYS = ("u", "t", "parameters", "kept", "value", "slope")
-"""What a kernel and its parts may use, in the order of their arguments."""
+"""Arrays that a kernel and its parts may use, in the order of their arguments."""
 
 INVERSE_ROOT = "inverse_root_"
 OWN_FUNCTIONS = (INVERSE_ROOT, "lanes_")
@@ -37,12 +36,12 @@ PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
 
 
 def print_number(value: Number, target: Target = DOUBLE) -> str:
-    """A C literal that reads back as the number of the target nearest to it."""
+    """Return the C literal that reads back as the nearest number of the target."""
     return target.number(value)
 
 
 def print_expression(expression: Expression, target: Target = DOUBLE) -> str:
-    """C text of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``."""
+    """Return the C source of an expression over ``u``, ``t``, ``parameters`` and temporaries ``w<k>``."""
     return _print(expression, 0, target)
 
 
@@ -65,7 +64,7 @@ def _print(expression: Expression, context: int, target: Target) -> str:
 
 
 def _function(operator: str, target: Target) -> str:
-    """Those of libm have a name for each type, our own have one."""
+    """Return the name of a function: those of libm have one for each type."""
     return operator if operator.startswith(OWN_FUNCTIONS) else target.function(operator)
 
 
@@ -76,23 +75,23 @@ def _load(load: Load) -> str:
 
 
 def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
-    """The functions a kernel applies to vectors; ``sources`` names the loads that are vectors."""
+    """Return the functions that a kernel applies to vectors; ``sources`` names the loads that are vectors."""
     return set().union(*(_functions(part, _Vectors(part, sources).has) for part in _every_part(kernel)))
 
 
 def scalar_functions(kernel: Kernel) -> set[str]:
-    """All functions that occur in a kernel."""
+    """Return all functions that occur in a kernel."""
     return set().union(*(_functions(part, lambda expression: True) for part in _every_part(kernel)))
 
 
 def constants(kernel: Kernel) -> Iterator[Number]:
-    """The numbers written in a kernel."""
+    """Return the numbers that occur in a kernel."""
     every = (expression for part in _every_part(kernel) for expression in _expressions(part))
     return (expression.value for expression in every if isinstance(expression, Constant))
 
 
 def _every_part(kernel: Kernel) -> Iterator[Part]:
-    """Those of the kernel and of the terms in its loops."""
+    """Return the parts of the kernel and of the terms of its loops."""
     return (part for each in kernel.functions for part in parts(each))
 
 
@@ -102,7 +101,7 @@ def _functions(part: Part, wanted: Callable[[Expression], bool]) -> set[str]:
 
 
 def _expressions(part: Part) -> Iterator[Expression]:
-    """Every expression of a part, with those it is made of."""
+    """Yield every expression of a part, with its subexpressions."""
     pending: list[Expression] = [expression for _, _, expression in part.statements]
     while pending:
         expression = pending.pop()
@@ -112,7 +111,7 @@ def _expressions(part: Part) -> Iterator[Expression]:
 
 
 def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
-    """The statements of a kernel of numbers, or of one of its parts."""
+    """Return the statements of a kernel of numbers, or of one of its parts."""
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
         return [f"{target.scalar} kept[{kept_numbers(cut)}];", *map(_call, cut)]
@@ -125,7 +124,10 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
 
 
 def print_lane_statements(code: Kernel | Part, sweep: Sweep, sources: Sources) -> list[str]:
-    """The same for vectors; what is the same in every lane stays a number, slopes go to their places in the mass."""
+    """Return the statements of a kernel of vectors, or of one of its parts.
+
+    Variables that are the same in every lane remain numbers; derivatives are stored at their indices in the mass.
+    """
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
         return [f"lanes kept[{kept_numbers(cut)}];", *map(_call, cut)]
@@ -142,7 +144,7 @@ def print_lane_statements(code: Kernel | Part, sweep: Sweep, sources: Sources) -
 
 
 def _call(part: Part) -> str:
-    """Part of a kernel, called from there; its arguments have the names of the kernel's."""
+    """Return the call of a part of a kernel; its arguments have the names of the kernel's."""
     return f"{part.name}({', '.join(array for array in ARRAYS if part.uses(array))});"
 
 
@@ -152,7 +154,7 @@ def _place_in_mass(sweep: Sweep, k: int) -> str:
 
 
 class _Vectors:
-    """Which temporaries of a part differ from lane to lane; what earlier parts kept are vectors."""
+    """Temporaries of a part that differ between lanes; values kept by earlier parts are vectors."""
 
     def __init__(self, part: Part, sources: Sources) -> None:
         self.sources, self.temporaries = (*sources, "kept"), set[int]()
@@ -161,7 +163,7 @@ class _Vectors:
                 self.temporaries.add(k)
 
     def has(self, expression: Expression) -> bool:
-        """Whether the expression is a vector."""
+        """Return whether the expression is a vector."""
         if isinstance(expression, Load):
             return expression.source in self.sources or (
                 expression.source == "w" and expression.index in self.temporaries
@@ -174,7 +176,7 @@ def _print_lanes(expression: Expression, vectors: _Vectors) -> str:
 
 
 def _with_lane_calls(expression: Expression, vectors: _Vectors) -> Expression:
-    """The same with ``f`` of a vector renamed ``lanes_f``, its plain arguments made vectors."""
+    """Return the expression with ``f`` of a vector renamed ``lanes_f``, and its scalar arguments made vectors."""
     if not isinstance(expression, Operation):
         return expression
     operands = tuple(_with_lane_calls(operand, vectors) for operand in expression.operands)

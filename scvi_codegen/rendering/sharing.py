@@ -1,10 +1,9 @@
-"""How threads share a family of terms: in rounds of tasks that add to different places.
+"""Division of a term group among threads, in rounds of tasks that add to different elements.
 
-Terms of a lattice add to neighbours of the outermost index: blocks of it are done in turn, first the even ones, then
-the odd ones. Pairs i < j are done in tiles, a block of i by a block of j, in the rounds of a tournament. All else, as
-rows of tables, may add to any place: each thread goes through all terms and adds to places of its own. Which one serves
-is seen in the indices alone, and the order in which a place is added to depends on sizes, never on the number of
-threads.
+Terms of a lattice add to neighbours of the outermost index: even blocks of it are done first, then odd ones. Pairs i <
+j are done in tiles, a block of i by a block of j, in the rounds of a round-robin tournament. All other terms, such as
+rows of tables, may add to any element: each thread evaluates all terms and adds to its own elements. The choice depends
+on the indices alone, and the order of additions on sizes, never on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ from scvi_codegen.rendering.sizes import count_text, size_text
 __all__ = ["MOST_THREADS", "Sharing", "sharing_of", "sharing_text"]
 
 MOST_THREADS = 64
-"""That share a step: as many as there are blocks of coordinates at most."""
+"""Largest number of threads that share a step: the largest number of blocks of coordinates."""
 
 
 class Sharing(Enum):
-    """What a task is told (``window`` of templates/support/indexed_blocks.h)."""
+    """Kinds of tasks (``window`` of templates/support/indexed_blocks.h)."""
 
     ALONE = auto()
     IN_TURN = auto()
@@ -32,7 +31,7 @@ class Sharing(Enum):
 
 
 def sharing_of(looped: LoopedKernel) -> Sharing:
-    """The way that serves."""
+    """Return the kind of tasks for a term group."""
     loops, targets = looped.loops, looped.targets
     if not loops:
         return Sharing.ALONE
@@ -46,7 +45,7 @@ def sharing_of(looped: LoopedKernel) -> Sharing:
 
 
 def sharing_text(looped: LoopedKernel) -> str:
-    """The same in C."""
+    """Return the C expression of the rounds."""
     found, loops = sharing_of(looped), looped.loops
     if found is Sharing.IN_TURN:
         span = f"{size_text(loops[0].first)}, {size_text(loops[0].end)}"
@@ -57,7 +56,7 @@ def sharing_text(looped: LoopedKernel) -> str:
 
 
 def _axes(targets: Sequence[Access], indices: Collection[str]) -> dict[str, int]:
-    """Of each array the axis on which all its targets move with one of the indices; nothing if an array has none."""
+    """Return the axis of each array on which all its targets depend on one of the indices; empty if one has none."""
     common: dict[str, set[int]] = {}
     for target in targets:
         moved = {k for k, place in enumerate(target.places) if place.index in indices and not place.table}
@@ -66,7 +65,7 @@ def _axes(targets: Sequence[Access], indices: Collection[str]) -> dict[str, int]
 
 
 def _width(targets: Sequence[Access], indices: Collection[str]) -> int:
-    """How far apart on these axes the places stand that an element adds to, at most."""
+    """Return the largest distance, on these axes, of elements that one term adds to."""
     offsets: dict[str, list[int]] = {}
     for target in targets:
         place = target.places[_axes(targets, indices)[target.array.name]]

@@ -1,4 +1,4 @@
-"""Sizes of arrays and loops in C, where a size is a number of the problem."""
+"""Sizes of arrays and loops in C, as numbers of the problem."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["count_text", "product_text", "size_text", "sizes_text"]
 
 
 def product_text(array: Array) -> str:
-    """The number of its entries, in C."""
+    """Return the number of entries of an array, in C."""
     return " * ".join(map(size_text, array.axes))
 
 
 def count_text(loops: Sequence[Loop]) -> str:
-    """How many elements loops have, in C."""
+    """Return the number of elements of loops, in C."""
     behind = {loop.behind: loop for loop in loops if loop.behind}
     return " * ".join(_span_text(loop, loop.index in behind) for loop in loops if not loop.behind) or "1"
 
@@ -28,13 +28,13 @@ def _span_text(loop: Loop, paired: bool) -> str:
 
 
 def size_text(size: Size) -> str:
-    """A size in C."""
+    """Return a size in C."""
     number = f"{size.number:+d}"
     return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
 
 
 def sizes_text(program: IndexedProgram, text: str) -> Iterator[str]:
-    """Declarations of the sizes that occur in a text."""
+    """Yield declarations of the sizes that occur in a source."""
     for k, name in enumerate(program.sizes):
         if re.search(rf"\bsize_{name}\b", text):
             yield f"const long long size_{name} = given->size[{k}];"

@@ -1,7 +1,7 @@
-"""C text and what is needed to call it: all that a stepper remembers of the symbolic world.
+"""C source of an integrator, and the interface that is needed to call it.
 
-An integrator is one header and one source, ``<prefix>.h`` and ``<prefix>.c``. The source includes support headers,
-plain C that is the same for every integrator, from a folder ``support`` beside it; amalgamated they stand in it.
+An integrator is one header and one source file, ``<prefix>.h`` and ``<prefix>.c``. The latter includes support headers,
+plain C that is the same for every integrator, from a folder ``support``; amalgamated, it contains them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["Interface", "Source", "check_interface", "included"]
 TEXTS = ("header", "code", "declarations")
 PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 SUPPORT = re.compile(r"support/\w+\.h", re.ASCII)
-"""Names of files, which are written into a folder: none leads out of it."""
+"""Names of files, which are written into a folder and must not lead out of it."""
 KINDS: dict[str, Callable[[Any], bool]] = {
     "str": lambda value: isinstance(value, str),
     "int": lambda value: type(value) is int and 0 <= value < 2**40,
@@ -31,20 +31,20 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
 }
-"""Whether a value read from JSON is what an annotation of :class:`Interface` says."""
+"""Checks of values read from JSON against the annotations of :class:`Interface`."""
 INCLUDED = re.compile(r'^#include "(support/\w+\.h)"\n', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """C text of an integrator.
+    """C source of an integrator.
 
     Attributes:
-        prefix: beginning of every exported C name.
-        header, code: texts of ``<prefix>.h`` and ``<prefix>.c``.
+        prefix: of every exported C name.
+        header, code: contents of ``<prefix>.h`` and ``<prefix>.c``.
         declarations: the header's inner part.
-        support: name and text of each header that the code includes from beside it, in order.
-        beside: a header and a source of its own that calls this one: the search for zero crossings, or FMI.
+        support: names and contents of the headers that the code includes, in order.
+        beside: a further header and source that call this one: the search for zero crossings, or FMI.
     """
 
     prefix: str
@@ -56,30 +56,30 @@ class Source:
 
     @property
     def files(self) -> dict[str, str]:
-        """Text by file name, ``/`` between folders."""
+        """File contents by file name, ``/`` between folders."""
         own = {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, **dict(self.support)}
         return own | (self.beside.files if self.beside else {})
 
     def write(self, folder: Path) -> None:
-        """All files, into a folder of their own."""
+        """Write all files into a folder."""
         for name, text in self.files.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(text, encoding="utf-8")
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """What is compiled: this one, and that beside it."""
+        """Sources to compile: this one, and :attr:`beside`."""
         return (self, self.beside) if self.beside else (self,)
 
     def amalgamated(self) -> Source:
-        """The same with each support header in the place where it is included."""
+        """Return the source with support headers inserted where they are included."""
         texts = dict(self.support)
         code = INCLUDED.sub(lambda include: texts[include[1]] if include[1] in texts else include[0], self.code)
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 
     def to_record(self) -> dict[str, Any]:
-        """Plain data, texts line by line, read back by :meth:`from_record`."""
+        """Return plain data, contents line by line, for :meth:`from_record`."""
         return {
             "prefix": self.prefix,
             **{name: getattr(self, name).split("\n") for name in TEXTS},
@@ -89,10 +89,10 @@ class Source:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Source:
-        """The source that :meth:`to_record` gave, also one of version 0.1, which has no support headers.
+        """Return the source from :meth:`to_record`, also of version 0.1, which has no support headers.
 
         Raises:
-            ValueError: for names that are none of an integrator's files, and texts that are no lists of lines.
+            ValueError: for invalid names of files, and contents that are not lists of lines.
         """
         names = record["prefix"], *record.get("support", {})
         for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
@@ -107,12 +107,12 @@ class Source:
         )
 
     def to_json(self) -> str:
-        """Text read back by :meth:`from_json`."""
+        """Return text for :meth:`from_json`."""
         return json.dumps(self.to_record())
 
     @classmethod
     def from_json(cls, text: str) -> Source:
-        """The source written by :meth:`to_json`."""
+        """Return the source from :meth:`to_json`."""
         return cls.from_record(json.loads(text))
 
 
@@ -121,7 +121,7 @@ def _is_number(value: Any) -> bool:
 
 
 def check_interface(source: Source, interface: Interface) -> None:
-    """Raise :class:`ValueError` where an interface says other sizes than the C text, which arrays are made of."""
+    """Raise :class:`ValueError` if an interface has other sizes than the C source, which determine those of arrays."""
     sizes = {
         "COORDINATES": interface.dimension,
         "PARAMETERS": len(interface.parameters),
@@ -153,36 +153,36 @@ def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
 
 
 def included(code: str) -> tuple[str, ...]:
-    """The support headers that a text includes, in order."""
+    """Return the support headers that a source includes, in order."""
     return tuple(INCLUDED.findall(code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interface:
-    """What a caller must know of a compiled integrator.
+    """Interface of a compiled integrator.
 
     Attributes:
-        prefix: beginning of every exported C name.
+        prefix: of every exported C name.
         title: system and method, one line.
-        notes: order, symplecticity, symmetry in words.
+        notes: order, symplecticity, symmetry as text.
         system, method: their names.
         coordinates, parameters: names in order.
-        defaults: parameter values used unless others are given.
+        defaults: default values of the parameters.
         unknowns: length of the run's memory of its last stages.
         workspace: doubles of workspace per call.
         has_action: whether the method has a discrete Lagrangian.
-        has_fallback: whether Newton's iteration is tried where sweeps fail.
-        map_names, map_formulas: of the momentum maps, what symmetries conserve.
+        has_fallback: whether Newton's method is tried if the fixed-point iteration fails.
+        map_names, map_formulas: of the momentum maps, the first integrals from symmetries.
         map_exact: whether the method is known to conserve them exactly, to round-off.
         momentum_names: in order; none in folders of version 0.1 for a Lagrangian: see :attr:`momenta`.
-        exchange_names: of what forces give in a step, energy and momentum maps; none without forces.
-        constraints: formulas of what the motion keeps at 0.
-        inputs: names of functions of time given as data, each five of the parameters.
-        energy_parameter: in transformed time the parameter that is the energy of the initial state, else "".
-        monitor: what chooses the lengths of its steps, g in dt = g dtau, or "".
-        conserves_energy: whether the motion does; not known of folders of version 0.1.
-        solver: of the stage equations, as of ``compile_stepper``, Newton's iteration behind it or not; not known of
-            folders of version 0.1.
+        exchange_names: of work and impulses of forces in a step: energy and momentum maps; none without forces.
+        constraints: formulas g of the constraints g = 0.
+        inputs: names of tabulated inputs, each of which has five parameters.
+        energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
+        monitor: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
+        conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
+        solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
+            version 0.1.
     """
 
     prefix: str
@@ -215,24 +215,24 @@ class Interface:
         return len(self.coordinates)
 
     def about(self) -> dict[str, str]:
-        """Title, system, method, and version of this package: what belongs beside every number computed."""
+        """Title, system, method, and version of this package, to accompany every computed number."""
         return {"title": self.title, "system": self.system, "method": self.method, "version": __version__}
 
     @property
     def momenta(self) -> tuple[str, ...]:
-        """Names of the momenta: those of a Hamiltonian, else ``p_`` before the coordinate's, where that is free."""
+        """Names of the momenta: those of a Hamiltonian, else ``p_`` and the coordinate's name."""
         return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
     def to_json(self) -> str:
-        """Text read back by :meth:`from_json`."""
+        """Return text for :meth:`from_json`."""
         return json.dumps(asdict(self), indent=2, ensure_ascii=True) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Interface:
-        """The interface written by :meth:`to_json`.
+        """Return the interface from :meth:`to_json`.
 
         Raises:
-            ValueError, TypeError: for other fields, and values of other kinds.
+            ValueError, TypeError: for other fields, and values of other types.
         """
         found: dict[str, Any] = json.loads(text)
         arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}

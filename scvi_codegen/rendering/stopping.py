@@ -1,13 +1,16 @@
-"""When iterations stop, if nothing else is said: known to the C and to those who call it."""
+"""Default convergence criteria of iterations, used by the C and by its callers."""
 
 __all__ = ["MAX_ITERATIONS", "NEAR", "ROUNDED", "TOLERANCE", "TYPED"]
 
 TOLERANCE = 2.0**-52
-"""Relative update below which an iteration has converged, if nothing else is said: the round-off unit of binary64."""
+"""Default relative update below which an iteration has converged: the round-off unit of binary64."""
 
 MAX_ITERATIONS = 50
-"""After which a step fails, if nothing else is said: Newton's iteration takes 3 to 6 and sweeps 5 to 20."""
+"""Default number of iterations after which a step fails: Newton's method takes 3 to 6, fixed-point iterations 5 to 20.
+"""
 
 ROUNDED, TYPED, NEAR = 64.0, 1e-6, 1e-2
-"""How far an initial state may be off constraints, as a part of its size: by rounding, in units of it; by what people
-type, moved without a word; beyond which it is refused."""
+"""Limits of the constraint violation of an initial state, relative to its size.
+
+Rounding, in units of it; precision of typed numbers, corrected silently; largest violation that is accepted.
+"""

@@ -1,7 +1,7 @@
-"""What the C is written for: the scalar type, and all that follows from it.
+"""Scalar types of C, and their rounding, literals and libm functions.
 
-The numbers of a program are exact. How they are rounded and spelled, and which functions of libm take them, belongs to
-a target. The support headers know it by the header of its name.
+The numbers of a program are exact; a target determines how they are rounded and printed, and which functions of libm
+take them. The support headers use the header of its name.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ class Target:
     """A scalar type of C.
 
     Attributes:
-        name: for people, as in :data:`~scvi_codegen.rendering.text.EMBEDDED`.
+        name: as in :data:`~scvi_codegen.rendering.text.EMBEDDED`.
         scalar: the type, and the name of its support header.
         suffix: of the functions of libm and of literals.
         digits: of a literal that reads back as the same number; 0: the shortest that does.
         tolerance: see :data:`scvi_codegen.rendering.stopping.TOLERANCE`.
-        halvings: of 1 to the round-off unit.
-        smallest, largest: numbers with all digits.
+        halvings: from 1 to the round-off unit.
+        smallest, largest: numbers with full precision.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Target:
     largest: float
 
     def rounded(self, value: Number) -> float:
-        """The number of the target nearest to ``value``; 0 below its smallest, as of low parts of tables."""
+        """Return the number of the target nearest to ``value``; 0 below its smallest, as for low words of tables."""
         digits = mp.convert(value)  # all 60 of them: it is rounded once
         if abs(digits) < self.smallest:
             return 0.0
@@ -49,11 +49,11 @@ class Target:
             return float(+digits)
 
     def rest(self, value: Number) -> Number:
-        """What rounding cuts off: a number is twice as exact in two parts."""
+        """Return the rounding error: the low word of a double-double number."""
         return settled(mp.convert(value) - self.rounded(value))
 
     def number(self, value: Number) -> str:
-        """A literal that reads back as the number of the target nearest to ``value``."""
+        """Return a literal that reads back as the number of the target nearest to ``value``."""
         nearest = self.rounded(value)
         if not self.digits:
             return repr(nearest)
@@ -61,11 +61,11 @@ class Target:
         return f"{text}{self.suffix}" if "." in text or "e" in text else f"{text}.0{self.suffix}"
 
     def function(self, name: str) -> str:
-        """The name of a function of libm."""
+        """Return the name of a function of libm."""
         return f"{name}{self.suffix}"
 
     def check(self, values: Iterable[Number]) -> None:
-        """Raise :class:`MethodError` for numbers of a model that the target cannot hold."""
+        """Raise :class:`MethodError` for numbers of a model outside the range of the target."""
         for value in values:
             if value != 0.0 and not self.smallest <= abs(value) <= self.largest:
                 raise MethodError(

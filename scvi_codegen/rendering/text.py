@@ -1,7 +1,7 @@
-"""Program to text: the only room that knows Jinja.
+"""Rendering of programs through the Jinja templates.
 
-Entry templates are named after the file they make; parts live in ``templates/parts``. Templates hold shape only: loops
-over the program's tables and the C that does not depend on it. Arithmetic arrives lowered and is printed by
+Entry templates are named after the file they make; parts are in ``templates/parts``. Templates contain only structure:
+loops over the program's tables and the C that does not depend on it. Kernels are printed by
 :mod:`scvi_codegen.rendering.printer` through filters.
 """
 
@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 Embedded: TypeAlias = Literal["double", "single"]
-"""The precision of C text for a microcontroller."""
+"""Precision of C source for a microcontroller."""
 
 EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
 
@@ -56,12 +56,14 @@ DECLARATIONS = {
 
 
 LARGEST_INLINED = 150
-"""Operations of the kernels of a sweep that is made part of the loop over steps. Larger ones lose by it: six bodies
-3 per cent, a chain of 64 masses 20."""
+"""Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
+
+Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses by 20.
+"""
 
 
 class ExampleInput(NamedTuple):
-    """A function of time: (n + 1,) breakpoints, and from each on coefficients of powers of the time since, (n, 4)."""
+    """Input as a function of time: (n + 1,) breakpoints, and (n, 4) coefficients of powers of the time since."""
 
     name: str
     breakpoints: tuple[float, ...]
@@ -70,15 +72,15 @@ class ExampleInput(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExampleRun:
-    """What the generated ``main.c`` runs: initial state, step, and how often it prints.
+    """Run of the generated ``main.c``: initial state, step, and output interval.
 
     Attributes:
-        h: of steps of one length, ``None`` where they choose theirs.
+        h: step size, ``None`` for adaptive steps.
         span: of time.
-        tolerance: of steps that choose their length; with a monitor in place of it tau.
-        controlled: whether the integrator has these.
-        to_end: whether it goes on to the end of the span, in steps of tau whose number is not known before.
-        inputs: of a system that has any, if they are given; ``parameters`` has their values at the start.
+        tolerance: of adaptive steps; with a time transformation the step tau.
+        controlled: whether the integrator has adaptive steps or a time transformation.
+        to_end: whether it continues to the end of the span, in a number of steps of tau that is not known before.
+        inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
         end: of a run with inputs.
     """
 
@@ -99,16 +101,16 @@ class ExampleRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventSearch:
-    """What the search for zeros of functions of the state is made from.
+    """Data of the search for zeros of functions of the state.
 
     Attributes:
         prefix, dimension: of the integrator.
         kernel: the functions at u = (q, p, v).
         uses_velocity: whether v occurs in them.
         transformed: whether time is, so that the integrator's velocities are dq/dtau.
-        nodes: (d + 1,) where they are evaluated on a part of a step, as fractions of it.
+        nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
         coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
-        doubts: of the last two of these, what part of them is in doubt.
+        doubts: factors of the last two coefficients in the error estimate.
     """
 
     prefix: str
@@ -122,30 +124,30 @@ class EventSearch:
 
     @property
     def velocity(self) -> str:
-        """The support header that gives v."""
+        """Support header that provides v."""
         return "event_velocity_by_clock" if self.transformed else "event_velocity"
 
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
-    """Header and source of a program; with control, steps that choose their length. Equal programs give equal bytes.
+    """Return header and source of a program; with control, with adaptive steps. Equal programs give equal bytes.
 
-    Where sweeps fail, Newton's iteration is the fallback if the program has it; or another is named.
+    If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
     """
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
 def render_derivatives(derivatives: Derivatives) -> Source:
-    """The text of a program solved by Newton's iteration, with the derivative of steps and its transpose."""
+    """Return the source of a program solved by Newton's method, with the derivative of steps and its transpose."""
     program = derivatives.program
     context = _context(program, DOUBLE, None, kernels=(*program.kernels, *derivatives.kernels), beside=derivatives)
     return _render(program.prefix, context | {"derivatives": derivatives, "written_out": None})
 
 
 def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
-    """The same for a microcontroller: one file, iterations bounded when it is compiled, the scalars of its registers.
+    """Return the source for a microcontroller: one file, bounded iterations, scalars of its registers.
 
     Raises:
-        MethodError: for a number that single precision cannot hold.
+        MethodError: for a number outside the range of single precision.
     """
     target = TARGETS[precision]
     target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
@@ -168,7 +170,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
 
 
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:
-    """What the templates of steps that choose their length need; the ladder's tables are a header of their own."""
+    """Return the template's context for adaptive steps; the predictor tables are a separate header."""
     name = f"support/{program.prefix}_ladder.h"
     if not (control and control.ladder and program.sweep):
         return {"control": control, "own_headers": {}}
@@ -176,9 +178,9 @@ def _control_context(program: Program, control: Control | None) -> dict[str, obj
 
 
 def render_ensemble(program: Program) -> Source | None:
-    """Text that integrates many trajectories at once, a lane each; ``None`` without a fixed-point solver.
+    """Return source that integrates many trajectories at once, one per lane; ``None`` without a fixed-point iteration.
 
-    Also with integrals: where time is one of these, trajectories have no common times.
+    Also ``None`` with integrals: with a time transformation, trajectories have no common times.
     """
     sweep = program.sweep
     if sweep is None or not sweep.serves_many or program.integrals:
@@ -200,7 +202,7 @@ def render_ensemble(program: Program) -> Source | None:
 
 
 def render_events(search: EventSearch) -> Source:
-    """The search for events, a header and a source behind those of an integrator."""
+    """Return header and source of the search for events."""
     context = {
         "search": search,
         "prefix": search.prefix,
@@ -214,7 +216,7 @@ def render_events(search: EventSearch) -> Source:
 
 
 def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
-    """``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
+    """Return ``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
     target = TARGETS[precision]
     target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
     for each in start.inputs:
@@ -233,9 +235,9 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
 
 
 def workspace_size(program: Program) -> int:
-    """Doubles of workspace: scratch, memory, and for Newton unknowns, point, update, pivots, rows and Jacobian.
+    """Return the doubles of workspace: scratch, memory; unknowns, point, update, pivots, rows, Jacobian of Newton.
 
-    Without Newton one in their place, for what a fallback may leave.
+    Without Newton's method one instead, for the result of a fallback.
     """
     if not program.newton:
         return scratch_size(program) + program.memory + 1
@@ -245,7 +247,7 @@ def workspace_size(program: Program) -> int:
 
 
 def scratch_size(program: Program) -> int:
-    """Doubles for the kernels of one family, or for the mass matrix with its slopes."""
+    """Return the doubles for the kernels of one stage group, or for the mass matrix with its derivatives."""
     mass = program.matrix_size(program.dimension, 1) + len(program.mass_entries)
     return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
 
@@ -292,7 +294,7 @@ def _scalar_kernels(
 
 
 def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
-    """What the templates of the fixed-point solver need; nothing without one. ``beside``: kernels of its derivative."""
+    """Return the template's context for the fixed-point iteration; ``beside``: kernels of its derivative."""
     sweep = program.sweep
     if sweep is None:
         return {"sweep": None}
@@ -303,10 +305,10 @@ def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]
 
 
 def _size(sweep: Sweep) -> int:
-    """Operations of all kernels with lanes."""
+    """Return the number of operations of all kernels on lanes."""
     return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
 
 
 def _inverse_roots(functions: set[str]) -> list[int]:
-    """The k of all ``inverse_root_k``."""
+    """Return the k of all ``inverse_root_k``."""
     return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))

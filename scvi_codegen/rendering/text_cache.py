@@ -1,8 +1,8 @@
-"""Generated texts, kept beside the compiled ones: what was derived once is not derived again.
+"""Cache of generated sources, next to the compiled ones.
 
-The name of an entry is made from everything the text depends on: the parts of a key that the caller gives, and the
-generator itself, of which the sizes and times of all files are taken. An entry that cannot be read or written, or is
-not what its checksum says, is no error: the text is then made anew.
+The name of an entry is a digest of everything the source depends on: the parts of a key that the caller passes, and the
+generator itself, represented by sizes and times of all files. An entry that cannot be read or written, or does not
+match its checksum, is no error: the source is generated again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["remembered_text"]
 
 
 def remembered_text(key: Sequence[str], make: Callable[[], str]) -> str:
-    """What ``make`` returns for this key, from the cache if it was made before."""
+    """Return the result of ``make`` for this key, from the cache if it was made before."""
     folder = trusted_folder()
     if folder is None:
         return make()
@@ -39,7 +39,7 @@ def remembered_text(key: Sequence[str], make: Callable[[], str]) -> str:
 
 @cache
 def _generator() -> str:
-    """Which version of this package, to the file, and of SymPy, which orders terms."""
+    """Return the version of this package, to the file, and of SymPy, which orders terms."""
     files = sorted([*PACKAGE.rglob("*.py"), *filter(Path.is_file, template_folder().rglob("*"))])
     lines = [f"{path} {(stat := path.stat()).st_size} {stat.st_mtime_ns}" for path in files]
     return "\n".join([*lines, f"sympy {sympy.__version__}"])

@@ -1,4 +1,4 @@
-"""Lattices of sums over indices as C: where each stands in the state, and its axes."""
+"""Lattices of indexed systems as C: their location in the state, and their axes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["roots_of", "waves_context"]
 
 
 def waves_context(program: IndexedProgram) -> dict[str, Any]:
-    """What the template needs of lattices."""
+    """Return the template's context for lattices."""
     before: list[str] = []
     lines: list[str] = []
     for array in program.coordinates:
@@ -32,7 +32,7 @@ def waves_context(program: IndexedProgram) -> dict[str, Any]:
 
 
 def roots_of(program: IndexedProgram) -> int:
-    """Of unity: numbers of a coordinate, in which those of every axis find room."""
+    """Return the doubles per coordinate that suffice for the roots of unity of every axis."""
     return 2 * max(map(_axes, program.coordinates))
 
 

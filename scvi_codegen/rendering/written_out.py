@@ -1,7 +1,7 @@
-"""The stage equations of the smallest programs as straight C: a statement a residual, the tables' numbers in place.
+"""Unrolled stage equations of the smallest programs: one statement per residual, with the numbers of the tables.
 
-Terms stand in the order in which the loops of ``support/stages.h`` add them, so both round alike; products with 0 are
-left out, products with 1 are not written.
+Terms are in the order in which the loops of ``support/stages.h`` add them, so that both round alike; products with 0
+are omitted, products with 1 simplified.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from scvi_codegen.rendering.target import Target
 __all__ = ["WrittenFamily", "WrittenOut", "written_out"]
 
 MOST_TERMS = 16
-"""Of the Jacobian: beyond, the tables are shorter."""
+"""Largest number of terms of the Jacobian; beyond it loops over tables are shorter."""
 
 Term: TypeAlias = tuple[Number, str]
-"""A number and what it multiplies."""
+"""A number and the factor that it multiplies."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenFamily:
-    """Where arguments, values and slopes of a family begin, and the statements that give its arguments."""
+    """Offsets of arguments, values and derivatives of a stage group, and the statements of its arguments."""
 
     family: Family
     u: int
@@ -42,7 +42,7 @@ class WrittenFamily:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrittenOut:
-    """Statements; ``sizes`` are how many arguments, values and slopes there are."""
+    """Statements; ``sizes`` are the numbers of arguments, values and derivatives."""
 
     families: tuple[WrittenFamily, ...]
     sizes: tuple[int, int, int]
@@ -53,7 +53,7 @@ class WrittenOut:
 
 
 def written_out(program: Program, target: Target) -> WrittenOut | None:
-    """The equations written out, ``None`` where loops over tables are shorter."""
+    """Return the unrolled equations, ``None`` if loops over tables are shorter."""
     if not program.newton or program.unknowns > FEW_UNKNOWNS or program.damping:
         return None
     writer = _Statements(program, target)
@@ -64,7 +64,7 @@ def written_out(program: Program, target: Target) -> WrittenOut | None:
 
 
 class _Statements:
-    """Writes tables as sums."""
+    """Writer of tables as sums."""
 
     def __init__(self, program: Program, target: Target) -> None:
         self.program, self.target = program, target
@@ -76,7 +76,7 @@ class _Statements:
         self.slope = list(accumulate(counts, initial=0))
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> WrittenOut:
-        """All statements, with those entries of the Jacobian."""
+        """Return all statements, with the given entries of the Jacobian."""
         program, blocks = self.program, self.program.blocks
         sites = range(program.sites)
         return WrittenOut(
@@ -120,7 +120,7 @@ class _Statements:
                     yield f"u[{n * family.value.arguments + loop.offset + i}] = {text};"
 
     def _row(self, site: int, row: int) -> list[Term]:
-        """The terms of row ``row`` of a site, the last row that of p1."""
+        """Return the terms of row ``row`` of a site, the last row that of p1."""
         program = self.program
         begins = row < program.blocks and site < program.dimension
         terms = [(program.momentum_rows[row], f"step->p0[{site}]")] if begins else []
@@ -133,7 +133,7 @@ class _Statements:
         return terms
 
     def _magnitudes(self) -> Iterator[str]:
-        """Of p1, then of q1: their terms without sign."""
+        """Yield the statements of the magnitudes of p1, then of q1: sums of absolute values."""
         program = self.program
         for s in range(program.sites):
             own = [f"step->p0[{s}]"] if s < program.dimension else []
@@ -148,7 +148,7 @@ class _Statements:
             yield f"size_q[{i}] = {_magnitude([f'step->q0[{i}]', *moves])};"
 
     def entries(self) -> dict[tuple[int, int, int, int], list[list[Term]]]:
-        """Sums by row (i, r) and column (j, b) of the Jacobian, a sum a pair of tables."""
+        """Return the sums by row (i, r) and column (j, b) of the Jacobian, one sum per pair of tables."""
         entries: dict[tuple[int, int, int, int], list[list[Term]]] = {}
         for k, family in enumerate(self.program.families):
             for block in family.blocks:
@@ -167,7 +167,7 @@ class _Statements:
         return entries
 
     def _slope_factor(self, k: int, n: int, e: int, power: int, coefficient: Number) -> str:
-        """The product of weight, h^power, slope and coefficient; nothing if that is 0."""
+        """Return the product of weight, h^power, derivative and coefficient; empty if that is 0."""
         if not coefficient:
             return ""
         slope = f"slope[{self.slope[k] + n * self.slopes[k] + e}]"
@@ -175,7 +175,7 @@ class _Statements:
         return product if coefficient == 1 else f"{product} * {self._signed(coefficient)}"
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:
-        """The product of weight, h^power and factor from the left; h before the weight if it is ``first``."""
+        """Return the product of weight, h^power and factor from the left; h before the weight if it is ``first``."""
         scale = [] if power == 0 else ["h" if power == 1 else f"({_power(power)})"]
         numbers = [] if weight == 1 else [self._signed(weight)]
         return " * ".join([*scale, *numbers, factor] if first else [*numbers, *scale, factor])
@@ -185,7 +185,7 @@ class _Statements:
         return f"({text})" if number < 0 else text
 
     def _sum(self, terms: Sequence[Term]) -> str:
-        """Terms that are not 0, joined by their signs; ``0`` if there is none."""
+        """Return the terms that are not 0, joined by their signs; ``0`` if there is none."""
         text = ""
         for coefficient, factor in terms:
             if coefficient:
@@ -205,7 +205,7 @@ class _Statements:
 
 
 def _statement(text: str) -> str:
-    """On lines that are broken between terms, not within products."""
+    """Return a statement that is broken between terms, not within products."""
     return wrapped(text.replace(" * ", "\0*\0"))
 
 

@@ -1,1 +1,1 @@
-"""The page from L to C: every formula beside the C function that computes it."""
+"""Page from L to C: every formula next to the C function that computes it."""

@@ -1,7 +1,7 @@
-"""Columns of a stage system's tables, read for what runs in them.
+"""Columns of a stage system's tables, and the index that they depend on.
 
-The names of a table tell: a column whose entries are called l_1_2, l_2_2, .. is l_2(tau_n) at point n. Entries without
-a name are 0, 1 and -1: all of them alike, or a single one that is not 0.
+It follows from the names in a table: a column whose entries are called l_1_2, l_2_2, .. is l_2(tau_n) at point n.
+Entries without a name are 0, 1 and -1: all of them alike, or a single one that is not 0.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ ANY_POINT = "n"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column over all points.
+    """A column over all points.
 
     Attributes:
         kind: ``"zero"``, ``"constant"``, ``"single"`` (one entry, the others 0), ``"leading"`` (ones for the first
             points, then zeros), ``"named"`` or ``"other"``.
-        points: how many entries it has.
+        points: number of entries.
         factor: of all entries, or of the single one.
         prefix: of the names.
         index: of the column in its names; the number of the point of the single entry, or of the last leading one,
-            counted from 1; ``None`` without one.
+            counted from 1; or ``None``.
         transposed: whether names have the index of the column first.
     """
 
@@ -45,7 +45,7 @@ class Column:
     transposed: bool = False
 
     def entry(self, index: object) -> sympy.Expr:
-        """The entry at point n, ``index`` in place of the column's own; a number is what it is."""
+        """Return the entry at point n, with ``index`` instead of the column's own; constants do not depend on it."""
         if self.kind in ("constant", "single", "leading"):
             return self.factor
         own = [] if self.index is None else [str(index)]
@@ -58,7 +58,7 @@ class Column:
 
 
 def column_of(table: Table, number: int) -> Column:
-    """Read one column of a table."""
+    """Return one column of a table."""
     names = [line[number] for line in table.names]
     values = [line[number] for line in table.entries]
     points, transposed = len(values), _is_transposed(table)
@@ -81,7 +81,7 @@ def column_of(table: Table, number: int) -> Column:
 
 
 def _is_transposed(table: Table) -> bool:
-    """Whether the second index in the names is that of the point, and the first is not."""
+    """Return whether the second index in the names is that of the point, and the first is not."""
     pairs = [
         (place, [int(index) for index in name.partition("/")[0].split("_")[1:]])
         for place, line in enumerate(table.names, 1)
@@ -93,7 +93,7 @@ def _is_transposed(table: Table) -> bool:
 
 
 def _parts(name: str, points: int, *, transposed: bool) -> tuple[str, int | None, int]:
-    """Prefix, index of the column (``None`` without one), divisor of a name: ``DD_1_0``, ``D_1_0/2``, ``-D_1_0``."""
+    """Return prefix, index of the column or ``None``, divisor of a name: ``DD_1_0``, ``D_1_0/2``, ``-D_1_0``."""
     base, _, divisor = name.removeprefix("-").partition("/")
     prefix, *indices = base.split("_")
     index = int(indices[0 if transposed else -1]) if len(indices) == 2 or points == 1 else None

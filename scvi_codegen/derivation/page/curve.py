@@ -1,4 +1,4 @@
-"""The trial curve of a method, in words and formulas, and the numbers that belong to it."""
+"""Trial curve of a method, in words and formulas, and its tables."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ CAPTIONS = {
     "gamma": "gamma_j: the fractions of the step",
 }
 SHOWN_WITH_PARTS = ("w", "dw", "d", "b")
-"""Entries that stand in the tables of quadratures and tableaux."""
+"""Entries that are part of the tables of quadratures and tableaux."""
 MOST_CELLS = 40
-"""Rows, and columns, of a table."""
+"""Largest number of rows, and of columns, of a table."""
 tau, j, s = Symbol("tau"), Symbol("j", integer=True), Symbol("s")
 
 
 def curve_section(method: Method) -> Section:
-    """Where on the step the method looks, and what moves between."""
+    """Return the section on the nodes and points of a method, and the curve through them."""
     drawing = step_drawing(method)
     contents = (*_curve(method), *(() if drawing is None else (drawing,)))
     return Section(name="curve", title="The trial curve", contents=contents)
 
 
 def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
-    """Nodes, weights, tableaux, and all entries that the equations name."""
+    """Return the section on nodes, weights, tableaux, and all entries that the equations name."""
     contents: list[Content] = []
     for part in method.parts:
         numbers = number_table(part)
@@ -73,7 +73,7 @@ def tables_section(method: Method, entries: tuple[TableEntry, ...]) -> Section:
 
 
 def _entry_table(prefix: str, entries: list[TableEntry]) -> Iterator[Content]:
-    """Entries of one name: a matrix, or a column where they have one index."""
+    """Yield entries of one name: a matrix, or a column if they have one index."""
     cells: dict[tuple[int, ...], Cell] = {_indices(entry)[1]: _shown(entry) for entry in entries}
     caption = CAPTIONS.get(prefix, f"{prefix}_{{n,j}}: coefficients of the equations")
     if any(len(index) < 2 for index in cells):
@@ -99,7 +99,7 @@ def _shown(entry: TableEntry) -> Cell:
 
 @singledispatch
 def _curve(method: Method) -> Iterator[Content]:
-    """What is said of the curve of a method, if anything is."""
+    """Yield the description of the curve of a method, if there is one."""
     return iter(())
 
 
@@ -166,7 +166,7 @@ def _nodal(degree: int) -> Iterator[Content]:
 
 
 def kronecker_form(method: SpectralCollocation) -> Iterator[Paragraph | Formula]:
-    """(18), (21) with letters for matrices; with all entries in ``StepEquations.matrix_form``."""
+    """Yield (18), (21) with letters for matrices; ``StepEquations.matrix_form`` has all entries."""
     s, m = method.degree, Symbol("m", integer=True, positive=True)
     A, a0 = MatrixSymbol("A", s, s), MatrixSymbol("a_0", s, 1)
     q0, p0, v0 = (MatrixSymbol(name, m, 1) for name in ("q_k", "p_k", "v_k"))

@@ -1,4 +1,4 @@
-"""The sections of the page, in order, and the page."""
+"""Sections of the page, in order, and the page."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ __all__ = ["derivation_html"]
 def derivation_html(
     system: MechanicalSystem, method: Method, *, solver: str = "auto", start: Start | None = None
 ) -> str:
-    """The derivation of ``method`` for ``system`` as a page of HTML that needs nothing else.
+    """Return the derivation of ``method`` for ``system`` as a self-contained page of HTML.
 
     Args:
-        system: what moves.
-        method: how its motion is discretised.
-        solver: of the C that is shown; as of :func:`~scvi_codegen.compiler.compile_stepper`.
-        start: of a step, at whose first guess the numbers of the Jacobian are shown.
+        system: the mechanical system.
+        method: its discretisation.
+        solver: of the C that is shown; as in :func:`~scvi_codegen.compiler.compile_stepper`.
+        start: of a step, at whose initial guess the entries of the Jacobian are evaluated.
 
     Raises:
-        MethodError: for a solver that the method does not have, or a system that the method is not for.
+        MethodError: for a solver that the method does not have, or a system that the method does not support.
     """
     check_regular(method, system)
     return page_template("derivation.html.jinja").render(

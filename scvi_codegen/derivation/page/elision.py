@@ -1,4 +1,4 @@
-"""What is too long to be read is left out, and how much that is stands in its place."""
+"""Elision of long formulas and functions, which are replaced by their size."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from scvi_codegen.display.page.blocks import Code, Content, Formula, Paragraph
 __all__ = ["MOST_FORMULAS", "formulas", "lines", "operations"]
 
 MOST_FORMULAS = 12
-"""Equations of one kind that are written out."""
+"""Largest number of equations of one kind that are shown."""
 MOST_OPERATIONS = 400
-"""Of an equation that is written out."""
+"""Largest number of operations of an equation that is shown."""
 MOST_TOGETHER = 600
-"""Of equations of one kind that are written out."""
+"""Largest number of operations of all equations of one kind that are shown."""
 MOST_LINES = 70
-"""Of a C function that are shown."""
+"""Largest number of lines of a C function that are shown."""
 
 
 @lru_cache(maxsize=4096)
 def operations(expression: sympy.Basic) -> int:
-    """As SymPy counts them: every function, power, product, quotient and sum of the formula as it stands."""
+    """Return the number of operations as SymPy counts them: functions, powers, products, quotients and sums."""
     return int(sympy.count_ops(expression))
 
 
 def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
-    """The first of them, and of the others how many they are.
+    """Yield the first formulas, and the number of the others.
 
     Args:
         given: all of them.
@@ -54,7 +54,7 @@ def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETH
 
 
 def lines(text: str) -> Code:
-    """C text, its end left out where it is long."""
+    """Return C source, truncated if it is long."""
     given = text.splitlines()
     if len(given) <= MOST_LINES:
         return Code(text)

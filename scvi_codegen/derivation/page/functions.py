@@ -1,4 +1,4 @@
-"""The functions around the kernels, in the order of their calls: what each does, and its C."""
+"""Functions around the kernels, in the order of their calls: their purpose, and their C."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from scvi_codegen.rendering.outline import Function, reached
 __all__ = ["functions_section"]
 
 OPENED = re.compile(r"\w+_advance|solve|sweep|newton|evaluate")
-"""Functions that are unfolded: the loop over the steps, and what solves for the stages."""
+"""Functions that are unfolded: the loop over the steps, and the solvers of the stages."""
 LANE_FUNCTION = re.compile(r"(lanes_)?inverse_root_\d|lanes_\w+")
 n, j = Symbol("n", integer=True), Symbol("j", integer=True)
 h, q, p, v0, g = (Symbol(name) for name in ("h", "q_k", "p_k", "v_0", "g"))
@@ -37,7 +37,7 @@ inverse_mass = Symbol("M__-1")
 def functions_section(
     system: MechanicalSystem, method: Method, program: Program, functions: Mapping[str, Function]
 ) -> Section:
-    """From the loop over the steps down: formulas or words at the left, C at the right."""
+    """Return the section on functions, from the loop over the steps down: formulas or words left, C right."""
     stages = discretise(system, method)
     kernels = {kernel.name for kernel in kernels_of(program)}
     start = f"{program.prefix}_advance"
@@ -68,7 +68,7 @@ def _pair(function: Function, start: str, given: Iterator[Content]) -> Beside:
 
 
 def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program: Program) -> Iterator[Content]:
-    """The equations that a function computes, where there is something to show."""
+    """Yield the equations that a function computes, if any."""
     if name == "evaluate":
         yield from _compiled(system, stages)
     elif name == "newton":

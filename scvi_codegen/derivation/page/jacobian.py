@@ -1,4 +1,4 @@
-"""The Jacobian of the stage equations: where it is not zero, and its numbers at the first guess of a step."""
+"""Jacobian of the stage equations: sparsity pattern, and values at the initial guess of a step."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from scvi_codegen.methods.stage_system import StageSystem
 __all__ = ["Start", "entry_numbers", "jacobian_section"]
 
 LARGEST_SHOWN = 3
-"""Rows of a Jacobian whose entries are typeset."""
+"""Largest number of rows of a Jacobian whose entries are typeset."""
 MOST_NUMBERS = 1000
-"""Entries of a Jacobian whose numbers are computed."""
+"""Largest number of entries of a Jacobian that are evaluated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """The step at whose first guess numbers are shown.
+    """Start of a step, at whose initial guess the Jacobian is evaluated.
 
     Attributes:
         q: (m,) positions.
-        velocity, p: (m,) each, ``None`` where not known; what needs it has no numbers then.
+        velocity, p: (m,) each, ``None`` if unknown; entries that depend on them are then not evaluated.
         h, t: step size and time.
     """
 
@@ -48,7 +48,7 @@ def jacobian_section(
     program: Program,
     start: Start | None = None,
 ) -> Section:
-    """Where the derivatives of the equations by their unknowns are not zero, and what they are at a start."""
+    """Return the section on the sparsity pattern of the Jacobian, and its values at a start."""
     pattern = jacobian_pattern(stages, system.dimension)
     small = derived is not None and pattern.entries <= MOST_NUMBERS
     numbers = entry_numbers(derived, start) if derived is not None and start is not None and small else {}
@@ -81,7 +81,7 @@ def jacobian_section(
 
 
 def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int], float]:
-    """Entries by row and column at the first guess; those that need what is not known are left out."""
+    """Return entries by row and column at the initial guess, without those that depend on unknown values."""
     values: dict[Symbol, sympy.Expr] = {entry.symbol: sympy.Float(str(entry.value)) for entry in derived.entries}
     values |= {parameter: sympy.Float(value) for parameter, value in derived.system.constants.items()}
     values |= {derived.step: sympy.Float(start.h), derived.time: sympy.Float(start.t)}
@@ -99,7 +99,7 @@ def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int],
 def _titles(
     derived: StepEquations, pattern: Pattern, numbers: Mapping[tuple[int, int], float]
 ) -> dict[tuple[int, int], str]:
-    """What an entry is: the equation, the unknown by which it is differentiated, and the number if that is known."""
+    """Return the titles of entries: the equation, the unknown, and the value if it is known."""
     return {
         (i, j): f"equation {i + 1} by {derived.unknowns[j]}" + (f": {numbers[i, j]:.6g}" if (i, j) in numbers else "")
         for i, row in enumerate(pattern.rows)

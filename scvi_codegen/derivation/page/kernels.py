@@ -1,4 +1,4 @@
-"""Each kernel's formulas beside its C, and what finding their common parts saved."""
+"""Formulas of each kernel next to its C, and the operations saved by common subexpressions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COUNTS = re.compile(r" Operations: .*$")
 
 
 def kernels_of(program: Program) -> tuple[Kernel, ...]:
-    """Every kernel of the C, each name once."""
+    """Return every kernel of the C, each name once."""
     kernels = list(program.kernels)
     if program.sweep:
         kernels += program.sweep.kernels
@@ -34,7 +34,7 @@ def kernels_of(program: Program) -> tuple[Kernel, ...]:
 
 
 def operations_section(program: Program) -> Section:
-    """Operations of every kernel before and after common parts were found."""
+    """Return the section on operations of every kernel before and after sharing of common subexpressions."""
     rows = tuple(
         (
             kernel.name,
@@ -61,7 +61,7 @@ def operations_section(program: Program) -> Section:
 
 
 def kernels_section(system: MechanicalSystem, program: Program, functions: Mapping[str, Function]) -> Section:
-    """One pair a kernel: formulas at the left, C at the right."""
+    """Return the section with one pair per kernel: formulas at the left, C at the right."""
     names = _names(system)
     pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
     text = (
@@ -72,7 +72,7 @@ def kernels_section(system: MechanicalSystem, program: Program, functions: Mappi
 
 
 def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
-    """Short symbols for the multipliers, lambda and nu with the name of their coordinate."""
+    """Return short symbols for the multipliers: lambda and nu with the name of their coordinate."""
     named = ((multipliers(system), "lambda"), (auxiliary_multipliers(system), "nu"))
     return {
         symbol: Symbol(f"{letter}_{q.name}")
@@ -82,7 +82,7 @@ def _names(system: MechanicalSystem) -> dict[Symbol, Symbol]:
 
 
 def kernel_text(functions: Mapping[str, Function], name: str) -> str:
-    """The C of a kernel; that of a large one is cut into parts, called by it in order."""
+    """Return the C of a kernel; a large one is divided into parts, which it calls in order."""
     parts = takewhile(functions.__contains__, (f"{name}_{k}" for k in count(1)))
     return "\n".join(functions[part].text for part in (*parts, name))
 

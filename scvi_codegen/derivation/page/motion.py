@@ -1,4 +1,4 @@
-"""What moves: the function that defines the system, its parameters, and the equations of motion."""
+"""Definition of the system, its parameters, and the equations of motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["motion_section", "system_section"]
 
 
 def system_section(system: MechanicalSystem) -> Section:
-    """The Lagrangian or the Hamiltonian, coordinates and parameters."""
+    """Return the section on the Lagrangian or the Hamiltonian, coordinates and parameters."""
     names = ", ".join(q.name for q in system.coordinates)
     letter, what = ("H", "Hamiltonian") if system.auxiliaries else ("L", "Lagrangian")
     count = f"{system.dimension} coordinate{'s' * (system.dimension > 1)}"
@@ -57,7 +57,7 @@ def system_section(system: MechanicalSystem) -> Section:
 
 
 def motion_section(system: MechanicalSystem) -> Section:
-    """Hamilton's equations where H is given, else the Euler-Lagrange equations."""
+    """Return the section with Hamilton's equations for H, else the Euler-Lagrange equations."""
     if system.auxiliaries:
         contents, title = tuple(_hamilton(system)), "Hamilton's equations"
     else:

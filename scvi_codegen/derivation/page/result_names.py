@@ -1,4 +1,4 @@
-"""What kernels are given and give back at a point, as symbols: q_n, L_q at point n, the Euler-Lagrange residual E_n."""
+"""Symbols of arguments and results of kernels: q_n, L_q at point n, the Euler-Lagrange residual E_n."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
 __all__ = ["argument_symbol", "meaning", "place_name", "result_symbol", "scalar_name"]
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
-"""Rates of the curve as they are typeset."""
+"""Time derivatives of the curve as they are typeset."""
 PLACES = {"start": "k", "end": "k+1"}
 MEANINGS = {
     "L": "L the Lagrangian, whose index says by what it is differentiated",
@@ -30,18 +30,18 @@ MULTIPLIED_FORCES = (
 
 
 def place_name(family: PointFamily, point: object = "n") -> str:
-    """The index of a point of a family: n, or k and k + 1 where it is an end of the step."""
+    """Return the index of a point of a stage group: n, or k and k + 1 at an end of the step."""
     return PLACES.get(family.name, str(point if len(family.abscissae) > 1 else 1))
 
 
 def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Symbol:
-    """What a gather gives at a point."""
+    """Return the symbol of the arguments of a gather at a point."""
     name = argument_name(system, gather)
     return Symbol(f"{ARGUMENTS.get(name, name)}_{place}")
 
 
 def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
-    """What a scatter takes from the kernel at a point; of a scalar's gradient, scatters are parallel to gathers."""
+    """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
     if system.constraints and scatter.results == positions_held(system):
         return Symbol(f"g_{place}")
     if system.constraints and scatter.results in (velocities_held(system), constraint_rates(system)):
@@ -55,14 +55,14 @@ def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatte
 
 
 def scalar_name(family: PointFamily) -> str:
-    """L, its k-th time derivative along the curve, or S."""
+    """Return L, its k-th time derivative along the curve, or S."""
     if family.name == "node":
         return "S"
     return "L" if not family.scalar_power else "L_dot" if family.scalar_power == 1 else f"L_d{family.scalar_power}"
 
 
 def meaning(family: PointFamily) -> str:
-    """What the letter of a family's results stands for."""
+    """Return the meaning of the letter of a stage group's results."""
     if family.scalar is not None:
         name = scalar_name(family)
         return MEANINGS[name[:5]] + (MULTIPLIED_FORCES if name == "S" and family.forced else "")

@@ -1,4 +1,4 @@
-"""Which entries of the Jacobian are not zero, by the structure of the tables and of the derivatives of kernels."""
+"""Sparsity pattern of the Jacobian, from the tables and the derivatives of kernels."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from scvi_codegen.methods.stage_system import StageSystem
 __all__ = ["Pattern", "jacobian_pattern", "pattern_drawing"]
 
 SIDE = 320
-"""Pixels of the picture."""
+"""Width of the picture in pixels."""
 LARGEST_DRAWN = 400
-"""Rows of a matrix of which every entry is drawn."""
+"""Largest number of rows of a matrix of which every entry is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """A square matrix of ``size`` rows: columns of the entries that are not zero, ascending, by row."""
+    """Sparsity pattern of a square matrix of ``size`` rows: by row, the ascending columns of nonzero entries."""
 
     size: int
     rows: tuple[tuple[int, ...], ...]
 
     @property
     def entries(self) -> int:
-        """How many are not zero."""
+        """Number of nonzero entries."""
         return sum(map(len, self.rows))
 
 
 def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
-    """Of the residuals with respect to the unknowns, in the order of the equations: block after block."""
+    """Return the pattern of the residuals with respect to the unknowns, in the order of the equations, by blocks."""
     places = [0, *accumulate(stages.block_sizes(dimension))]
     lines = [0, *accumulate(stages.row_sizes(dimension))]
     found: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
@@ -48,7 +48,7 @@ def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
 
 
 def _met(rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int) -> set[tuple[int, int]]:
-    """Rows and blocks that have a point in common."""
+    """Return the pairs of rows and blocks that have a point in common."""
     return {
         (r, b - 1)
         for row, block in zip(rows, blocks, strict=True)
@@ -60,7 +60,7 @@ def _met(rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]
 
 
 def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | None = None) -> Drawing | None:
-    """A picture of the matrix, ``None`` where it would be too large to be seen; ``titles`` show where one points."""
+    """Return a picture of the matrix, ``None`` if it is too large; ``titles`` are tooltips."""
     if pattern.size > LARGEST_DRAWN:
         return None
     cell = SIDE / pattern.size
@@ -84,14 +84,14 @@ def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | No
 
 
 def _pointed(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
-    """What is seen of an entry where one points at it."""
+    """Yield the tooltips of entries."""
     for (i, j), title in titles.items():
         place = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
         yield f'<rect class="entry" {place}><title>{escape(title)}</title></rect>'
 
 
 def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:
-    """First column and length of every run of neighbours."""
+    """Return first column and length of every run of neighbours."""
     runs: list[tuple[int, int]] = []
     for column in columns:
         if runs and sum(runs[-1]) == column:

@@ -1,4 +1,4 @@
-"""The equations of a step: in a few lines with sums, written out where they are short, and their Jacobian."""
+"""Equations of a step: in compact form with sums, and component by component if they are short."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 MOST_OPERATIONS = 6000
-"""Of all equations written out, about: beyond, they are not."""
+"""Approximate largest number of operations of all equations shown component by component."""
 FAMILIES = {
     "quadrature": "At the quadrature points tau_n",
     "node": "At the nodes",
@@ -40,7 +40,7 @@ FAMILIES = {
 
 
 def stage_section(system: MechanicalSystem, stages: StageSystem) -> Section:
-    """What is unknown, what kernels are given, and the equations but those with p_k."""
+    """Return the section on unknowns, arguments of kernels, and all equations but those with p_k."""
     return Section(
         name="stages",
         title="Stage equations",
@@ -53,7 +53,7 @@ def stage_section(system: MechanicalSystem, stages: StageSystem) -> Section:
 
 
 def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
-    """The implicit discrete Euler-Lagrange equations (5) and the end of the step."""
+    """Return the section on the implicit discrete Euler-Lagrange equations (5) and the end of the step."""
     rows = list(_rows(system, stages, {"IDEL"}))
     text = (
         "The equations that hold the momenta p_k and p_(k+1) together with the curve, (5): p_k is known, p_(k+1) is "
@@ -69,7 +69,7 @@ def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
 
 
 def families_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
-    """What each family of points is given, and what its results are called."""
+    """Yield the arguments of each stage group, and the names of its results."""
     meanings: dict[str, None] = {}
     for family in stages.families:
         given = list(gather_formulas(system, stages, family))
@@ -81,7 +81,7 @@ def families_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator
 
 
 def written_out(system: MechanicalSystem, method: Method, stages: StageSystem) -> StepEquations | None:
-    """The equations with everything put in, ``None`` where they would be too long to be read."""
+    """Return the equations component by component, ``None`` if they would be too long."""
     points = sum(
         len(family.abscissae) * sum(1 + operations(result) for result in family.results) for family in stages.families
     )
@@ -89,7 +89,7 @@ def written_out(system: MechanicalSystem, method: Method, stages: StageSystem) -
 
 
 def written_out_section(derived: StepEquations | None) -> Section:
-    """All equations component by component."""
+    """Return the section with all equations component by component."""
     title, name = "Written out", "written-out"
     if derived is None:
         text = (

@@ -1,4 +1,4 @@
-"""The step as a line, with the nodes, stages and quadrature points of a method on it."""
+"""Drawing of a step as a line, with the nodes, stages and quadrature points of a method."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INDEX = '<tspan dy="4" font-size="10">k</tspan>'
 
 
 def step_drawing(method: Method) -> Drawing | None:
-    """One line a part of the method; ``None`` without parts."""
+    """Return a drawing with one line per part of the method; ``None`` without parts."""
     if not method.parts:
         return None
     height = ROW * len(method.parts) + 34
@@ -55,7 +55,7 @@ def _mark(c: float, y: int, stem: float | None) -> str:
 
 
 def _stems(part: Part) -> list[float | None]:
-    """Heights by weight of a quadrature; nothing for nodes and stages."""
+    """Return heights by weight for a quadrature; ``None`` for nodes and stages."""
     if not isinstance(part, Quadrature):
         return [None] * len(positions(part))
     weights: Vector = part.weights

@@ -1,4 +1,4 @@
-"""Stage equations of any method in a few lines: sums over points and unknowns, and one row for those alike."""
+"""Stage equations in compact form: sums over points and unknowns, and one line for rows that differ in an index."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RUNNING_ROW = "i"
 
 
 def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> Iterator[Formula]:
-    """What the kernel of a family is given at point n; what is an unknown itself is left out."""
+    """Yield the arguments of the kernel of a stage group at point n, except those that are unknowns themselves."""
     for gather in family.gathers:
         total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, place_name(family))
         scale = sympy.Rational(str(gather.scale))
@@ -38,7 +38,7 @@ def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: Point
 
 
 def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tuple[Row, Formula]]:
-    """The equations; rows that differ in an index alone are one, the range of its index beside the number."""
+    """Yield the equations; rows that differ in an index alone are one, with the range of the index after the number."""
     lines = [_Line.of(system, stages, r) for r in range(len(stages.rows))]
     for _, alike in groupby(zip(stages.rows, lines, strict=True), key=lambda pair: pair[1].pattern):
         members = list(alike)
@@ -53,7 +53,7 @@ def row_formulas(system: MechanicalSystem, stages: StageSystem) -> Iterator[tupl
 
 
 def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula, Formula]:
-    """q_(k+1) and p_(k+1)."""
+    """Return q_(k+1) and p_(k+1)."""
     number_q, number_p = stages.end_numbers
     end = _Line.of(system, stages, len(stages.rows))
     return (
@@ -63,7 +63,7 @@ def end_formulas(system: MechanicalSystem, stages: StageSystem) -> tuple[Formula
 
 
 def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
-    """One line of a table times q_k and the unknowns, which are summed where they are of one kind."""
+    """Return one line of a table times q_k and the unknowns, as sums over unknowns of one kind."""
     columns = [column_of(table, c) for c in range(len(blocks) + 1)]
     first = columns[0]
     if first.kind == "single" and [column.index for column in columns] == list(range(1, len(columns) + 1)):
@@ -77,7 +77,7 @@ def gathered(table: Table, blocks: Sequence[Block]) -> sympy.Expr:
 
 
 def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator[sympy.Expr]:
-    """Unknowns of one kind times their coefficients."""
+    """Yield unknowns of one kind times their coefficients."""
     columns, numbers = [column for column, _ in group], [_number(block) for _, block in group]
     factor, span = h ** group[0][1].power, (j, numbers[0], numbers[-1])
     kinds = {column.kind for column in columns}
@@ -100,13 +100,13 @@ def _group_terms(letter: str, group: Sequence[tuple[Column, Block]]) -> Iterator
 
 
 def _ahead(column: Column, number: int) -> int:
-    """By how much the index of a column is greater than that of its unknown."""
+    """Return the difference of the index of a column and that of its unknown."""
     return 0 if column.index is None else column.index - number
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What one scatter gives to one line: what the table has there, and the result that it multiplies."""
+    """Contribution of a scatter to a line: the column of the table, and the result that it multiplies."""
 
     system: MechanicalSystem
     family: PointFamily
@@ -116,34 +116,34 @@ class _Part:
 
     @property
     def first(self) -> int:
-        """The number of the first point, as the names of the weights have it."""
+        """Number of the first point, as in the names of the weights."""
         return int(self.family.weight_names[0].rpartition("_")[2] or 1)
 
     @property
     def index(self) -> int | None:
-        """Of the column, or of the point of its single entry or its last leading one."""
+        """Index of the column, or of the point of its single entry or its last leading one."""
         kind, index = self.column.kind, self.column.index
         return index + self.first - 1 if index is not None and kind in ("single", "leading") else index
 
     def product(self, index: object) -> sympy.Expr:
-        """The entry times the result: at point n, or at the single point of the entry; weights left out."""
+        """Return the entry times the result, without weight: at point n, or at the single point of the entry."""
         place = place_name(self.family, index if self.column.kind == "single" else n)
         factor = sympy.Rational(str(self.scatter.scale)) * h**self.power
         return factor * self.column.entry(index) * result_symbol(self.system, self.family, self.scatter, place)
 
     def weight(self, index: object) -> sympy.Expr:
-        """Of a point, 1 where weights have no names."""
+        """Return the weight of a point, 1 if weights have no names."""
         name = self.family.weight_names[0]
         return Symbol(f"{name.rpartition('_')[0]}_{index}") if name else sympy.S.One
 
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One row of the equations, or the line of p_(k+1).
+    """A row of the equations, or the line of p_(k+1).
 
     Attributes:
         momentum: coefficient of p_k: a number, or the column of q_(k+1) whose entry it is.
-        parts: what the scatters give.
+        parts: contributions of the scatters.
         kind: number and kind of the row, without its own index.
         base: the index in which it differs from rows of the same pattern.
     """
@@ -155,7 +155,7 @@ class _Line:
 
     @classmethod
     def of(cls, system: MechanicalSystem, stages: StageSystem, r: int) -> _Line:
-        """Read a row; ``r`` beyond the last one is the line of p_(k+1)."""
+        """Return a row; ``r`` beyond the last one is the line of p_(k+1)."""
         row = stages.rows[r] if r < len(stages.rows) else None
         parts = tuple(
             _Part(system, family, scatter, column, scatter.power + (row.power if row else 0))
@@ -172,7 +172,7 @@ class _Line:
 
     @property
     def pattern(self) -> tuple[object, ...]:
-        """Equal for lines that differ in an index alone."""
+        """Key that is equal for lines that differ in an index alone."""
         momentum = self.momentum
         if isinstance(momentum, Column):
             coefficient: tuple[object, ...] = (momentum.prefix, self._shift(momentum.index))
@@ -195,7 +195,7 @@ class _Line:
         return None if index is None or self.base is None else index - self.base
 
     def summed(self, own: object) -> sympy.Expr:
-        """The right side, ``own`` in place of the line's own index."""
+        """Return the right side, with ``own`` instead of the line's own index."""
 
         def placed(index: int | None) -> object:
             shift = self._shift(index)
@@ -225,7 +225,7 @@ class _Line:
 
 
 def _momentum(stages: StageSystem, r: int) -> sympy.Expr | Column:
-    """The coefficient of p_k: the entry of the line of q_(k+1) where it is that, else a number."""
+    """Return the coefficient of p_k: the entry of the line of q_(k+1) if it is that, else a number."""
     if r == len(stages.rows):
         return _small(stages.end_momentum)
     value = stages.rows[r].momentum
@@ -236,7 +236,7 @@ def _momentum(stages: StageSystem, r: int) -> sympy.Expr | Column:
 
 
 def _small(value: Number) -> sympy.Expr:
-    """Halves exactly, other numbers in 17 digits."""
+    """Return halves exactly, other numbers in 17 digits."""
     doubled = 2 * value
     return sympy.Rational(int(doubled), 2) if doubled == int(doubled) else sympy.Float(str(value), 17)
 

@@ -1,11 +1,11 @@
-"""SymPy as presentation MathML, which browsers typeset by themselves.
+"""SymPy expressions as presentation MathML, which browsers typeset.
 
     >>> from sympy import Symbol
     >>> mathml(Symbol("theta_1_dot") / 2)  # doctest: +ELLIPSIS
     '<math><mfrac><msub><mover accent="true"><mi mathvariant="normal" ...>θ</mi><mo ...>˙</mo></mover>...</math>'
 
-Fractions keep what is short; wide factors stand behind them, and nothing is rewritten: signs and factors are those of
-the expression. Browsers do not break lines within ``<math>``, so :func:`mathml_terms` gives a long equation in pieces
+Fractions contain short factors, followed by wide ones, and nothing is rewritten: signs and factors are those of the
+expression. Browsers do not break lines within ``<math>``, so :func:`mathml_terms` returns a long equation in pieces
 between which a line may end.
 """
 
@@ -19,25 +19,25 @@ __all__ = ["mathml", "mathml_terms"]
 
 
 def mathml(expression: sympy.Basic, *, display: bool = False) -> str:
-    """One ``<math>`` element; well-formed XML and HTML.
+    """Return one ``<math>`` element; well-formed XML and HTML.
 
     Args:
         expression: an expression, a matrix or a relation.
-        display: whether it stands on a line of its own, with full-size fractions and limits above and below.
+        display: whether it is on a line of its own, with full-size fractions and limits above and below.
     """
     printer = Printer()
     return printer.text([printer.printed(expression)], display=display)
 
 
 def mathml_terms(right: sympy.Basic, left: sympy.Basic | None = None) -> tuple[tuple[str, ...], ...]:
-    """An equation as terms, and each of them as ``<math>`` elements, to be set one after the other.
+    """Return an equation as terms, and each of them as ``<math>`` elements, to be set one after the other.
 
     A line may end between terms, and between the pieces of a term that is longer than a line: before a factor, and
     before a sign within the brackets of a long factor. A short equation is one piece.
 
     Args:
         right: an expression, or an equation if ``left`` is ``None``.
-        left: what it equals; ``left =`` is the first piece where it is short.
+        left: the left side; ``left =`` is the first piece if it is short.
     """
     if left is None and isinstance(right, sympy.Eq):
         left, right = right.lhs, right.rhs

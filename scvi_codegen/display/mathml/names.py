@@ -1,4 +1,4 @@
-"""Names of symbols taken apart: ``theta_1_dot`` is a letter with an accent and an index, ``l_1_0`` is l_0(tau_1)."""
+"""Parser of names of symbols: ``theta_1_dot`` is a letter with an accent and an index, ``l_1_0`` is l_0(tau_1)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GREEK = {letter: name for name, letter in greek_unicode.items()}
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """What a symbol's name is made of: ``theta_1_dot`` is θ with an accent and one index."""
+    """Parts of a symbol's name: ``theta_1_dot`` is θ with an accent and one index."""
 
     letter: str
     accent: str = ""
@@ -36,7 +36,7 @@ class Name:
 
 
 def parsed(name: str) -> Name:
-    """Names as the package makes them (q_dot, p_q1_k, Q_2_x) and as SymPy knows them (Q__2_x, theta1)."""
+    """Return the parts of names as the package makes them (q_dot, p_q1_k, Q_2_x) and as SymPy does (Q__2_x, theta1)."""
     plain = LATEX_ACCENT.sub(r"\2_\1", name.strip("_") or name)
     head, *raised = re.split(r"__|\^", plain)
     above: list[str] = []
@@ -65,7 +65,7 @@ class TableName:
 
 
 def table_name(name: str) -> TableName | None:
-    """What a symbol stands for if it is called like an entry of a table."""
+    """Return the entry of a table that a symbol denotes if its name is that of one."""
     prefix, *indices = name.lstrip("_").split("_")
     if prefix in CARDINAL and len(indices) == 2 and all(map(str.isdigit, indices)):
         return TableName((Name("l", CARDINAL[prefix], below=(indices[1],)),), Name("τ", below=(indices[0],)), ())
@@ -75,7 +75,7 @@ def table_name(name: str) -> TableName | None:
 
 
 def latex_name(name: str) -> str:
-    """The same in LaTeX: ``l_1_0`` as l_0(tau_1), ``Q_2_x`` with 2 above and x below."""
+    """Return the name in LaTeX: ``l_1_0`` as l_0(tau_1), ``Q_2_x`` with 2 above and x below."""
     entry = table_name(name)
     if entry is None:
         return _latex(parsed(name))

@@ -1,4 +1,4 @@
-"""SymPy's presentation printer with our fractions, signs, names and numbers, and with long products in pieces."""
+"""SymPy's presentation MathML printer with other fractions, signs, names and numbers, and long products in pieces."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ __all__ = ["ONE_LINE", "Printer", "length"]
 DIGITS = 6
 """Significant digits of floating-point numbers."""
 SHORT = 24
-"""Characters of an expression that goes into a numerator whole."""
+"""Largest number of characters of an expression that is put into a numerator whole."""
 ONE_LINE = 48
-"""Characters of an equation, or of a term, that is not broken."""
+"""Largest number of characters of an equation, or of a term, that is not broken."""
 WIDE = 80
-"""Characters of a factor that is broken within its brackets."""
+"""Number of characters beyond which a factor is broken within its brackets."""
 TALL = "2.2em"
 """Height of brackets whose contents are in other pieces."""
 SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
@@ -34,21 +34,21 @@ SQUARED = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
 TYPESET = str.maketrans({"-": "\N{MINUS SIGN}", "ⅆ": "d", "ⅇ": "e", "ⅈ": "i"})
 TALL_TAGS = ("mfrac", "mtable", "munderover")
 DOT = {"style": "font-weight:bold;padding-bottom:0.12em"}
-"""Of dots above a letter: fonts without a table for mathematics set them onto the letter, where they are not seen."""
+"""Style of dots above a letter, which fonts without a table for mathematics would set onto the letter."""
 GREEK = re.compile("[\u0370-\u03ff]")
 UPRIGHT = {"mathvariant": "normal", "style": "font-style:italic"}
-"""Of Greek letters: the slanted ones that browsers would put in their place are missing in most fonts."""
+"""Style of Greek letters: the slanted ones that browsers would substitute are missing in most fonts."""
 
 Child: TypeAlias = Element | str
 Piece: TypeAlias = list[Element]
-"""What becomes one ``<math>`` element."""
+"""Elements that become one ``<math>`` element."""
 
 
 class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no stubs
-    """SymPy's printer with our fractions, signs, names and numbers."""
+    """SymPy's MathML printer with other fractions, signs, names and numbers."""
 
     def text(self, elements: Sequence[Element], *, display: bool) -> str:
-        """``<math>`` around elements."""
+        """Return ``<math>`` around elements."""
         root = self._element("math", *elements)
         if display:
             root.setAttribute("displaystyle", "true")
@@ -56,19 +56,19 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return str(root.toxml())
 
     def printed(self, expression: Any) -> Element:
-        """An expression as one element."""
+        """Return an expression as one element."""
         element: Element = self._print(expression)
         return element
 
     def operator(self, sign: str, **attributes: str) -> Element:
-        """A sign with attributes of its own."""
+        """Return a sign with attributes."""
         element = self._element("mo", sign)
         for name, value in attributes.items():
             element.setAttribute(name, value)
         return element
 
     def terms(self, expression: sympy.Basic) -> Iterator[list[Piece]]:
-        """The terms of a sum with their signs, in pieces between which a line may end."""
+        """Yield the terms of a sum with their signs, in pieces between which a line may end."""
         if not isinstance(expression, sympy.Add | sympy.Mul):
             yield [[self.printed(expression)]]
             return
@@ -81,7 +81,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
             yield pieces
 
     def _product_pieces(self, product: sympy.Expr) -> Iterator[Piece]:
-        """A fraction or narrow factors, then one wide factor after the other, those in brackets in pieces too."""
+        """Yield a fraction or narrow factors, then the wide factors one by one, those in brackets in pieces, too."""
         fraction, factors = self._fraction(product, longest=WIDE)
         narrow = list(takewhile(_is_narrow, factors))
         if fraction is not None or narrow:
@@ -111,12 +111,12 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return children[0] if len(children) == 1 else self._element("mrow", *children)
 
     def _fenced(self, *contents: Element) -> Element:
-        """In brackets, which grow with fractions and matrices only."""
+        """Return elements in brackets, which grow with fractions and matrices only."""
         begin, end = self._brackets(tall=any(map(_is_tall, contents)))
         return self._row(begin, *contents, end)
 
     def _brackets(self, *, tall: bool, **shape: str) -> list[Element]:
-        """Not symmetric about the fraction line: fonts without a table for mathematics do not say where that is."""
+        """Return brackets, not symmetric about the fraction line, whose height not all fonts define."""
         shape |= {"symmetric": "false"} if tall else {"stretchy": "false"}
         return [self.operator(sign, **shape) for sign in "()"]
 
@@ -128,7 +128,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return self._fenced(*elements[1:])
 
     def parenthesize(self, item: Any, level: int, strict: bool = False) -> Element:
-        """``item``, in brackets where it binds less than its surroundings."""
+        """Return ``item``, in brackets if its precedence is lower than that of its surroundings."""
         binding = precedence_traditional(item)
         return self._bracketed(item) if binding < level or (not strict and binding == level) else self.printed(item)
 
@@ -142,7 +142,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return self._row(*children)
 
     def _operand(self, term: sympy.Expr) -> Element:
-        """A term without its sign; a sum within a sum keeps its brackets."""
+        """Return a term without its sign; a sum within a sum keeps its brackets."""
         return self._bracketed(term) if term.is_Add else self.printed(term)
 
     def _print_Mul(self, expr: sympy.Expr) -> Element:
@@ -151,12 +151,12 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return self._row(*([self.operator("-")] if negative else []), *product)
 
     def _product(self, expr: sympy.Expr) -> list[Element]:
-        """A product without a sign."""
+        """Return a product without a sign."""
         fraction, factors = self._fraction(expr)
         return [*([] if fraction is None else [fraction]), *self._factors(factors)]
 
     def _fraction(self, expr: sympy.Expr, *, longest: int | None = None) -> tuple[Element | None, list[sympy.Expr]]:
-        """A fraction of what is short, and the wide factors that stand behind it.
+        """Return a fraction of the short factors, and the wide factors behind it.
 
         A denominator of more than ``longest`` characters is one of these, as a negative power.
         """
@@ -174,13 +174,13 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return self._element("mfrac", self._whole(narrow), self._whole(bottom)), wide
 
     def _whole(self, factors: Sequence[sympy.Expr]) -> Element:
-        """A numerator or a denominator: a single factor needs no brackets."""
+        """Return a numerator or a denominator: a single factor needs no brackets."""
         if not factors:
             return self._element("mn", "1")
         return self.printed(factors[0]) if len(factors) == 1 else self._row(*self._factors(factors))
 
     def _factors(self, factors: Sequence[sympy.Expr]) -> list[Element]:
-        """Factors with the invisible sign of a product between them, or a dot before a digit."""
+        """Return factors with the invisible sign of a product between them, or a dot before a digit."""
         elements = []
         for number, factor in enumerate(factors):
             last = number == len(factors) - 1 and isinstance(factor, sympy.Sum | sympy.Integral | sympy.Derivative)
@@ -259,7 +259,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
     _print_MatrixSymbol = _print_Dummy = _print_Symbol
 
     def _named(self, name: str) -> Element:
-        """A symbol: letter, accent, indices; an entry of a derived table as the function or matrix it comes from."""
+        """Return a symbol: letter, accent, indices; an entry of a derived table as a function or matrix entry."""
         entry = table_name(name)
         if entry is None:
             return self._typeset(parsed(name))
@@ -279,7 +279,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
         return self._element(tag, letter, *scripts) if scripts else letter
 
     def _indices(self, parts: Sequence[str]) -> Element:
-        """Indices with commas between them; ``k+1`` is a sum, ``q1`` has an index of its own."""
+        """Return indices with commas between them; ``k+1`` is a sum, ``q1`` has its own index."""
         elements: list[Element] = []
         for number, part in enumerate(parts):
             elements += [self._comma()] if number else []
@@ -292,7 +292,7 @@ class Printer(MathMLPresentationPrinter):  # type: ignore[misc]  # SymPy has no 
 
 
 def _sign_and_size(term: sympy.Expr) -> tuple[bool, sympy.Expr]:
-    """Whether the number in front is negative, and the term without that sign."""
+    """Return whether the leading number is negative, and the term without that sign."""
     if not isinstance(term, sympy.Mul) or term.is_Matrix:
         negative = bool(term.is_Number and term.is_negative)
         return negative, -term if negative else term
@@ -304,7 +304,7 @@ def _sign_and_size(term: sympy.Expr) -> tuple[bool, sympy.Expr]:
 
 
 def _numerator_and_denominator(product: sympy.Expr) -> tuple[list[sympy.Expr], list[sympy.Expr]]:
-    """The factors above and below the line, in SymPy's order."""
+    """Return the factors above and below the fraction line, in SymPy's order."""
     top: list[sympy.Expr] = []
     bottom: list[sympy.Expr] = []
     for factor in product.as_ordered_factors():
@@ -319,13 +319,13 @@ def _numerator_and_denominator(product: sympy.Expr) -> tuple[list[sympy.Expr], l
 
 
 def _inverted(factor: sympy.Expr) -> tuple[sympy.Expr, sympy.Expr]:
-    """Base and exponent of 1 / factor."""
+    """Return base and exponent of 1 / factor."""
     base, exponent = factor.args if factor.is_Pow else (factor, sympy.S.One)
     return base, -exponent
 
 
 def _is_narrow(factor: sympy.Expr) -> bool:
-    """Numbers, symbols and their powers and roots."""
+    """Return whether a factor is a number, a symbol, or a power or root of these."""
     return bool(factor.is_Atom or (factor.is_Pow and factor.base.is_Atom and factor.exp.is_Atom))
 
 
@@ -336,17 +336,17 @@ def _starts_with_digit(factor: sympy.Expr) -> bool:
 
 
 def length(expression: sympy.Basic) -> int:
-    """About the width of an expression, in characters."""
+    """Return the approximate width of an expression, in characters."""
     return len(str(expression))
 
 
 def _is_tall(element: Element) -> bool:
-    """Whether brackets around it should grow."""
+    """Return whether brackets around an element should grow."""
     return element.tagName in TALL_TAGS or any(_is_tall(child) for child in element.childNodes if child.nodeType == 1)
 
 
 def _finish(node: Any) -> None:
-    """Make the text within well-formed (SymPy's printer writes HTML entities) and its Greek letters seen."""
+    """Make the text well-formed (SymPy's printer writes HTML entities) and its Greek letters visible."""
     for child in node.childNodes:
         if child.nodeType != Node.TEXT_NODE:
             _finish(child)

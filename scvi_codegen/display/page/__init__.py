@@ -1,6 +1,5 @@
-"""Pages of HTML that need nothing else: formulas as MathML, pictures inline, no script, no network.
+"""Self-contained pages of HTML: formulas as MathML, pictures inline, without scripts or network.
 
-What stands on a page (:mod:`~scvi_codegen.display.page.blocks`), its text typeset
-(:mod:`~scvi_codegen.display.page.typesetting`), and the templates in which it is set
-(:mod:`~scvi_codegen.display.page.environment`).
+Modules: contents of a page (:mod:`~scvi_codegen.display.page.blocks`), typesetting of its text
+(:mod:`~scvi_codegen.display.page.typesetting`), and its templates (:mod:`~scvi_codegen.display.page.environment`).
 """

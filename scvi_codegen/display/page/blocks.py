@@ -1,4 +1,4 @@
-"""What a page is made of: prose, formulas, tables, text in a fixed-width font, drawings, and things side by side."""
+"""Blocks of a page: prose, formulas, tables, fixed-width text, drawings, and blocks side by side."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Cell: TypeAlias = float | int | str | sympy.Basic | None
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableBlock:
-    """Numbers, written as CSV in full precision.
+    """Table of numbers, written as CSV in full precision.
 
     Attributes:
         name: ``""`` for the main table of a result, else what is appended to the file's name.
         columns: headings.
-        rows: as many cells as columns; ``None`` where there is no number.
-        formats: format specification by column, for the report; ``".3g"`` where none is given.
+        rows: as many cells as columns; ``None`` for a missing number.
+        formats: format specification by column, for the report; default ``".3g"``.
         shown: whether the report prints it; long series of a curve are only drawn.
     """
 
@@ -75,7 +75,7 @@ class Listing:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """C, with its comments set back; what is long scrolls."""
+    """C source, with its comments in a lighter colour; long lines scroll."""
 
     text: str
 
@@ -86,7 +86,7 @@ class Drawing:
 
     Attributes:
         svg: an ``<svg>`` element with colours of the page (``currentColor``, its variables).
-        caption: what it shows.
+        caption: description.
     """
 
     svg: str
@@ -95,12 +95,12 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beside:
-    """Things side by side on a wide screen, one above the other on a narrow one.
+    """Contents side by side on a wide screen, one above the other on a narrow one.
 
     Attributes:
         title: of both, in a fixed-width font.
-        left, right: what stands there.
-        folded: whether only the title is seen until the reader unfolds it.
+        left, right: contents.
+        folded: whether only the title is visible until the reader unfolds it.
     """
 
     title: str
@@ -118,7 +118,7 @@ class Section:
     """A part of a page.
 
     Attributes:
-        name: what links to it use.
+        name: anchor of links.
         title: its heading.
         contents: in order.
     """

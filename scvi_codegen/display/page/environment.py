@@ -1,4 +1,4 @@
-"""The templates of pages, ``templates/page.html.jinja`` and those that extend it, with their filters."""
+"""Jinja environment of pages, ``templates/page.html.jinja`` and those that extend it, with their filters."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ KINDS = {
     "beside": blocks.Beside,
     "table": blocks.TableBlock,
 }
-"""What templates ask of a block."""
+"""Tests of blocks in templates."""
 COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
 def page_template(name: str, **filters: Callable[..., object]) -> Template:
-    """The template of that file name, with ``filters`` of its own beside those of all pages."""
+    """Return the template of that file name, with ``filters`` in addition to those of all pages."""
     environment = _environment()
     if not filters:
         return environment.get_template(name)
@@ -40,7 +40,7 @@ def page_template(name: str, **filters: Callable[..., object]) -> Template:
 
 
 def style_sheet(*names: str) -> Markup:
-    """The text of style sheets, one after the other."""
+    """Return the contents of style sheets, one after the other."""
     return Markup("\n".join((template_folder() / name).read_text(encoding="utf-8") for name in names))
 
 
@@ -71,7 +71,7 @@ def _is_a(kind: type) -> Callable[[object], bool]:
 
 
 def _equation(formula: blocks.Formula) -> Markup:
-    """Terms that stay together where they fit a line."""
+    """Return terms that are not broken if they fit a line."""
     terms = mathml_terms(formula.right, formula.left)
     return Markup(" ".join(f'<span class="term">{" ".join(pieces)}</span>' for pieces in terms))
 

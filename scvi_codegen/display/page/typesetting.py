@@ -1,4 +1,4 @@
-"""Plain ASCII prose and table cells as typeset HTML: 1e-9, h^2, q_(k+1), -3, <=, ``..``."""
+"""Typesetting of ASCII prose and table cells as HTML: 1e-9, h^2, q_(k+1), -3, <=, ``..``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["SPACE", "cell", "column_class", "column_heading", "prose"]
 
 FORMAT = ".3g"
 LONGEST_LINE = 32
-"""Characters of a cell whose lines are not broken."""
+"""Largest number of characters of a cell that is not broken into lines."""
 MINUS, TIMES, SPACE = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{NO-BREAK SPACE}"
 SIGNS = {
     "...": "\N{HORIZONTAL ELLIPSIS}",
@@ -38,7 +38,7 @@ NEGATIVE = re.compile(r"(?<![\w)\]>;-])-(?=\d)|(?<== )-(?=\w)|(?<= )-(?= |[A-Za-
 
 
 def prose(text: str) -> Markup:
-    """Text with its numbers, indices and signs typeset; ``h = 0.1`` stays on one line."""
+    """Return text with its numbers, indices and signs typeset; ``h = 0.1`` stays on one line."""
     typeset = SIGN.sub(lambda match: SIGNS[match[0]], str(escape(text)))
     typeset = LOWERED.sub(_lowered, SCIENTIFIC.sub(_scientific, typeset))
     typeset = EQUALITY.sub(f"{SPACE}={SPACE}", RAISED.sub(_raised, typeset))
@@ -46,12 +46,12 @@ def prose(text: str) -> Markup:
 
 
 def column_heading(text: str) -> Markup:
-    """Of a column; an index that it gives a value is set as a variable, whose letter is not mistaken for another."""
+    """Return the heading of a column; an index with a value is set as a variable."""
     return Markup(INDEX.sub(r"<var>\1</var>", str(prose(text))))
 
 
 def cell(value: Cell, specification: str | None = None) -> Markup:
-    """An entry of a table; numbers in the format given, a dash where there is none."""
+    """Return an entry of a table; numbers in the given format, a dash if there is none."""
     match value:
         case None:
             return Markup("\N{EN DASH}")
@@ -65,7 +65,7 @@ def cell(value: Cell, specification: str | None = None) -> Markup:
 
 
 def column_class(table: TableBlock, index: int) -> str:
-    """``"number"`` for what is set to the right, ``"text"`` for what needs several lines."""
+    """Return ``"number"`` for right-aligned columns, ``"text"`` for multi-line ones, ``"word"`` for others."""
     cells = [row[index] for row in table.rows]
     texts = [value for value in cells if isinstance(value, str)]
     if any(isinstance(value, sympy.Symbol) for value in cells):

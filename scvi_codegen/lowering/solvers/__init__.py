@@ -1,6 +1,6 @@
-"""Solvers of the stage equations that need no matrix: fixed points, whose points are lanes of a vector, and splittings.
+"""Solvers of the stage equations without matrices: fixed-point iterations and splittings.
 
-Each room here turns the tables of a method and the kernels of a system into data for one template; which of them serves
-is said in :mod:`scvi_codegen.lowering.solvers.choice`. Newton's iteration, which serves always, is made from the stage
-system itself, in :mod:`scvi_codegen.lowering.program`.
+The points of an iteration are SIMD lanes. Each module turns the tables of a method and the kernels of a system into
+data for a template; :mod:`scvi_codegen.lowering.solvers.choice` selects one. Newton's method, which is always
+available, is lowered from the stage system itself, in :mod:`scvi_codegen.lowering.program`.
 """

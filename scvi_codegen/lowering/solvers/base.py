@@ -1,14 +1,14 @@
-"""What every solver without a matrix is: a function from a problem to its sweep, or ``None`` where it does not serve.
+"""Common interface of the fixed-point solvers: a function from a problem to an iteration, or ``None``.
 
-A solver is a file in this folder with such a function, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of :class:`~scvi_codegen.ir.sweep.Sweep`, data alone, that
-declares the tables and the support headers of which :mod:`scvi_codegen.rendering.lanes` makes C. Solvers share
-nothing but the problem. What they may rely on:
+A solver is a module in this folder with such a function, a line in ``FIXED_POINTS``
+(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of :class:`~scvi_codegen.ir.sweep.Sweep`, plain data,
+which declares the tables and the support headers from which :mod:`scvi_codegen.rendering.lanes` renders C. Solvers
+share only the problem. They may rely on the following:
 
-* the tables of a shape are numbers of the method in 60 digits, and stay so in the sweep; they are rounded when they are
-  printed, in two parts where what rounding does to the map is to be less;
-* the numbers of a sweep are padded to its lanes (:mod:`scvi_codegen.lowering.solvers.padding`);
-* a sweep that does not converge costs time, not correctness: Newton's iteration follows it.
+* the tables of a shape are numbers of the method in 60 digits, also in the iteration; they are rounded when they are
+  printed, as double-double numbers if one rounding is not accurate enough;
+* the tables of an iteration are padded to its lanes (:mod:`scvi_codegen.lowering.solvers.padding`);
+* an iteration that does not converge costs time, not correctness: Newton's method follows it.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class StepProblem:
 
     @property
     def lagrangian(self) -> LagrangianSystem | None:
-        """The system itself, or where a Hamiltonian is given that of its Lagrangian, if one is found.
+        """The system itself, or for a Hamiltonian that of its Lagrangian, if one is found.
 
-        The step of both is the same (35f).
+        Both have the same step (35f).
         """
         return lagrangian_twin(self.system)
 

@@ -1,4 +1,4 @@
-"""Which fixed-point solver serves a method and a system.
+"""Choice of the fixed-point solver for a method and a system.
 
 All of them iterate on kernels at points that are the lanes of one vector, without a Newton matrix:
 :mod:`~scvi_codegen.lowering.solvers.separable` on positions, :mod:`~scvi_codegen.lowering.solvers.coupled` on
@@ -34,11 +34,11 @@ FIXED_POINTS: tuple[Solver, ...] = (
     printed_sweep,
     shooting_sweep,
 )
-"""The first that serves is taken: the quickest."""
+"""Fixed-point solvers, the fastest first; the first that is applicable is used."""
 
 
 def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
-    """The fixed-point iteration of the stage equations of a system, or ``None`` where there is none."""
+    """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none."""
     if system.constraints:
         return None
     problem = StepProblem(system, stages.shape)
@@ -46,7 +46,7 @@ def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
 
 
 def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
-    """Raise :class:`MethodError` for a solver that does not exist, or was not ``found`` for this method and system."""
+    """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
     if solver not in names:
         raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")
     if solver == "explicit" and found is None:

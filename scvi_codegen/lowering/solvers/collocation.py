@@ -1,9 +1,9 @@
-"""The fixed-point solver of collocation in position form: accelerations at the nodes, as lanes.
+"""Fixed-point solver of collocation in position form: accelerations at the nodes are SIMD lanes.
 
-It serves what collocates the Euler-Lagrange equations and is not variational: spectral collocation and Runge-Kutta
-methods in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
+It applies to non-variational collocation of the Euler-Lagrange equations: spectral collocation and Runge-Kutta methods
+in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
 printed, whose momenta at both ends are quadratures. The equations, those of ``methods/collocation.py`` and
-``methods/shooting.py`` solved for the accelerations, stand at :class:`scvi_codegen.ir.curve_sweeps.CollocationSweep`.
+``methods/shooting.py`` solved for the accelerations, are in :class:`scvi_codegen.ir.curve_sweeps.CollocationSweep`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["position_sweep", "printed_sweep"]
 
 
 def position_sweep(problem: StepProblem) -> CollocationSweep | None:
-    """The fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
+    """Return the fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, Accelerations):
         return None
@@ -49,7 +49,7 @@ def position_sweep(problem: StepProblem) -> CollocationSweep | None:
 
 
 def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
-    """The fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
+    """Return the fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, PrintedCurve):
         return None
@@ -69,7 +69,7 @@ def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
 
 
 def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds:
-    """Weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
+    """Return the weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
     nodes = (0, *tableau.c)
     values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_slopes))
 
@@ -85,7 +85,7 @@ def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds
 
 
 def _node_kernel(system: MechanicalSystem) -> Kernel:
-    """L_q - L_vq v - L_vt and the lower triangle of the mass."""
+    """Return the kernel of L_q - L_vq v - L_vt and the lower triangle of the mass."""
     return system_kernel(
         system,
         "applied_force_lanes",

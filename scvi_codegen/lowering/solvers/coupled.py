@@ -1,17 +1,17 @@
-"""The fixed-point solver for any regular Lagrangian: velocities are corrected by the mass at each point, in lanes.
+"""Fixed-point solver for any regular Lagrangian: velocities are corrected by the mass matrix at each point, in lanes.
 
-The equations are L_v(q_n, V_n) = P_n with q_n and P_n from the two tables of a method. With other points than
-velocities (an SVI of another quadrature) the s velocities z_b give V_n = sum_b l_nb z_b and the equations are projected
-on them: a correction goes to the points by l, through the mass of each, and back by the projection.
+The equations are L_v(q_n, V_n) = P_n with q_n and P_n from the two tables of a method. If the points are not those of
+the velocities (an SVI with another quadrature), the s velocities z_b give V_n = sum_b l_nb z_b and the equations are
+projected: a correction is interpolated by l, solved with the mass at each point, and projected back.
 
-Where masses depend on positions, a correction changes forces and momenta about as much as what it corrects. So it is
-made twice, the second time less its own effect to first order, by F_q, F_v and L_vq of the same kernel: a sweep then
-contracts as two do, and forces at the end follow the last correction. A quarter of the time of a step is saved on a
-swinging Atwood machine, 8 to 25 % on pendulums, carts and motions in transformed time.
+If masses depend on positions, a correction changes forces and momenta about as much as the residual it removes. So it
+is computed twice, the second time including its own first-order effect, by F_q, F_v and L_vq of the same kernel: one
+iteration then converges like two, and the final forces include the last correction. This saves a quarter of the time of
+a step of a swinging Atwood machine, 8 to 25 % for pendulums, carts and time-transformed systems.
 
-For a variational method the two tables belong together. With mu_nj = a_nj / beta_j, the scaled weights h beta_j
-rounded once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51,
-the rounded map still has a generating function: its energy error does not drift.
+For a variational method the two tables are adjoint. With mu_nj = a_nj / beta_j, the scaled weights h beta_j rounded
+once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51, the
+rounded map still has a generating function: its energy error does not drift.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ __all__ = ["coupled_sweep", "over", "weighted_tables"]
 
 FRACTION_BITS = 51
 MOST_FOLLOWED = 8
-"""Coordinates; of more the slopes of all forces by all of them cost more than they save."""
+"""Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
 
 
 def coupled_sweep(problem: StepProblem) -> CoupledSweep | None:
-    """The fixed-point iteration of a Lagrangian; ``None`` with too many points."""
+    """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
     return _sweep(system, tables) if system and tables else None
 
@@ -84,9 +84,9 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
 
 
 def _followed(system: LagrangianSystem) -> tuple[Expr, ...]:
-    """F_q, F_v and L_vq row by row, zeros with them, of few coordinates whose masses depend on where they are.
+    """Return F_q, F_v and L_vq by rows, with their zeros, for few coordinates with position-dependent masses.
 
-    Of others nothing: their sweeps contract quickly.
+    Nothing for other systems, whose iterations converge quickly.
     """
     forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
     if m > MOST_FOLLOWED or not any(entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()):
@@ -100,7 +100,7 @@ def _followed(system: LagrangianSystem) -> tuple[Expr, ...]:
 
 
 def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
-    """Position table and weights, momentum table and weights, whose products are the method's own tables."""
+    """Return position table and weights, momentum table and weights, whose products are the method's own tables."""
     beta, weights = tables.end_position, tables.end_momentum
     if not tables.variational:
         ones = (mp.one,) * len(beta)
@@ -113,5 +113,5 @@ def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vec
 
 
 def over(numbers: Vector, divisors: Vector) -> Vector:
-    """Quotients, entry by entry."""
+    """Return quotients, entry by entry."""
     return tuple(x / y for x, y in zip(numbers, divisors, strict=True))

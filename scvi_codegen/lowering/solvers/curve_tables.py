@@ -1,4 +1,4 @@
-"""Tables of the fixed-point solvers whose unknowns are accelerations: the nodes of a curve, and points along it."""
+"""Tables of the fixed-point solvers with accelerations as unknowns: the nodes of a curve, and points along it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["node_tables", "point_tables"]
 
 
 def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
-    """The nodes of a curve: the stages of a tableau."""
+    """Return the nodes of a curve: the stages of a tableau."""
     size = len(tableau.b)
     return NodeTables(
         count=size,
@@ -28,7 +28,7 @@ def node_tables(tableau: Tableau, lanes: int) -> NodeTables:
 
 
 def point_tables(system: MechanicalSystem, tableau: Tableau, rule: Quadrature, lanes: int) -> PointTables:
-    """The points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
+    """Return the points of a quadrature along a curve whose velocity is a polynomial through the nodes."""
     forms = forms_of(system)
     return PointTables(
         abscissae=pad_vector(rule.abscissae, lanes, repeat=True),

@@ -1,9 +1,9 @@
-"""The fixed-point solver for a system given by its Hamiltonian: no mass matrix, no Legendre transform, in lanes.
+"""Fixed-point solver for Hamiltonian systems: no mass matrix, no Legendre transform, in lanes.
 
-With positions and momenta at the points by the two tables of a method, one sweep takes forces, momenta, velocities and
-positions in turn, each from the latest of the others. It contracts like h^2 where H = T(p) + V(q), and like h at worst.
-H need not be regular. The tables are those of :mod:`scvi_codegen.lowering.solvers.coupled`: the rounded map of a
-variational method still has a generating function.
+With positions and momenta at the points by the two tables of a method, one iteration computes forces, momenta,
+velocities and positions in turn, each from the latest of the others (Gauss-Seidel). Its convergence rate is h^2 if H =
+T(p) + V(q), and h at worst. H need not be regular. The tables are those of
+:mod:`scvi_codegen.lowering.solvers.coupled`: the rounded map of a variational method still has a generating function.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["hamiltonian_sweep"]
 
 
 def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
-    """The fixed-point iteration of a Hamiltonian; ``None`` with too many points, or other points than velocities."""
+    """Return the fixed-point iteration of a Hamiltonian; ``None`` with too many or other points than velocities."""
     system = problem.system
     tables = velocity_tables(problem.shape) if system.auxiliaries else None
     if tables is None or tables.velocity or system.damping != 0:

@@ -1,9 +1,9 @@
-"""Tables for steps that choose their own length on a ladder, h = 2^(k/4).
+"""Tables for adaptive step sizes on the grid h = 2^(k/4).
 
-What the points kept of the last step, or of the last two, is continued into the next by least-squares polynomials
-(:mod:`scvi_codegen.lowering.solvers.padding`); on a ladder there are few ratios of lengths, so each has its table. They
-are guesses: doubles serve, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section 2.2), in sums
-that round the same everywhere.
+The stored values of the last step, or of the last two, are extrapolated into the next by least-squares polynomials
+(:mod:`scvi_codegen.lowering.solvers.padding`); the grid has few ratios of step sizes, each with its own table. As
+predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section
+2.2), in sums that round the same on all platforms.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, 
 __all__ = ["control_of", "control_of_sweep", "ladder_of"]
 
 RUNGS, REACH = 4, 2
-"""Rungs an octave, and how many of them a step may be from the one before for its guess to be continued."""
+"""Levels per factor of two, and the largest change of level for which the predictor is available."""
 MANTISSAS = tuple(round(2.0 ** (k / RUNGS + 32)) / 2.0**32 for k in range(RUNGS))
-"""Of 32 bits. In 53 the square of the root of 2 is 2 and an ulp; what that does to a product by rounding depends on the
-leading digits alone, the same in every orbit, and adds up: 2e-17 to 7e-17 of Kepler's energy an orbit at e = 0.9."""
+"""Step sizes in one octave, rounded to 32 bits.
+
+In 53 bits the square of the root of 2 is 2 plus an ulp; the resulting rounding error of a product depends only on the
+leading digits, is the same in every orbit, and accumulates: 2e-17 to 7e-17 of the energy per Kepler orbit at e = 0.9.
+"""
 
 
 def control_of(program: Program) -> Control | None:
-    """How the steps of a program choose their length; ``None`` where its curves tell no error."""
+    """Return the adaptive step-size control of a program; ``None`` if its curves give no error estimate."""
     if not program.error_power or program.integrals:
         return None
     return Control(
@@ -38,12 +41,12 @@ def control_of(program: Program) -> Control | None:
 
 
 def control_of_sweep(sweep: Sweep) -> Control:
-    """How steps by a fixed-point iteration alone choose their length."""
+    """Return the adaptive step-size control of a fixed-point iteration alone."""
     return Control(mantissas=MANTISSAS, ladder=ladder_of(sweep))
 
 
 def ladder_of(sweep: Sweep) -> Ladder:
-    """The ladder of a fixed-point iteration."""
+    """Return the predictor tables of a fixed-point iteration."""
     points, ratios = _doubles(sweep.guess.abscissae), [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
     alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
@@ -63,9 +66,9 @@ def ladder_of(sweep: Sweep) -> Ladder:
 def _tables(
     sweep: Sweep, ratios: Sequence[float], sources: Sequence[float], degree: int, ages: Sequence[float]
 ) -> list[list[NumberTable]]:
-    """For each ratio of the next step to the last a table for each step that the sources are of.
+    """Return, for each ratio of the next step size to the last, a table for each step that the sources belong to.
 
-    ``ages``: the ratio of the last step to each of these, by which h a, where that is kept, is longer.
+    ``ages``: the ratio of the last step size to each of these, by which stored values h a are scaled.
     """
     points = _doubles(sweep.guess.abscissae)
     through = tuple(map(_doubles, sweep.guess_through))
@@ -89,7 +92,7 @@ def _doubles(numbers: Sequence[Number]) -> tuple[float, ...]:
 
 
 def least_squares(sources: Sequence[float], targets: Sequence[float], degree: int) -> list[list[float]]:
-    """From values at the sources to those of the least-squares polynomial at the targets."""
+    """Return the matrix from values at the sources to those of the least-squares polynomial at the targets."""
     count, everywhere = len(sources), [*sources, *targets]
     rows = [[0.0] * count for _ in targets]
     before, here, norm_before = [0.0] * len(everywhere), [1.0] * len(everywhere), math.inf
@@ -108,7 +111,7 @@ def least_squares(sources: Sequence[float], targets: Sequence[float], degree: in
 
 
 def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> NumberTable:
-    """A square table, through another if there is one, with whole vectors as columns; rows beyond repeat the last."""
+    """Return a table, times another one if given, padded to whole vectors; further rows repeat the last."""
     count = len(rows)
     if through:
         columns = list(zip(*rows, strict=True))

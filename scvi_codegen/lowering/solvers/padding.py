@@ -1,7 +1,7 @@
 """Tables of fixed-point solvers, padded to whole vectors.
 
-Lanes beyond the last real point repeat it (its row, its abscissa) and have weight 0: whatever the domain of the
-Lagrangian, they are inside, and they never delay convergence.
+Lanes beyond the last real point repeat it (its row, its abscissa) and have weight 0: they are in the domain of the
+Lagrangian whenever it is, and never delay convergence.
 """
 
 from __future__ import annotations
@@ -15,34 +15,36 @@ __all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_vector
 
 MOST_LANES = 32
 DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
-"""Of the polynomials through the last step, or through the last two, that are continued into the next. Higher ones
-follow the motion longer, but multiply rounding errors, by about 1e6 for these."""
+"""Degrees of the polynomials through the last step, or through the last two, that are extrapolated into the next.
+
+Higher degrees are more accurate, but amplify rounding errors, by about 1e6 for these.
+"""
 INTERPOLATED = 5
-"""Up to this degree the polynomial of two steps goes through all points; above, least squares make better guesses."""
+"""Degree up to which the polynomial of two steps interpolates all points; above, least squares predict better."""
 
 
 def lane_count(points: int) -> int:
-    """The power of two, at least 2, that holds so many points."""
+    """Return the power of two, at least 2, that is not less than the number of points."""
     return max(2, 1 << (points - 1).bit_length())
 
 
 def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
-    """Rows beyond the last repeat it, columns beyond are zero: a lane too many is the last point again."""
+    """Return the padded table: rows beyond the last repeat it, columns beyond are zero."""
     return lower_matrix(_wide(entries, lanes))
 
 
 def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
-    """The rest is zero, or the last entry again."""
+    """Return the padded vector; further entries are zero, or repeat the last."""
     return lower_vector(_longer(entries, lanes, repeat=repeat))
 
 
 def guess_tables(
     abscissae: Vector, lanes: int, *, through: Matrix | None = None, degree: int | None = None
 ) -> GuessTables:
-    """From the values at the points in the last step, or in the last two, to those in the next.
+    """Return the predictor tables from values at the points in the last one or two steps to those in the next.
 
-    ``through``: a matrix to apply to the guess; ``degree``: of the highest coefficient that the method resolves, left
-    out as many as the points determine.
+    ``through``: a matrix to apply to the prediction; ``degree``: of the leading coefficient that the method resolves,
+    by default the highest that the points determine.
     """
     highest = len(abscissae) - 1 if degree is None else degree
     alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))

@@ -1,13 +1,14 @@
-"""Multipliers by themselves, for constant masses: no matrix of positions and velocities. SVI(1) is RATTLE.
+"""RATTLE and its generalisation to s + 1 Lobatto points, for constant masses: only multipliers are solved for.
 
-Where masses are constant and diagonal and forces depend on positions and time, positions at the s + 1 points of
-Lobatto's are explicit in forces and multipliers (Lobatto IIIA and IIIB), and what is left are s equations a constraint,
+If masses are constant and diagonal and forces depend on positions and time, positions at the s + 1 Lobatto points are
+explicit in forces and multipliers (Lobatto IIIA and IIIB), which leaves s equations per constraint,
 
     g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
 
-then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved by Newton's
-iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band where constraints are a chain, factorised once a step. How
-forces and slopes change with positions is left to the iteration: what that neglects is of the order of h^2.
+then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved by a
+simplified Newton iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band matrix if the constraints form a chain,
+factorised once per step. Changes of forces and derivatives with the positions are neglected, an error of order h^2 that
+the iteration removes. SVI(1) is RATTLE.
 
 Source: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983).
 """
@@ -28,7 +29,7 @@ __all__ = ["rattle_of"]
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
-    """What such steps need; ``None`` for others."""
+    """Return the tables of such steps; ``None`` if they are not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if not system.constraints or any(velocities_held(system)) or not forms.separable or tables is None:
         return None

@@ -1,12 +1,12 @@
-"""The fixed-point solver for separable systems: points as lanes, forces in, positions out, nothing to factorise.
+"""Fixed-point solver for separable systems: points are lanes, and no matrix is factorised.
 
 With a constant diagonal mass and forces of position and time the two tables of a method (positions from velocities,
-momenta from forces) multiply into one, q_n = q0 + h c_n v0 + h^2 sum_j product[n][j] F_j / m, for every SVI, for the
-Runge-Kutta methods, and for spectral collocation and the position forms as well.
+momenta from forces) are multiplied into one, q_n = q0 + h c_n v0 + h^2 sum_j product[n][j] F_j / m, for every SVI, for
+the Runge-Kutta methods, and for spectral collocation and the position forms as well.
 
-A variational method is symplectic because its tables belong together; rounded to 53 bits each they no longer do quite,
-and the energy drifts. Here they have 106 bits, the powers of h included. The low parts enter only where they matter: in
-the last evaluation of the points and in the increments.
+A variational method is symplectic because its tables are adjoint; rounded to 53 bits they are not exactly, and the
+energy drifts. So they have 106 bits, including the powers of h. The low words are only used where they matter: in the
+last evaluation of the points and in the increments.
 """
 
 from __future__ import annotations
@@ -32,13 +32,11 @@ __all__ = ["separable_sweep"]
 
 
 def separable_sweep(problem: StepProblem, *, velocities: bool = False) -> SeparableSweep | None:
-    """The fixed-point iteration of a separable system; ``None`` of others, and with too many points.
+    """Return the fixed-point iteration of a separable system; ``None`` for others, and with too many points.
 
-    With ``velocities`` it has the table of those at the points, and guesses forces rather than positions.
-
-    Nothing is integrated along its curve, whose velocities it does not keep.
-
-    Position form and phase-space form are the same there.
+    With ``velocities`` it has the table of those at the points, and predicts forces instead of positions. Systems with
+    integrals are excluded, since it does not store the velocities. Position form and phase-space form are the same for
+    separable systems.
     """
     system, shape = problem.lagrangian, problem.shape
     if system is None or not forms_of(system).separable or system.integrands:

@@ -1,8 +1,8 @@
-"""The fixed-point solver of the shooting-based variational method: node and quadrature points as lanes.
+"""Fixed-point solver of the shooting-based variational method: node and quadrature points are lanes.
 
-The order of the updates inside a sweep (accelerations, then the action along the new curve, then momentum, initial
-velocity and multipliers) makes it contract twice as fast as all at once. The equations, those of
-``methods/shooting.py`` in these unknowns, stand at :class:`scvi_codegen.ir.curve_sweeps.ShootingSweep`.
+The order of the updates in an iteration (accelerations, then the action along the new curve, then momentum, initial
+velocity and multipliers) makes it converge twice as fast as a simultaneous update. The equations, those of
+``methods/shooting.py`` in these unknowns, are in :class:`scvi_codegen.ir.curve_sweeps.ShootingSweep`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, matri
 __all__ = ["shooting_sweep"]
 
 LARGEST_DIMENSION = 8
-"""Beyond, the derivatives of the multiplied residual as lanes take longer to compile than they save."""
+"""Largest number of coordinates; beyond, the kernels take longer to compile than they save."""
 
 
 def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
-    """The fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` where it would be too large."""
+    """Return the fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` if it would be too large."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, ShotCurve):
         return None
@@ -54,7 +54,7 @@ def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
 
 
 def _node_kernel(system: MechanicalSystem) -> Kernel:
-    """E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
+    """Return the kernel of E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
     forms, state = forms_of(system), (*system.coordinates, *system.velocities)
     slopes = gradient(forms.multiplied_residual, state)
     adjoint = sum(forms.multiplied_forces[:2], ()) or (S.Zero,) * len(state)

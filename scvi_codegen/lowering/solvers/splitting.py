@@ -1,4 +1,4 @@
-"""The explicit solver: kicks and drifts in turn, for Stoermer-Verlet and its compositions on separable systems."""
+"""Explicit solver: alternating kicks and drifts, for Stoermer-Verlet and its compositions on separable systems."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["splitting_of"]
 
 
 def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
-    """The sequence of kicks and drifts, or ``None`` where the method is implicit."""
+    """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
     if not method.fractions or system.constraints:
         return None
     twin = lagrangian_twin(system)

@@ -3,7 +3,7 @@
     q_n = q0 + h sum_b position[n][b] V_b,    P_b = p0 + h sum_n momentum[b][n] F_n,
 
 with q1 and p1 by the rows ``end_position`` and ``end_momentum``. The fixed-point solvers of separable and of coupled
-systems are both made from them.
+systems are both derived from them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class VelocityTables:
     """Tables in 60 digits.
 
     Attributes:
-        abscissae: (g,) of the points; blocks: (s,) of the velocities.
+        abscissae: (g,) of the points; blocks: (s,) abscissae of the velocities.
         position: (g, s); momentum: (s, g); end_position: (s,); end_momentum: (g,).
         velocity, projection: (g, s) from the s velocities to those at the points, (s, g) back; empty if they are the
             same.
         variational: whether ``momentum`` is the adjoint of ``position``: beta_b momentum[b][n] = w_n (beta_b -
-            position[n][b]) (summed over the projection, where there is one).
+            position[n][b]) (summed over the projection, if there is one).
     """
 
     abscissae: Vector
@@ -45,7 +45,7 @@ class VelocityTables:
 
 
 def velocity_tables(shape: Shape | None) -> VelocityTables | None:
-    """Those of stage equations of that shape, or ``None`` of others, and where the velocities do not determine them."""
+    """Return the tables of stage equations; ``None`` for other shapes, or if velocities do not determine the curve."""
     if not isinstance(shape, Velocities):
         return None
     if shape.variational:
@@ -54,10 +54,10 @@ def velocity_tables(shape: Shape | None) -> VelocityTables | None:
 
 
 def resolved_degree(tables: VelocityTables) -> int:
-    """The highest degree of the momenta along a step that forces reach: the Legendre coefficients above it are 0.
+    """Return the highest degree of the momenta along a step that forces reach; higher Legendre coefficients are 0.
 
-    The momenta of a Lobatto IIIA-IIIB pair of s stages have degree s - 2. A coefficient that vanishes whatever the
-    forces are tells nothing of the error of the step.
+    The momenta of a Lobatto IIIA-IIIB pair of s stages have degree s - 2. A coefficient that vanishes for all forces is
+    no error estimate.
     """
     for degree in range(len(tables.blocks) - 1, 0, -1):
         (line,) = matrix_product((legendre_functional(tables.blocks, degree),), tables.momentum)
@@ -67,7 +67,7 @@ def resolved_degree(tables: VelocityTables) -> int:
 
 
 def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
-    """Those of a Runge-Kutta method in phase space."""
+    """Return the tables of a Runge-Kutta method in phase space."""
     return VelocityTables(
         abscissae=abscissae,
         blocks=abscissae,
@@ -82,7 +82,7 @@ def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
 
 
 def _variational_tables(shape: Velocities) -> VelocityTables | None:
-    """The adjoint pair; where the velocities are not those at the points, the equations projected on the curve."""
+    """Return the adjoint pair; if the velocities are not those at the points, with the projected equations."""
     beta, weights = shape.end, shape.weights
     if any(x == 0 for x in beta):
         return None
@@ -115,7 +115,7 @@ def _is_identity(entries: Matrix) -> bool:
 
 
 def _inverse_stiffness(velocity: Matrix, weights: Vector) -> Matrix | None:
-    """K^-1, K = l^T w l: it solves beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) for constant mass."""
+    """Return K^-1, K = l^T w l: it solves beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) for constant mass."""
     stiffness = mp.matrix(matrix_product(_columns_scaled(transpose(velocity), weights), velocity))
     try:
         inverse = mp.inverse(stiffness)
