@@ -53,5 +53,5 @@ print(f"tilt {tilt[0]:.2f} at first, {abs(tilt[100]):.0e} after 2 s, {abs(run.q[
 print(f"the largest force is {np.abs(forces).max():.1f}")
 
 given = (np.array([*times, 6.0]), np.array([*forces, 0.0]), "constant")
-again = stepper.drive([0.0, 0.35], velocity=[0.0, 0.0], inputs={"u": given}, h=SAMPLE / STEPS, t_end=6.0)
+again = stepper.integrate([0.0, 0.35], velocity=[0.0, 0.0], inputs={"u": given}, h=SAMPLE / STEPS, t_end=6.0)
 print(f"driven by these forces as data it ends {np.abs(again.q[-1] - run.q).max():.0e} away")

@@ -88,7 +88,7 @@ print(f"Jupiter is 1/{1 / found.parameters['jupiter']:.1f} of the Sun; 1/{1 / JU
 for name, each in {"the Sun alone": alone, "Jupiter and Saturn, too": found}.items():
     print(f"{name}: within {np.linalg.norm(each.residuals, axis=1).max():.6f} au of where Ceres was")
 
-motion = stepper.drive(
+motion = stepper.integrate(
     found.q,
     found.p,
     parameters={"jupiter": found.parameters["jupiter"]},

@@ -45,7 +45,7 @@ def compared(system, points, task, momentum=None):
     stepper = sc.compile_stepper(system, method)
     with warnings.catch_warnings(action="ignore", category=sc.AccuracyWarning):
         # the table shows the errors of coarse grids
-        again = stepper.drive(motion.q[0], motion.p[0], inputs=motion.inputs, h=motion.h, t_end=motion.t[-1])
+        again = stepper.integrate(motion.q[0], motion.p[0], inputs=motion.inputs, h=motion.h, t_end=motion.t[-1])
     x = np.concatenate([motion.q, stepper.velocity(motion.q, motion.p)], axis=1)
     ours = {"t": motion.t, "x": x, "inputs": motion.inputs, "cost": motion.cost, "solved": True}
     ours |= {"iterations": motion.iterations, "unknowns": motion.unknowns}

@@ -38,7 +38,7 @@ for steps in map(int, sys.argv[1:] or (40, 80)):
 print(f"takes {motion.t[-1]:.4f}, by Edelbaum's formula {edelbaum:.4f}")
 
 stepper = sc.compile_stepper(craft, "svi:3")
-run = stepper.drive(motion.q[0], motion.p[0], inputs=motion.inputs, h=motion.h / 8, t_end=motion.t[-1])
+run = stepper.integrate(motion.q[0], motion.p[0], inputs=motion.inputs, h=motion.h / 8, t_end=motion.t[-1])
 x, y = run.q[:, 0] * np.cos(run.q[:, 1]), run.q[:, 0] * np.sin(run.q[:, 1])
 figure, axes = plt.subplots(figsize=(5.5, 5.5), layout="constrained")
 circle = np.exp(1j * np.linspace(0, 2 * np.pi, 200))

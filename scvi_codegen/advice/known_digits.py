@@ -86,7 +86,7 @@ def known_digits(
     try:
         stepper = compile_stepper(system, default_method(system))
         if system.inputs:
-            q, p = stepper.drive(nudged, trajectory.p[0], inputs=inputs or {}, **given).at(times)
+            q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **given).at(times)
         else:
             second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **given)
             q, p = second.q, second.p

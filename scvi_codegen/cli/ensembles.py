@@ -20,7 +20,7 @@ from scvi_codegen.native.options import FAILURES, SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import driven_work
+from scvi_codegen.runtime.ensemble_work import ensemble_work
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
@@ -98,7 +98,7 @@ def _work(
     }
     if model.system.inputs:
         inputs = model.all_inputs()
-        return driven_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
+        return ensemble_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
         return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)

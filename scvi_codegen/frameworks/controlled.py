@@ -49,7 +49,7 @@ class ControlledMotion:
 
     @property
     def inputs(self) -> dict[str, PPoly]:
-        """Inputs as functions of time, in the form that :meth:`Stepper.drive` takes."""
+        """Inputs as functions of time, in the form that :meth:`Stepper.integrate` takes."""
         from scipy.interpolate import BPoly, PPoly  # here: slow to import
 
         return {name: PPoly.from_bernstein_basis(BPoly(own.T, self.t)) for name, own in self.coefficients.items()}

@@ -11,8 +11,8 @@ from scvi_codegen.given.words import meanings, same_here
 __all__ = ["keyword_meant"]
 
 ELSEWHERE: Final = {
-    "inputs": "a system with inputs runs by .drive(..., inputs={'u': (t, values)}), many at once by "
-    ".drive_ensemble, and between samples by run.set_inputs(u=...)",
+    "inputs": "data belong to .integrate(..., inputs={'u': (t, values)}) and .integrate_ensemble, values that change "
+    "during a run to run.set_inputs(u=...)",
     "t_eval": "keep all states, and ask the run for those at times: run.at(times)",
     "events": "they are of .integrate(..., events=...) or of compile_stepper(..., events=...)",
     "save_every": "it is of run.record(n, save_every=...), and of .integrate",

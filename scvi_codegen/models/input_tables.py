@@ -16,7 +16,7 @@ __all__ = ["InputTable", "checked_tables", "tables_of_example"]
 
 
 class InputTable(NamedTuple):
-    """Function of time as :meth:`Stepper.drive` accepts it: n ascending times, n values, kind of interpolation."""
+    """Function of time as :meth:`Stepper.integrate` accepts it: n ascending times, n values, kind of interpolation."""
 
     t: tuple[float, ...]
     values: tuple[float, ...]

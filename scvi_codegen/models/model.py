@@ -64,8 +64,8 @@ class Model:
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         save_every: stride of saved states, in steps.
         t: initial time.
-        inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.drive` accepts it;
-            a run requires all inputs of the system.
+        inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
+            it; a run requires all inputs of the system.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
@@ -277,9 +277,8 @@ class Model:
         common: dict[str, Any] = {"t": self.t, "t_end": self.t + self.covered, "error": self.error}
         common |= {"parameters": self.parameters, "options": options}
         if self.system.inputs:
-            found = stepper.drive(self.q, p, inputs=self.all_inputs(), **common).confirmation
-        else:
-            found = stepper.integrate(self.q, p, **common).confirmation
+            common["inputs"] = self.all_inputs()
+        found: GlobalError | None = stepper.integrate(self.q, p, **common).confirmation
         assert found is not None  # by construction
         return found
 

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.errors import StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters
 from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import driven_work, ensemble_work
+from scvi_codegen.runtime.ensemble_work import ensemble_work
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -65,7 +64,7 @@ def integrate_ensemble(
         q, p: (k, m) initial positions and momenta.
         velocity: (k, m) initial velocities, instead of p.
         h, steps, t_end, tolerance, save_every, t, t_eval, parameters, options: as of ``stepper.integrate_ensemble``.
-        inputs: as of ``stepper.drive_ensemble``; not combined with ``t_eval``.
+        inputs: as of ``stepper.integrate_ensemble``; not combined with ``t_eval``.
         progress: called with the number of completed trajectories.
         address: address of a scheduler, ``"tcp://10.0.0.1:8786"``; by default a cluster of threads in this process.
         blocks: number of blocks of trajectories, by default four for each thread of the cluster.
@@ -86,13 +85,7 @@ def integrate_ensemble(
         "save_every": save_every,
     }
     way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
-    work: Ensemble | EnsembleToEnds
-    if inputs is None:
-        work = ensemble_work(stepper, q, p, t_eval=t_eval, **way, **start)
-    elif t_eval is None:
-        work = driven_work(stepper, q, p, inputs=inputs, **way, **start)
-    else:
-        raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+    work = ensemble_work(stepper, q, p, inputs=inputs, t_eval=t_eval, **way, **start)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())
@@ -135,7 +128,7 @@ def _gather(
     from distributed import as_completed
 
     pickled = pickle.dumps(work.stepper)
-    futures = {client.submit(_integrate, pickled, work.call, work.part(part), pure=False): part for part in parts}
+    futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
     done = 0
     try:
         for future, found in as_completed(futures, with_results=True):
@@ -151,9 +144,9 @@ def _gather(
         client.cancel(list(futures))
 
 
-def _integrate(pickled: bytes, call: str, arguments: dict[str, Any]) -> tuple[Any, ...]:
+def _integrate(pickled: bytes, arguments: dict[str, Any]) -> tuple[Any, ...]:
     """Integrate one slice on a single worker thread and return its arrays."""
-    result = getattr(_stepper(pickled), call)(threads=1, **arguments)
+    result = _stepper(pickled).integrate_ensemble(threads=1, **arguments)
     return tuple(getattr(result, name) for name in ARRAYS)
 
 

@@ -34,7 +34,6 @@ __all__ = [
     "Stretch",
     "advance_to",
     "checked_inputs",
-    "drive",
     "end_of",
     "entered",
     "input_of",
@@ -42,6 +41,7 @@ __all__ = [
     "parameters_at",
     "parameters_of",
     "planned",
+    "record_pieces",
     "stretches",
     "with_end",
 ]
@@ -179,7 +179,7 @@ def part_of_inputs(inputs: Mapping[str, Input], part: slice) -> dict[str, Input]
     }
 
 
-def drive(
+def record_pieces(
     run: Run,
     inputs: Mapping[str, Input],
     t_end: float,

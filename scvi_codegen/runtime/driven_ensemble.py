@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,8 +44,6 @@ class DrivenEnsemble(Ensemble):
         ends: number of steps up to the end of each segment.
         numbers: step numbers of the saved states.
     """
-
-    call: ClassVar[str] = "drive_ensemble"
 
     def __init__(
         self,

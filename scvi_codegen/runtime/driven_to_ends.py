@@ -1,6 +1,6 @@
 """Ensembles with inputs and adaptive step size: each trajectory has its own steps, final time and inputs.
 
-Trajectories are bitwise equal to those of :meth:`Stepper.drive`: steps end at all breakpoints.
+Trajectories are bitwise equal to those of :meth:`Stepper.integrate`: steps end at all breakpoints.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,8 +39,6 @@ __all__ = ["DrivenToEnds"]
 
 class DrivenToEnds(EnsembleToEnds):
     """Ensemble with inputs and adaptive steps; arguments as of :class:`EnsembleToEnds`."""
-
-    call: ClassVar[str] = "drive_ensemble"
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -128,9 +128,6 @@ class Ensemble:
         """Return the (n,) times of the saved states."""
         number = self.save_every * np.arange(len(self.q), dtype=np.float64)
         return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
-
-    call: ClassVar[str] = "integrate_ensemble"
-    """Stepper method that accepts the arguments of :meth:`part`."""
 
     def part(self, part: slice) -> dict[str, object]:
         """Return keyword arguments that construct the ensemble of a slice of the trajectories."""

@@ -7,7 +7,7 @@ for any number of threads. C runs without the GIL.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,9 +108,6 @@ class EnsembleToEnds:
     def length(self) -> int:
         """Final value of ``progress``: the number of trajectories."""
         return len(self)
-
-    call: ClassVar[str] = "integrate_ensemble"
-    """Stepper method that accepts the arguments of :meth:`part`."""
 
     def part(self, part: slice) -> dict[str, object]:
         """Return keyword arguments that construct the ensemble of a slice of the trajectories."""

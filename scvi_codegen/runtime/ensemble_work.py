@@ -25,7 +25,7 @@ from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.inputs import Array, check_left_to_inputs
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["driven_work", "ensemble_work"]
+__all__ = ["ensemble_work"]
 
 
 def ensemble_work(
@@ -33,21 +33,29 @@ def ensemble_work(
     q: ArrayLike,
     p: ArrayLike | None,
     *,
-    velocity: ArrayLike | None,
-    h: float | None,
-    steps: int | None,
-    t_end: ArrayLike | None,
-    tolerance: float | None,
-    t_eval: ArrayLike | None,
+    inputs: Mapping[str, Any] | None = None,
+    velocity: ArrayLike | None = None,
+    h: float | None = None,
+    steps: int | None = None,
+    t_end: ArrayLike | None = None,
+    tolerance: float | None = None,
+    t_eval: ArrayLike | None = None,
     t: float,
     parameters: EnsembleParameters,
     **others: Any,
 ) -> Ensemble | EnsembleToEnds:
-    """Return an ensemble without inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
+    """Return an ensemble; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
         StateError: if a shape, name or number is invalid, or the stepper has a monitor.
     """
+    if inputs is not None:
+        if t_eval is not None:
+            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+        way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
+        return _driven_work(
+            stepper, q, p, inputs=inputs, velocity=velocity, t=t, parameters=parameters, **way, **others
+        )
     _refuse_monitors(stepper)
     p = momenta_of_each(stepper, q, p, velocity, t, parameters)
     common = {"t": t, "parameters": parameters, **others}
@@ -67,7 +75,7 @@ def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple
     return h, steps
 
 
-def driven_work(
+def _driven_work(
     stepper: Integrator,
     q: ArrayLike,
     p: ArrayLike | None,
@@ -82,7 +90,7 @@ def driven_work(
     parameters: EnsembleParameters,
     **others: Any,
 ) -> DrivenEnsemble | DrivenToEnds:
-    """Return an ensemble with inputs; arguments as of :meth:`Stepper.drive_ensemble`.
+    """Return an ensemble with inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
         StateError: as :func:`~scvi_codegen.runtime.driven.checked_inputs`, and if the stepper has a monitor.

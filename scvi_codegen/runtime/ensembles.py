@@ -16,7 +16,7 @@ from scvi_codegen.runtime.deviations import ChaosIndicators
 from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import driven_work, ensemble_work
+from scvi_codegen.runtime.ensemble_work import ensemble_work
 
 __all__ = ["Ensembles"]
 
@@ -24,12 +24,13 @@ __all__ = ["Ensembles"]
 class Ensembles(ConstrainedStates):
     """Integration of many initial states on all cores."""
 
-    @takes(StateError, progress=FUNCTION)
+    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
     def integrate_ensemble(
         self,
         q: ArrayLike,
         p: ArrayLike | None = None,
         *,
+        inputs: Mapping[str, Any] | None = None,
         velocity: ArrayLike | None = None,
         h: float | None = None,
         steps: int | None = None,
@@ -47,6 +48,8 @@ class Ensembles(ConstrainedStates):
 
         Args:
             q, p: (k, m) initial positions and momenta.
+            inputs: of a system with inputs, as of :meth:`integrate`, common to all trajectories, or values of shape
+                (k, n), one row per trajectory. Fixed steps are common, end at all breakpoints and lead to one t_end.
             velocity: (k, m) initial velocities, instead of p.
             h, steps, save_every, t, options, progress: as in :meth:`integrate`.
             t_end: final time, or (k,) final times, for adaptive steps, instead of h and steps. Every
@@ -68,6 +71,7 @@ class Ensembles(ConstrainedStates):
             self,
             q,
             p,
+            inputs=inputs,
             velocity=velocity,
             h=h,
             steps=steps,
@@ -83,58 +87,6 @@ class Ensembles(ConstrainedStates):
         found = work.result()
         warn_of_lost_energies(found)
         return found
-
-    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
-    def drive_ensemble(
-        self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
-        *,
-        inputs: Mapping[str, Any],
-        h: float | None = None,
-        velocity: ArrayLike | None = None,
-        steps: int | None = None,
-        t_end: ArrayLike | None = None,
-        tolerance: float | None = None,
-        save_every: int = 1,
-        t: float = 0.0,
-        parameters: EnsembleParameters = None,
-        options: SolverOptions | None = None,
-        progress: Callable[[int], None] | None = None,
-        threads: int | None = None,
-    ) -> EnsembleTrajectory:
-        """Run k trajectories with inputs, with common fixed steps that end at all breakpoints or with adaptive steps.
-
-        Args:
-            inputs: as of :meth:`drive`, common to all trajectories, or values of shape (k, n) for one input each.
-            h: common step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
-            steps, t_end: with h one of both; without h ``t_end``, one time or (k,) times.
-            q, p, velocity, tolerance, save_every, t, parameters, options, progress, threads: as of
-                :meth:`integrate_ensemble`.
-
-        Returns:
-            An :class:`EnsembleTrajectory`; states equal those of :meth:`drive` to round-off, bitwise without h.
-
-        Raises:
-            StateError: as :meth:`drive`.
-        """
-        work = driven_work(
-            self,
-            q,
-            p,
-            velocity=velocity,
-            inputs=inputs,
-            h=h,
-            steps=steps,
-            t_end=t_end,
-            tolerance=tolerance,
-            save_every=save_every,
-            t=t,
-            parameters=parameters,
-            options=options,
-        )
-        work.run(progress=progress, threads=threads)
-        return work.result()
 
     @takes(StateError, progress=FUNCTION)
     def chaos_indicators_ensemble(

@@ -138,7 +138,7 @@ def fit(
         observed: names of the columns of ``measured``, coordinates and momenta (``"p_x"``, or the names of the
             Hamiltonian); by default the coordinates in order.
         deviations: number or (c,), standard deviations of the noise; by default equal and estimated from the residuals.
-        inputs: as of :meth:`Stepper.drive`.
+        inputs: as of :meth:`Stepper.integrate`.
         bounds: (lower, upper) by names of unknowns; infinite for no bound.
         segments: number of segments for multiple shooting, for records long relative to the Lyapunov time or guesses
             that soon lose phase. The initial state of each segment is unknown and initially guessed from the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -196,12 +196,13 @@ class IndexedStepper:
         binding = self._controlled if goal else self._binding
         return IndexedRun.restored(self.interface, binding, saved, options, goal, self._threads(threads))
 
-    @takes(StateError, parameters=MAPPING, tables=MAPPING, observe=FUNCTION, progress=FUNCTION)
+    @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)
     def integrate(
         self,
         q: ArrayLike | Mapping[str, ArrayLike],
         p: ArrayLike | Mapping[str, ArrayLike] | None = None,
         *,
+        inputs: Mapping[str, Any] | None = None,
         velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
         h: float | None = None,
         steps: int | None = None,
@@ -224,6 +225,7 @@ class IndexedStepper:
         Args:
             q: initial positions: an array of the declared shape, or several by name; their shapes determine the sizes.
             p, velocity: initial momenta or velocities, in the same form; by default 0.
+            inputs: of a system with inputs, by name, as of :meth:`Stepper.integrate`; steps end at their breakpoints.
             h: fixed step size, negative to integrate backward.
             steps, save_every: number of steps, and steps between saved states.
             t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly; with
@@ -247,23 +249,20 @@ class IndexedStepper:
             :class:`IndexedTrajectory` of steps // save_every + 1 states, plus that at t_end or at a terminal event.
 
         Raises:
-            StateError: if a name, shape or number is invalid, an index would leave its array, or an observation is not
-                real or changes its shape.
+            StateError: if a name, shape or number is invalid, an index would leave its array, an observation is not
+                real or changes its shape, or inputs do not cover the run.
             EventError: if an event function is invalid or not finite.
             MethodError: if the method has no adaptive steps.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         save_every = checked_count(save_every, "save_every", least=1)
-        check_inputs_given(self.interface, parameters)
-        if h is not None and t_end is not None:
-            if steps is not None:
-                raise StateError(f"the run ends after steps={steps} or at t_end={t_end:g}: give one of the two")
-            steps_to(t, t_end, h)  # raises if h has the wrong sign
-        elif h is not None and steps is None:
-            raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
-        if h is None and steps is not None:
-            raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
-        count = np.inf if steps is None else checked_count(steps, "steps", least=0)
+        data = None if inputs is None else checked_inputs(self.interface, inputs)
+        if data is None:
+            check_inputs_given(self.interface, parameters)
+            count = _step_count(h, steps, t, t_end)
+        else:
+            check_left_to_inputs(self.interface, parameters)
+            end = end_of(t, h, steps, t_end)
         beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
         beside |= {"options": options, "threads": threads}
         if error is not None:
@@ -272,89 +271,54 @@ class IndexedStepper:
                 partial(self.integrate, events=events),
                 self.integrate,
                 (q, p, velocity),
-                beside,
-                {"t_end": t_end, "save_every": save_every, "progress": progress},
-            )
-        adaptive = t_end if h is None else None
-        run = self.start(q, p, velocity=velocity, h=h, t_end=adaptive, tolerance=tolerance, **beside)
-        check = GrowthCheck(run, check_growth)
-        record = IndexedRecord(run, observe, as_events(events))
-        if h is None or t_end is None:
-            record.follow(count, save_every, progress=progress)
-            return _said(record, check)
-        record.take(keep=True)
-        for part in planned(run.t, t_end, h, {}):
-            run.update(h=part.h)
-            record.go_on(run.steps + part.steps, save_every, progress=progress, to_end=True)
-            if record.search and record.search.ended:
-                break
-        return _said(record, check)
-
-    @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)
-    def drive(
-        self,
-        q: ArrayLike | Mapping[str, ArrayLike],
-        p: ArrayLike | Mapping[str, ArrayLike] | None = None,
-        *,
-        inputs: Mapping[str, Any],
-        velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
-        h: float | None = None,
-        steps: int | None = None,
-        t_end: float | None = None,
-        tolerance: float | None = None,
-        save_every: int = 1,
-        t: float = 0.0,
-        parameters: Mapping[str, ArrayLike] | None = None,
-        tables: Mapping[str, ArrayLike] | None = None,
-        observe: Callable[[IndexedRun], ArrayLike] | None = None,
-        options: SolverOptions | None = None,
-        threads: int | None = None,
-        progress: Callable[[int], None] | None = None,
-        events: EventLike | Sequence[EventLike] | None = None,
-        error: float | None = None,
-        check_growth: bool | None = None,
-    ) -> IndexedTrajectory:
-        """Integrate a system with inputs; steps end at the breakpoints of inputs, which preserves the order.
-
-        Args:
-            inputs: by name, as of :meth:`Stepper.drive`: ``(t, values)``, ``(t, values, "cubic")``, a ``CubicSpline``.
-            h: fixed step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
-            steps, t_end: with h one of both; without h ``t_end``.
-            q, p, velocity, tolerance, save_every, t, parameters, tables: as of :meth:`integrate`.
-            observe, options, threads, progress, events: as of :meth:`integrate`; states at breakpoints are also saved.
-            error, check_growth: as of :meth:`integrate`.
-
-        Raises:
-            StateError: if inputs do not cover the run or define no function of time.
-            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
-        """
-        save_every = checked_count(save_every, "save_every", least=1)
-        data, end = checked_inputs(self.interface, inputs), end_of(t, h, steps, t_end)
-        check_left_to_inputs(self.interface, parameters)
-        controlled = {"t_end": end, "tolerance": tolerance} if h is None else {"h": h}
-        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
-        beside |= {"options": options, "threads": threads}
-        if error is not None:
-            return confirmed_run(
-                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}),
-                partial(self.drive, events=events),
-                self.drive,
-                (q, p, velocity),
                 beside | {"inputs": inputs},
                 {"t_end": t_end, "save_every": save_every, "progress": progress},
             )
-        run = self.start(q, p, velocity=velocity, **controlled, **beside)
-        numbers = np.array(run.problem.arrays.numbers)
-        values = partial(parameters_at, self.interface.parameters, numbers, data)
-        run.update(parameters=values(entered(t, end)))
-        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+        to = t_end if h is None else None
+        run = self.start(q, p, velocity=velocity, h=h, t_end=to, tolerance=tolerance, **beside)
         record = IndexedRecord(run, observe, as_events(events))
+        if data is None:
+            check = GrowthCheck(run, check_growth)
+            if h is None or t_end is None:
+                record.follow(count, save_every, progress=progress)
+                return _said(record, check)
+            segments: Iterable[int | None] = _planned_segments(run, t_end, h)
+        else:
+            values = partial(parameters_at, self.interface.parameters, np.array(run.problem.arrays.numbers), data)
+            run.update(parameters=values(entered(t, end)))
+            check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+            segments = stretches(run, data, end, values)
         record.take(keep=True)
-        for count in stretches(run, data, end, values):
-            record.go_on(np.inf if count is None else run.steps + count, save_every, progress=progress, to_end=True)
+        for steps in segments:
+            until = np.inf if steps is None else run.steps + steps
+            record.go_on(until, save_every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
         return _said(record, check)
+
+
+def _step_count(h: float | None, steps: int | None, t: float, t_end: float | None) -> float:
+    """Return the number of steps of a run without inputs, infinity for one to t_end.
+
+    Raises:
+        StateError: unless the arguments determine the run.
+    """
+    if h is not None and t_end is not None:
+        if steps is not None:
+            raise StateError(f"the run ends after steps={steps} or at t_end={t_end:g}: give one of the two")
+        steps_to(t, t_end, h)  # raises if h has the wrong sign
+    elif h is not None and steps is None:
+        raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+    if h is None and steps is not None:
+        raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
+    return np.inf if steps is None else checked_count(steps, "steps", least=0)
+
+
+def _planned_segments(run: IndexedRun, t_end: float, h: float) -> Iterator[int]:
+    """Set the step size of the run for each segment of equal steps to t_end, and yield its number of steps."""
+    for part in planned(run.t, t_end, h, {}):
+        run.update(h=part.h)
+        yield part.steps
 
 
 def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal | None:

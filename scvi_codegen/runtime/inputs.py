@@ -127,7 +127,7 @@ def check_left_to_inputs(interface: TakesInputs, parameters: Any) -> None:
 def missing_input(name: str) -> StateError:
     """Return the error for an input that is not set."""
     return StateError(
-        f"the input {name} is not given: stepper.drive(..., inputs={{'{name}': (t, values)}}) follows data, "
+        f"the input {name} is not given: stepper.integrate(..., inputs={{'{name}': (t, values)}}) follows data, "
         f"run.set_inputs({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
     )
 

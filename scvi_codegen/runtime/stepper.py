@@ -9,7 +9,8 @@ Neither SymPy nor Jinja is imported.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, TypedDict, Unpack, overload
 
 from numpy.typing import ArrayLike
 
@@ -21,7 +22,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import advance_to, checked_inputs, drive, end_of, entered, parameters_of
+from scvi_codegen.runtime.driven import advance_to, checked_inputs, end_of, entered, parameters_of, record_pieces
 from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensembles import Ensembles
 from scvi_codegen.runtime.error_growth import GrowthCheck
@@ -37,6 +38,25 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = ["Stepper"]
 
 
+class Settings(TypedDict, total=False):
+    """Keyword arguments that :meth:`Stepper.integrate` takes with and without inputs."""
+
+    velocity: ArrayLike | None
+    h: float | None
+    steps: int | None
+    t_end: float | None
+    tolerance: float | None
+    save_every: int
+    t: float
+    parameters: Parameters
+    options: SolverOptions | None
+    progress: Callable[[int], None] | None
+    t_eval: ArrayLike | None
+    events: EventLike | Sequence[EventLike] | None
+    error: float | None
+    check_growth: bool | None
+
+
 class Stepper(Ensembles):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs and ensembles."""
 
@@ -45,12 +65,21 @@ class Stepper(Ensembles):
         texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, self._second)
         return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
 
-    @takes(StateError, progress=FUNCTION)
+    @overload
+    def integrate(
+        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: None = None, **settings: Unpack[Settings]
+    ) -> Trajectory: ...
+    @overload
+    def integrate(
+        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: Mapping[str, Any], **settings: Unpack[Settings]
+    ) -> DrivenTrajectory: ...
+    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
     def integrate(
         self,
         q: ArrayLike,
         p: ArrayLike | None = None,
         *,
+        inputs: Mapping[str, Any] | None = None,
         velocity: ArrayLike | None = None,
         h: float | None = None,
         steps: int | None = None,
@@ -65,11 +94,15 @@ class Stepper(Ensembles):
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
-    ) -> Trajectory:
+    ) -> Trajectory | DrivenTrajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
         Args:
             q, p: (m,) initial positions and momenta.
+            inputs: of a system with inputs, by name: ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with
+                ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or
+                ``PPoly`` of degree 3 at most. Steps end at the breakpoints, which preserves the order; states there are
+                saved. Without them inputs need values among the parameters.
             velocity: (m,) initial velocities, instead of p.
             h: fixed step size, negative to integrate backward; step of tau in transformed time
                 (:func:`~scvi_codegen.reparametrise`).
@@ -83,7 +116,7 @@ class Stepper(Ensembles):
             parameters, options: as in :meth:`step`; in transformed time the energy defaults to that of (q, p).
             progress: called with the number of completed steps.
             t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
-                :meth:`Trajectory.at`.
+                :meth:`Trajectory.at`. Not with inputs.
             events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run. One or
                 several :class:`~scvi_codegen.runtime.events.Event` or functions of (q, v, p, t) as text or SymPy
                 expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
@@ -97,56 +130,47 @@ class Stepper(Ensembles):
                 than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
 
         Returns:
-            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it. An
+            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs a
+            :class:`DrivenTrajectory`, whose states at breakpoints are additional. An
             :class:`~scvi_codegen.AccuracyWarning` reports the worst step if it is too large for the motion.
 
         Raises:
-            StateError: if a shape, name or number is invalid.
+            StateError: if a shape, name or number is invalid, or inputs do not cover the run.
             EventError: if an event function has an unknown symbol or is not finite.
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         stepper = self if events is None else self.with_events(events)
         if t_eval is not None and save_every != 1:
             raise StateError(f"states are kept at t_eval or every so many steps (save_every={save_every}), not both")
-        clocked = bool(self.interface.energy_parameter)
+        data = None if inputs is None else checked_inputs(self.interface, inputs)
+        if data is not None and t_eval is not None:
+            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+        common: dict[str, Any] = {"t": t, "options": options}
         if error is not None:
             return confirmed_run(
                 checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, monitored=self._has_tau),
-                stepper.integrate,
-                stepper.with_events(()).integrate,
+                partial(stepper.integrate, inputs=inputs),
+                partial(stepper.with_events(()).integrate, inputs=inputs),
                 (q, p, velocity),
-                {"t": t, "parameters": parameters, "options": options},
+                common | {"parameters": parameters},
                 {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
-        run = stepper.start(
-            q,
-            p,
-            velocity=velocity,
-            h=h,
-            t=t,
-            t_end=t_end if h is None or self.interface.monitor else None,
-            tolerance=tolerance,
-            parameters=parameters,
-            options=options,
-        )
-        check = GrowthCheck(run, check_growth)
-        if h is not None and t_end is not None and not self.interface.monitor:
-            whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
-            if whole is None or whole % checked_count(save_every, "save_every", least=1):
-                return _said(observed_until(run, t_end, steps, save_every, t_eval, progress))
-            steps = whole
-        _check_number(run, steps)
-        if t_eval is None:
-            found = run.record(steps, save_every=save_every, progress=progress)
-            if run.leaving:
-                warn_of_long_steps(found)
-        elif clocked:
-            raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
-        else:
-            times = times_of_run(t_eval, run.t, _end_of(run, steps))
-            found = _said(Observation(run, times=times).advance(steps, progress))
-        check.warn(found)
-        return found
+        start = partial(stepper.start, q, p, velocity=velocity, h=h, tolerance=tolerance, **common)
+        to_end = h is None or bool(self.interface.monitor)
+        if data is None:
+            run = start(t_end=t_end if to_end else None, parameters=parameters)
+            check = GrowthCheck(run, check_growth)
+            found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
+            check.warn(found)
+            return found
+        end = end_of(t, None if self.interface.monitor else h, steps, t_end)
+        values = parameters_of(self, parameters, data)
+        run = start(t_end=end if to_end else None, parameters=values(entered(t, end)))
+        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+        save_every = checked_count(save_every, "save_every", least=1)
+        driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
+        check.warn(driven)
+        return driven
 
     @property
     def _has_tau(self) -> bool:
@@ -187,72 +211,6 @@ class Stepper(Ensembles):
             raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
         return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
 
-    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
-    def drive(
-        self,
-        q: ArrayLike,
-        p: ArrayLike | None = None,
-        *,
-        inputs: Mapping[str, Any],
-        velocity: ArrayLike | None = None,
-        h: float | None = None,
-        steps: int | None = None,
-        t_end: float | None = None,
-        tolerance: float | None = None,
-        save_every: int = 1,
-        t: float = 0.0,
-        parameters: Parameters = None,
-        options: SolverOptions | None = None,
-        progress: Callable[[int], None] | None = None,
-        events: EventLike | Sequence[EventLike] | None = None,
-        error: float | None = None,
-        check_growth: bool | None = None,
-    ) -> DrivenTrajectory:
-        """Integrate a system with inputs; steps end at the breakpoints of inputs, which preserves the order.
-
-        Args:
-            inputs: by name ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with ``"constant"``
-                (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or ``PPoly`` of
-                degree 3 at most.
-            h: fixed step size; the step before a breakpoint is shorter. If omitted, steps are adaptive.
-            steps, t_end: with h one of both; without h ``t_end``.
-            q, p, velocity, tolerance, save_every, t, parameters, options, progress, events: as of :meth:`integrate`.
-            error, check_growth: as of :meth:`integrate`.
-
-        Raises:
-            StateError: if inputs do not cover the run or define no function of time.
-            StepFailedError: if a step fails; its ``trajectory`` contains the states of that piece before the failure.
-        """
-        stepper = self if events is None else self.with_events(events)
-        data = checked_inputs(self.interface, inputs)
-        if error is not None:
-            return confirmed_run(
-                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, monitored=self._has_tau),
-                stepper.drive,
-                stepper.with_events(()).drive,
-                (q, p, velocity),
-                {"t": t, "parameters": parameters, "options": options, "inputs": inputs},
-                {"t_end": t_end, "save_every": save_every, "progress": progress},
-            )
-        end = end_of(t, None if self.interface.monitor else h, steps, t_end)
-        values = parameters_of(self, parameters, data)
-        run = stepper.start(
-            q,
-            p,
-            velocity=velocity,
-            h=h,
-            t=t,
-            t_end=end if h is None or self.interface.monitor else None,
-            tolerance=tolerance,
-            parameters=values(entered(t, end)),
-            options=options,
-        )
-        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
-        save_every = checked_count(save_every, "save_every", least=1)
-        found = drive(run, data, end, save_every=save_every, values=values, progress=progress)
-        check.warn(found)
-        return found
-
     def from_checkpoint(
         self,
         saved: bytes,
@@ -276,6 +234,36 @@ class Stepper(Ensembles):
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
         return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+
+
+def _recorded(
+    run: Run,
+    h: float | None,
+    steps: int | None,
+    t_end: float | None,
+    *,
+    save_every: int,
+    t_eval: ArrayLike | None,
+    progress: Callable[[int], None] | None,
+) -> Trajectory:
+    """Return the states of a run without inputs; arguments as of :meth:`Stepper.integrate`."""
+    interface = run.stepper.interface
+    clocked = bool(interface.energy_parameter)
+    if h is not None and t_end is not None and not interface.monitor:
+        whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
+        if whole is None or whole % checked_count(save_every, "save_every", least=1):
+            return _said(observed_until(run, t_end, steps, save_every, t_eval, progress))
+        steps = whole
+    _check_number(run, steps)
+    if t_eval is None:
+        found = run.record(steps, save_every=save_every, progress=progress)
+        if run.leaving:
+            warn_of_long_steps(found)
+        return found
+    if clocked:
+        raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
+    times = times_of_run(t_eval, run.t, _end_of(run, steps))
+    return _said(Observation(run, times=times).advance(steps, progress))
 
 
 def _check_number(run: Run, steps: int | None) -> None:

@@ -95,7 +95,8 @@ class Pace:
     def run(self, **how: Any) -> Trajectory:
         """Integrate from the first state of the subject."""
         first = self.subject.states[0]
-        return self.stepper.integrate(first.q, first.p, t=first.t, parameters=self.parameters, **how)
+        found: Trajectory = self.stepper.integrate(first.q, first.p, t=first.t, parameters=self.parameters, **how)
+        return found
 
     def distance(self, motion: ExactMotion, start: State, span: Any, end: Array) -> float:
         """Return the distance of a state from the exact motion, in units of the sizes of q and p."""

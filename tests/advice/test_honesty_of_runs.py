@@ -88,7 +88,7 @@ class TestLongSteps:
             name="held", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2 + u*x", inputs=["u"]
         )
         stepper = sc.compile_stepper(held, "svi:1")
-        stepper.drive([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
+        stepper.integrate([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
         going = stepper.start([0.0], [0.0], h=0.1)
         for k in range(200):
             going.set_inputs(u=math.cos(0.1 * k))

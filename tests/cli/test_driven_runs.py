@@ -56,7 +56,7 @@ def output_of(*words):
 
 def test_a_run_is_that_of_drive_and_its_file_too(model):
     text = output_of("-o", "run.npz", "--plot", "run.png", "--save-every", "2")
-    expected = compile_stepper(model.system, model.method).drive(
+    expected = compile_stepper(model.system, model.method).integrate(
         model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, save_every=2
     )
     with np.load("run.npz") as file:
@@ -77,7 +77,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 0, result.output
     table = ([0.0, 1.0, 2.0, 3.0], [1.0, 0.0, 0.5, -1.0], "cubic")
-    expected = compile_stepper(model.system, "svi:8").drive(model.q, model.p, inputs={"u": table}, t_end=2.3)
+    expected = compile_stepper(model.system, "svi:8").integrate(model.q, model.p, inputs={"u": table}, t_end=2.3)
     found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
     assert_allclose(found[-1, :3], [2.3, expected.q[-1, 0], expected.p[-1, 0]], atol=1e-12)
 
@@ -108,7 +108,7 @@ def test_an_ensemble_of_them(model):
     model = load_model("pushed.toml")
     stepper = compile_stepper(model.system, model.method)
     given = {"inputs": dict(model.inputs), "h": 0.1, "t_end": 2.3}
-    expected = [stepper.drive([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
+    expected = [stepper.integrate([q], velocity=[v], **given) for q, v in ((0.1, 0.0), (0.2, 1.0), (0.3, -1.0))]
     with np.load("many.npz") as file:
         assert (file["t"] == expected[0].t).all()
         assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), atol=2e-15)

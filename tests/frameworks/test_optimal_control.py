@@ -98,7 +98,7 @@ def test_the_motion_is_that_of_the_stepper_and_inputs_keep_their_bounds():
     motion = optimal_control(SWING, SVI(3), degree=2, parameters={"a": 0.4}, **UP)
     stepper = compile_stepper(SWING, SVI(3), flags=QUICK_FLAGS)
     given = {"inputs": motion.inputs, "h": motion.h, "t_end": 5.0, "parameters": {"a": 0.4}}
-    again = stepper.drive(motion.q[0], motion.p[0], **given)
+    again = stepper.integrate(motion.q[0], motion.p[0], **given)
     assert_allclose(again.q, motion.q, atol=1e-6)
     assert abs(motion.inputs["u"](np.linspace(0.0, 5.0, 999))).max() < 1.0 + 1e-7
     assert abs(motion.coefficients["u"]).max() > 0.999  # they bind
@@ -191,7 +191,7 @@ def test_constraints_hold_at_all_times_and_the_optimum_is_that_of_an_angle():
     assert_allclose(held.q, np.c_[np.sin(free.q[:, 0]), -np.cos(free.q[:, 0])], atol=1e-4)
     assert np.abs(np.hypot(*held.q.T) - 1.0).max() < 1e-10
     stepper = compile_stepper(BOB, SVI(3, "gauss-lobatto:4"), flags=QUICK_FLAGS)
-    again = stepper.drive(held.q[0], held.p[0], inputs=held.inputs, h=held.h, t_end=2.0)
+    again = stepper.integrate(held.q[0], held.p[0], inputs=held.inputs, h=held.h, t_end=2.0)
     assert_allclose(again.q, held.q, atol=1e-9)
 
 
@@ -218,7 +218,7 @@ def test_a_blade_goes_where_it_points():
         degree=1,
     )
     stepper = compile_stepper(skate, method, flags=QUICK_FLAGS)
-    again = stepper.drive(parked.q[0], parked.p[0], inputs=parked.inputs, h=parked.h, t_end=3.0)
+    again = stepper.integrate(parked.q[0], parked.p[0], inputs=parked.inputs, h=parked.h, t_end=3.0)
     assert_allclose(again.q, parked.q, atol=1e-8)
     assert_allclose(parked.q[-1], [1.0, 0.3, 0.0], atol=1e-9)
     assert np.abs(again.constraint_values()[1]).max() < 1e-10

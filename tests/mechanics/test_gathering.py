@@ -131,10 +131,12 @@ def test_inputs_keep_their_names():
         ).parameters
     )
     data = {"u": (np.linspace(0, 1, 11), np.sin(np.linspace(0, 1, 11)))}
-    run = sc.compile_indexed(found.system, "svi:3").drive(
+    run = sc.compile_indexed(found.system, "svi:3").integrate(
         np.zeros(4), inputs=data, h=0.1, steps=5, tables=found.tables, parameters=found.parameters
     )
-    other = sc.compile_stepper(system, "svi:3").drive(np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5)
+    other = sc.compile_stepper(system, "svi:3").integrate(
+        np.zeros(4), velocity=np.zeros(4), inputs=data, h=0.1, steps=5
+    )
     assert run.q["q"][-1] == pytest.approx(other.q[-1], abs=1e-14)
 
 

@@ -328,15 +328,17 @@ def test_positions_do_not_follow_constraints_that_jump():
     )
     stepper, times = compile_stepper(system, lobatto(4)), [0.0, 1.0, 2.0]
     given = {"q": [0.6, -0.8], "velocity": [0.0, 0.0], "t_end": 1.5}
-    stepper.drive(**given, inputs={"u": (times, [0.0, 0.0, 0.3])}, check_growth=True)  # begins again with the first u
-    ends = [stepper.drive(**given, inputs={"u": (times, [0.0, 0.0, 0.3])}, h=h).q[-1] for h in (0.05, 0.02, None)]
+    stepper.integrate(
+        **given, inputs={"u": (times, [0.0, 0.0, 0.3])}, check_growth=True
+    )  # begins again with the first u
+    ends = [stepper.integrate(**given, inputs={"u": (times, [0.0, 0.0, 0.3])}, h=h).q[-1] for h in (0.05, 0.02, None)]
     assert_allclose(ends[1:], ends[:1] * 2, atol=1e-9)
     jumping = {"u": (times, [0.0, 0.3, 0.3], "constant")}
     for h in (0.05, None):
         with pytest.raises(StateError, match=r"at t = 1 the constraint y\*\*2 \+ \(-u \+ x\)\*\*2 - 1 jumps to -0\.12"):
-            stepper.drive(**given, inputs=jumping, h=h)
+            stepper.integrate(**given, inputs=jumping, h=h)
     with pytest.raises(StateError, match=r"at t = 1 the constraint .* jumps"):
-        stepper.drive_ensemble([given["q"]], velocity=[given["velocity"]], inputs=jumping, h=0.05, t_end=1.5)
+        stepper.integrate_ensemble([given["q"]], velocity=[given["velocity"]], inputs=jumping, h=0.05, t_end=1.5)
     with pytest.raises(StateError, match="the input u is not given"):
         stepper.start(given["q"], velocity=given["velocity"], h=0.05)
     run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})

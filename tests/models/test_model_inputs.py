@@ -57,7 +57,7 @@ def test_a_model_is_driven_as_by_hand(file, monkeypatch, tmp_path):
     model = load_model(file)
     assert model.inputs == {"u": InputTable(T, U, "cubic"), "w": InputTable((0.0, 3.0), (0.0, 0.3), "linear")}
     stepper = compile_stepper(model.system, model.method)
-    expected = stepper.drive([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
+    expected = stepper.integrate([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
     run = model.start(stepper)
     for steps in model.stretches(run):
         run.advance(steps)

@@ -149,12 +149,12 @@ def test_inputs_are_met_at_their_breakpoints() -> None:
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**4/4 + x*u", inputs=["u"]
     )
     pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
-    exact = sc.compile_stepper(system, sc.SVI(8)).drive([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
+    exact = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
     common: dict[str, Any] = {"system": system, "q": (1.0,), "p": (0.0,), "monitor": "1/(1 + x**2)", "inputs": pushes}
     errors = []
     for tau in (0.4, 0.2):
         model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
-        driven = model.stepper().drive(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
+        driven = model.stepper().integrate(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
         run = model.start(model.stepper())
         for steps in model.stretches(run):
             run.record(steps)

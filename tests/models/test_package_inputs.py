@@ -48,7 +48,7 @@ def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
     model = replace(model, method=method, h=h, t=t)
     states, printed = states_printed(generate_package(model, tmp_path / "pushed"))
     stepper = compile_stepper(model.system, method, flags=PORTABLE_FLAGS)
-    run = stepper.drive(model.q, states[:1, 2], inputs=dict(model.inputs), h=h, t=t, t_end=t + np.copysign(2.3, h))
+    run = stepper.integrate(model.q, states[:1, 2], inputs=dict(model.inputs), h=h, t=t, t_end=t + np.copysign(2.3, h))
     rows = np.isin(run.t, states[:, 0])
     assert rows.sum() == len(states) > 10
     assert (states[:, 1] == run.q[rows, 0]).all()
@@ -64,7 +64,7 @@ def test_steps_that_choose_their_length_go_from_breakpoint_to_breakpoint(model, 
     model = replace(model, h=None, tolerance=None)
     states, _ = states_printed(generate_package(model, tmp_path / "pushed"))
     stepper = compile_stepper(model.system, model.method)
-    run = stepper.drive(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)
+    run = stepper.integrate(model.q, velocity=model.velocity, inputs=dict(model.inputs), t_end=2.3)
     assert_allclose(states[-1, :3], [2.3, run.q[-1, 0], run.p[-1, 0]], atol=3e-13)
 
 
@@ -128,8 +128,8 @@ def test_a_folder_is_driven_from_python_too(model, tmp_path):
     folder = generate_package(model, tmp_path / "pushed")
     assert load_model(folder / "model.toml") == model
     given = {"inputs": dict(model.inputs), "h": 0.03, "t_end": 2.3}
-    run = load_package(folder).drive(model.q, velocity=model.velocity, **given)
-    same = compile_stepper(model.system, model.method).drive(model.q, velocity=model.velocity, **given)
+    run = load_package(folder).integrate(model.q, velocity=model.velocity, **given)
+    same = compile_stepper(model.system, model.method).integrate(model.q, velocity=model.velocity, **given)
     assert_allclose(run.q, same.q, atol=1e-14)
     assert "pushed_next_steps" in (folder / "README.md").read_text()
 
@@ -147,7 +147,7 @@ def test_without_data_the_inputs_are_nought(model, tmp_path):
 def test_on_a_microcontroller(model, precision, tmp_path):
     folder = generate_package(model, tmp_path / "pushed", embedded=precision)
     states, _ = states_printed(folder, STRICT.replace("-Wconversion", ""))
-    run = compile_stepper(model.system, model.method).drive(
+    run = compile_stepper(model.system, model.method).integrate(
         model.q, velocity=model.velocity, inputs=dict(model.inputs), h=0.03, t_end=2.3
     )
     size = 1e-13 if precision == "double" else 3e-6

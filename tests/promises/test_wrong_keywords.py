@@ -1,5 +1,7 @@
 """Keywords that a function does not have: an error that says what was meant, or where it belongs."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from samples import QUICK_FLAGS
@@ -33,17 +35,17 @@ def chain():
     return sc.compile_indexed(system, "svi:2")
 
 
-@pytest.mark.parametrize("name", ["integrate", "start", "integrate_ensemble"])
-def test_inputs_go_to_drive(name, stepper):
-    with pytest.raises(ArgumentError, match=rf"{name}\(\) takes no 'inputs': a system with inputs runs by \.drive\("):
-        getattr(stepper, name)([0.2], [0.0], h=0.1, inputs=DATA)
-    assert stepper.drive([0.2], [0.0], h=0.1, steps=3, inputs=DATA).t[-1] == pytest.approx(0.3)
+def test_inputs_go_to_integrate(stepper, chain):
+    for start in (partial(stepper.start, [0.2], [0.0]), partial(chain.start, np.zeros(3))):
+        with pytest.raises(ArgumentError, match=r"start\(\) takes no 'inputs': data belong to \.integrate\("):
+            start(h=0.1, inputs=DATA)
+    assert stepper.integrate([0.2], [0.0], h=0.1, steps=3, inputs=DATA).t[-1] == pytest.approx(0.3)
 
 
-@pytest.mark.parametrize("name", ["integrate", "start"])
-def test_so_do_those_of_sums(name, chain):
-    with pytest.raises(ArgumentError, match=r"takes no 'inputs': a system with inputs runs by \.drive\("):
-        getattr(chain, name)(np.zeros(3), h=0.1, inputs=DATA)
+def test_states_of_runs_with_inputs_are_kept_at_steps(stepper):
+    for integrate, state in ((stepper.integrate, [0.2]), (stepper.integrate_ensemble, [[0.2]])):
+        with pytest.raises(StateError, match="states of runs with inputs are kept at their steps: leave out t_eval"):
+            integrate(state, state, t_end=0.3, inputs=DATA, t_eval=[0.1])
 
 
 @pytest.mark.parametrize(
@@ -55,7 +57,7 @@ def test_so_do_those_of_sums(name, chain):
         ({"v0": [0.0]}, "'v0'; did you mean 'velocity'?"),
         ({"solver": "newton"}, "'solver': it is chosen where a stepper is compiled"),
         ({"method": "svi:4"}, "'method': the method is said where it is compiled"),
-        ({"colour": "red"}, "'colour': it takes q, p, velocity, h, steps, t_end"),
+        ({"colour": "red"}, "'colour': it takes q, p, inputs, velocity, h, steps, t_end"),
     ],
     ids=str,
 )
@@ -86,7 +88,7 @@ def test_no_word_hides_a_keyword():
     assert keyword_meant("q", ["y0"]) == "; did you mean 'y0'?"
     assert keyword_meant("n", ["mass"]).startswith(": their number goes to run.advance(n)")
     assert not [here for here, elsewhere in WORDS.items() if {*here.split()} & {*elsewhere.split()}]
-    for name in ("drive", "drive_ensemble", "integrate", "momentum"):
+    for name in ("integrate", "integrate_ensemble", "momentum"):
         assert hasattr(Stepper, name)
         assert any(f".{name}" in place for place in ELSEWHERE.values())
 
@@ -98,8 +100,8 @@ def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):
         flags=QUICK_FLAGS,
     )
     with pytest.raises(StateError, match=r"'u' is no input of this system, which has none: .* inputs=\['u'\]"):
-        free.drive([0.2], [0.0], h=0.1, steps=3, inputs=DATA)
+        free.integrate([0.2], [0.0], h=0.1, steps=3, inputs=DATA)
     with pytest.raises(StateError, match=r"'u1' is no input of this system, which has u; did you mean 'u'\?"):
-        stepper.drive([0.2], [0.0], h=0.1, steps=3, inputs={"u1": DATA["u"]})
+        stepper.integrate([0.2], [0.0], h=0.1, steps=3, inputs={"u1": DATA["u"]})
     with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
         chain.start(np.zeros(3), h=0.1).set_inputs(w=1.0)

@@ -454,10 +454,10 @@ def far_away():
         "adaptive": lambda t, end: adaptive.integrate([1.0], [0.0], t=t, t_end=end),
         "monitored": lambda t, end: monitored.integrate([1.0], [0.0], t=t, t_end=end, h=0.02),
         "clocked": lambda t, end: clocked.integrate([1.0], [0.0], t=t, t_end=end, h=np.copysign(0.02, end - t)),
-        "driven": lambda t, end: driven.drive(
+        "driven": lambda t, end: driven.integrate(
             [1.0], [0.0], inputs=inputs(t), t=t, t_end=end, h=np.copysign(0.07, end - t)
         ),
-        "driven, adaptive": lambda t, end: driven.drive([1.0], [0.0], inputs=inputs(t), t=t, t_end=end),
+        "driven, adaptive": lambda t, end: driven.integrate([1.0], [0.0], inputs=inputs(t), t=t, t_end=end),
         "indexed": lambda t, end: indexed.integrate([1.0], [0.0], t=t, t_end=end),
     }
 

@@ -141,7 +141,7 @@ def test_steps_that_end_at_a_time_take_the_density_on_by_their_part():
     start = {"q": [0.4, 0.0], "velocity": [0.0, 2.0], "h": 0.1}
     for breakpoints in (2, 101, 401):
         times = np.linspace(0.0, 40.0, breakpoints)
-        run = stepper.drive(**start, inputs={"u": (times, 0.0 * times)}, t_end=40.0)
+        run = stepper.integrate(**start, inputs={"u": (times, 0.0 * times)}, t_end=40.0)
         assert max(map(off_the_monitor, run.pieces)) < 2e-3
     run = stepper.start(**start, t_end=3.0, parameters={"u_0": 0.0})
     for t_end in (3.0, -3.0) * 20:
@@ -155,12 +155,12 @@ def test_ways_of_driven_runs():
     system = LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
     stepper = compile_stepper(system, SVI(2), monitor="1 + x**2", flags=QUICK_FLAGS)
     given = {"inputs": {"u": ([0.0, 1.0, 2.0], [1.0, 2.0, 2.0], "constant")}, "h": 0.1}
-    there = stepper.drive([0.0], [0.0], **given, t_end=2.0)
+    there = stepper.integrate([0.0], [0.0], **given, t_end=2.0)
     assert there.q[-1, 0] == pytest.approx(2.5, abs=1e-14)
-    back = stepper.drive(there.q[-1], there.p[-1], **given, t=2.0, t_end=0.0)
+    back = stepper.integrate(there.q[-1], there.p[-1], **given, t=2.0, t_end=0.0)
     assert np.abs([back.q[-1], back.p[-1]]).max() < 1e-14
     with pytest.raises(StateError, match="have no number: give t_end"):
-        stepper.drive([0.0], [0.0], **given, steps=10)
+        stepper.integrate([0.0], [0.0], **given, steps=10)
 
 
 def test_invariants_are_kept_for_long():

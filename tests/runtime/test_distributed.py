@@ -81,7 +81,7 @@ class TestCluster:
         knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
         given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
         q = np.linspace(0.1, 1.0, COUNT)[:, np.newaxis]
-        here = stepper.drive_ensemble(q, 0.0 * q, **given)
+        here = stepper.integrate_ensemble(q, 0.0 * q, **given)
         result = integrate_ensemble(stepper, q, 0.0 * q, **given, blocks=3)
         assert here.ok.all()
         for found, expected in ((result.t, here.t), (result.q, here.q), (result.p, here.p), (result.steps, here.steps)):

@@ -68,7 +68,7 @@ def test_the_order_is_kept_across_breakpoints(pendulum, kind, exact, method):
     stepper, expected = compile_stepper(pendulum, method), reference(exact, lambda t, _: 0.1 * t, 2.3)
     inputs, errors = {"u": (KNOTS, VALUES, kind), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     for h in (0.1, 0.02):
-        run = stepper.drive([0.3], velocity=[0.1], inputs=inputs, h=h, t_end=2.3)
+        run = stepper.integrate([0.3], velocity=[0.1], inputs=inputs, h=h, t_end=2.3)
         assert run.t[-1] == pytest.approx(2.3, abs=1e-15)
         assert set(np.round(KNOTS[1:5], 12)) <= set(np.round(run.t, 12))
         assert np.diff(run.t).max() < 1.000001 * h
@@ -79,19 +79,19 @@ def test_the_order_is_kept_across_breakpoints(pendulum, kind, exact, method):
 def test_steps_that_choose_their_length_and_states_between(pendulum):
     stepper, expected = compile_stepper(pendulum, SVI(6)), reference(sloped, lambda t, _: 0.1 * t, 2.3)
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    run = stepper.drive([0.3], velocity=[0.1], inputs=inputs, t_end=2.3)
+    run = stepper.integrate([0.3], velocity=[0.1], inputs=inputs, t_end=2.3)
     assert_allclose([run.q[-1, 0], run.velocity[-1, 0]], expected, atol=3e-13)
     q, p = run.at([0.2, 1.0, 2.3])
     assert_allclose(q[0], reference(sloped, lambda t, _: 0.1 * t, 0.2)[0], atol=3e-13)
     assert_allclose(q[1], reference(sloped, lambda t, _: 0.1 * t, 1.0)[0], atol=3e-13)
     assert_allclose((q[2], p[2]), (run.q[-1], run.p[-1]), atol=1e-15)
-    back = stepper.drive(run.q[-1], run.p[-1], inputs=inputs, t=2.3, t_end=0.0)
+    back = stepper.integrate(run.q[-1], run.p[-1], inputs=inputs, t=2.3, t_end=0.0)
     assert_allclose(back.q[-1], [0.3], atol=1e-12)
 
 
 def test_work_of_inputs_is_in_the_balance(pendulum):
     still = {"w": ([0.0, 3.0], [0.0, 0.0])}
-    run = compile_stepper(pendulum, SVI(5)).drive(
+    run = compile_stepper(pendulum, SVI(5)).integrate(
         [0.3], velocity=[0.1], inputs={"u": (KNOTS, VALUES), **still}, h=0.1, t_end=2.3
     )
     assert np.abs(run.energy() - run.energy()[0] - run.work()).max() < 1e-11
@@ -132,7 +132,7 @@ def test_from_sympy_and_what_scipy_gives():
     stepper = compile_stepper(system, SVI(3))
     of_knots = PPoly.from_spline(make_interp_spline(KNOTS, VALUES))  # with pieces of no length
     for given in (CubicSpline(KNOTS, VALUES), Akima1DInterpolator(KNOTS, VALUES), of_knots):
-        run = stepper.drive([0.0], [0.0], inputs={"u": given}, h=0.13, t_end=2.6)
+        run = stepper.integrate([0.0], [0.0], inputs={"u": given}, h=0.13, t_end=2.6)
         assert_allclose(run.q[-1, 0], given.antiderivative(2)(2.6), atol=1e-14)
 
 
@@ -142,10 +142,10 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     stepper = compile_stepper(pendulum, SVI(3))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
     told = []
-    full = stepper.drive([0.3], [0.1], **given, progress=told.append)
+    full = stepper.integrate([0.3], [0.1], **given, progress=told.append)
     assert told[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
     assert told == sorted(told)
-    fewer = stepper.drive([0.3], [0.1], **given, save_every=3)
+    fewer = stepper.integrate([0.3], [0.1], **given, save_every=3)
     assert {0.0, *KNOTS[1:5][KNOTS[1:5] <= t_end].tolist(), t_end} <= set(np.round(fewer.t, 14))
     assert len(fewer) < len(full) / 1.5
     kept = np.isin(full.t, fewer.t)
@@ -153,10 +153,10 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
     assert (fewer.q == full.q[kept]).all()
     assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
     assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
-    watched = stepper.drive([0.3], [0.1], **given, save_every=3, events="q")
+    watched = stepper.integrate([0.3], [0.1], **given, save_every=3, events="q")
     assert (watched.iterations == fewer.iterations).all()
     assert (np.diff(np.cumsum(full.iterations)[kept]) == fewer.iterations[1:]).all()
-    assert len(stepper.drive([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
+    assert len(stepper.integrate([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
     with pytest.raises(StateError, match=r"t = 3 is outside of the states, which go from 0 to 2\."):
         full.at(3.0)
 
@@ -164,7 +164,7 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
 def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
     stepper = compile_stepper(pendulum, SVI(4))
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
-    run = stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
+    run = stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
     run.save(tmp_path / "run.npz")
     with np.load(tmp_path / "run.npz") as file:
         assert (file["q"] == run.q).all()
@@ -189,7 +189,7 @@ def test_momentum_maps_with_inputs():
         lagrangian="x_dot**2/2 + y_dot**2 - (x - y - u)**2/2",
         inputs=["u"],
     )
-    run = compile_stepper(pair, SVI(3)).drive(
+    run = compile_stepper(pair, SVI(3)).integrate(
         [0.0, 1.0], velocity=[0.5, 0.1], inputs={"u": (KNOTS, VALUES)}, h=0.1, t_end=2.3
     )
     assert np.ptp(run.energy()) > 0.1
@@ -219,7 +219,7 @@ def test_momentum_maps_with_inputs():
 )
 def test_what_is_no_input(pendulum, inputs, said):
     with pytest.raises(StateError, match=said):
-        compile_stepper(pendulum, SVI(2)).drive([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
+        compile_stepper(pendulum, SVI(2)).integrate([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
 
 
 def test_velocities_at_a_breakpoint_are_those_of_the_pieces_that_follow():
@@ -230,9 +230,9 @@ def test_velocities_at_a_breakpoint_are_those_of_the_pieces_that_follow():
     stepper, inputs = compile_stepper(system, SVI(3)), {"u": ([0.0, 1.0, 2.0], [5.0, 7.0, 7.0], "constant")}
     for t_end, u in ((0.0, 5.0), (2.0, 7.0)):
         for h in (t_end - 1.0, None):
-            run = stepper.drive([0.2], velocity=[0.5], inputs=inputs, h=h, t=1.0, t_end=t_end)
+            run = stepper.integrate([0.2], velocity=[0.5], inputs=inputs, h=h, t=1.0, t_end=t_end)
             assert (run.velocity[0, 0], run.p[0, 0]) == (0.5, 0.5 + u)
-        many = stepper.drive_ensemble([[0.2]], velocity=[[0.5]], inputs=inputs, h=t_end - 1.0, t=1.0, t_end=t_end)
+        many = stepper.integrate_ensemble([[0.2]], velocity=[[0.5]], inputs=inputs, h=t_end - 1.0, t=1.0, t_end=t_end)
         assert many.p[0, 0, 0] == 0.5 + u
 
 
@@ -240,9 +240,9 @@ def test_what_inputs_are_made_of_is_no_parameter_beside_them(pendulum):
     stepper = compile_stepper(pendulum, SVI(2))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3, "parameters": {"u_0": 3}}
     with pytest.raises(StateError, match="u_0 is a part of the input u"):
-        stepper.drive([0.3], [0.0], **given)
+        stepper.integrate([0.3], [0.0], **given)
     with pytest.raises(StateError, match="u_0 is a part of the input u"):
-        stepper.drive_ensemble([[0.3]], [[0.0]], **given)
+        stepper.integrate_ensemble([[0.3]], [[0.0]], **given)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_names_of_inputs_are_no_others(parameters, inputs, said):
 def test_names_and_runs_without_an_end(pendulum):
     stepper = compile_stepper(pendulum, SVI(2))
     with pytest.raises(StateError, match="t_end"):
-        stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
+        stepper.integrate([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
     with pytest.raises(StateError, match="no input"):
         stepper.start([0.3], [0.0], h=0.1).set_inputs(v=1.0)
     with pytest.raises(StateError, match="input u must be real numbers, not None"):
@@ -284,18 +284,18 @@ def test_names_and_runs_without_an_end(pendulum):
 def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
     stepper, inputs = compile_stepper(pendulum, SVI(2)), {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}
     with pytest.raises(StateError, match="one of t_end and steps"):
-        stepper.drive([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
+        stepper.integrate([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
     with pytest.raises(StateError, match=r"steps of h = -0.1 do not lead from t = 0 to t_end = 2"):
-        stepper.drive([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)
+        stepper.integrate([0.3], [0.0], inputs=inputs, h=-0.1, t_end=2.0)
     assert (
-        stepper.drive([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, 0 * KNOTS)}, h=1e12, t_end=0.2).t[-1]
+        stepper.integrate([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, 0 * KNOTS)}, h=1e12, t_end=0.2).t[-1]
         == 0.2
     )
     clocked = compile_stepper(reparametrise(problem("kepler").system, "frequency"), SVI(2))
     with pytest.raises(StateError, match="transformed time has no inputs"):
-        clocked.drive([0.5, 0.0], [0.0, 1.7], inputs={}, h=0.1, t_end=2.0)
+        clocked.integrate([0.5, 0.0], [0.0, 1.7], inputs={}, h=0.1, t_end=2.0)
     for h in (0.1, None):
-        still = stepper.drive([0.3], [0.2], inputs=inputs, h=h, t=1.0, t_end=1.0)
+        still = stepper.integrate([0.3], [0.2], inputs=inputs, h=h, t=1.0, t_end=1.0)
         assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
 
 
@@ -331,14 +331,14 @@ def test_events_and_monitors_know_inputs_by_name(pendulum):
     """A crossing of the torque with a number, and of the angle with a line that is data."""
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     stepper = compile_stepper(pendulum, SVI(4))
-    run = stepper.drive([0.3], [0.1], inputs=inputs, t_end=2.3, events=["u - 1/2", "q - w - 1/3"])
+    run = stepper.integrate([0.3], [0.1], inputs=inputs, t_end=2.3, events=["u - 1/2", "q - w - 1/3"])
     torque, line = run.events
     assert torque.t[0] == pytest.approx(0.5 / 1.2 * 0.37, rel=1e-14)
     assert_allclose(np.interp(torque.t, KNOTS, VALUES), 0.5, rtol=1e-13)
     assert_allclose(line.q[:, 0], 0.1 * line.t + 1 / 3, rtol=1e-12)
     assert len(line.t)
     slowed = compile_stepper(pendulum, SVI(4), monitor="1/(2 + q**2 + w)")
-    same = slowed.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3)
+    same = slowed.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3)
     assert_allclose(same.q[-1], run.q[-1], atol=1e-8)
     by_hand = 1 / (2 + same.q[:, 0] ** 2 + 0.1 * same.t)
     lengths = np.concatenate([piece.step_sizes[:-1] for piece in same.pieces])
@@ -350,19 +350,19 @@ def test_events_and_monitors_know_inputs_by_name(pendulum):
 
 def test_inputs_stay_in_other_coordinates_and_other_forms(pendulum):
     inputs, data = ("u", "w"), {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    expected = compile_stepper(pendulum, SVI(4)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    expected = compile_stepper(pendulum, SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     dual, half = hamiltonian_of(pendulum), change_coordinates(pendulum, {"q": "2*z"}, coordinates=["z"])
     assert dual.inputs == lagrangian_of(dual).inputs == half.inputs == inputs
-    found = compile_stepper(dual, SVI(4)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    found = compile_stepper(dual, SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(found.q, expected.q, atol=1e-8)
-    found = compile_stepper(half, SVI(4)).drive([0.15], [0.2], inputs=data, h=0.05, t_end=2.3)
+    found = compile_stepper(half, SVI(4)).integrate([0.15], [0.2], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(2.0 * found.q, expected.q, atol=1e-13)
 
 
 def test_inputs_of_a_hamiltonian(pendulum):
     """In text and from SymPy, in H and in forces: as of the Lagrangian of the same motion."""
     data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
-    expected = compile_stepper(pendulum, SVI(6)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    expected = compile_stepper(pendulum, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     told = HamiltonianSystem.from_text(
         name="pushed pendulum",
         coordinates=["q"],
@@ -383,7 +383,7 @@ def test_inputs_of_a_hamiltonian(pendulum):
         inputs=[u, w],
     )
     assert told == taken
-    found = compile_stepper(told, SVI(6)).drive([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    found = compile_stepper(told, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(found.q, expected.q, atol=1e-13)
 
 
@@ -391,14 +391,14 @@ def test_the_step_of_a_driven_run_is_that_of_its_first_piece(pendulum):
     stepper = compile_stepper(pendulum, "svi:2")
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     for h in (0.1, 0.4):
-        run = stepper.drive([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
+        run = stepper.integrate([0.3], [0.1], inputs=inputs, h=h, t_end=2.3)
         assert run.h == run.t[1] - run.t[0] == min(h, KNOTS[1])
-    assert stepper.drive([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
+    assert stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
 
 
 def test_some_of_the_states(pendulum):
     """Every slice of a run with inputs is the same states, energies and work, across breakpoints and at them."""
-    run = compile_stepper(pendulum, "svi:2").drive(
+    run = compile_stepper(pendulum, "svi:2").integrate(
         [0.3], velocity=[0.1], inputs=dict.fromkeys(pendulum.inputs, (KNOTS, VALUES)), h=0.2, t_end=2.6
     )
     count, work = len(run), run.work()

@@ -31,7 +31,7 @@ def stepper():
 
 def run_from(stepper, x, coefficients=COEFFICIENTS, **options):
     own = {"parameters": {"c": x[2], "l": x[3]}, "h": 0.07, "t_end": 4.0} | options
-    return stepper.drive(x[:1], x[1:2], inputs={"u": PPoly(coefficients, BREAKS)}, **own)
+    return stepper.integrate(x[:1], x[1:2], inputs={"u": PPoly(coefficients, BREAKS)}, **own)
 
 
 def states_of(run):

@@ -1,4 +1,4 @@
-"""Ensembles with inputs: each trajectory is that of ``drive``, with values of its own or common ones."""
+"""Ensembles with inputs: each trajectory is that of ``integrate``, with values of its own or common ones."""
 
 import pickle
 
@@ -50,10 +50,10 @@ def of_one(inputs, j):
 def check_against_drive(stepper, start, inputs, tolerance, **given):
     """Times equal those of single runs, states to round-off."""
     _, c = own_values()
-    runs = stepper.drive_ensemble(*start, inputs=inputs, parameters={"c": c}, **given)
+    runs = stepper.integrate_ensemble(*start, inputs=inputs, parameters={"c": c}, **given)
     assert runs.ok.all()
     for j in range(COUNT):
-        run = stepper.drive(start[0][j], start[1][j], inputs=of_one(inputs, j), parameters={"c": c[j]}, **given)
+        run = stepper.integrate(start[0][j], start[1][j], inputs=of_one(inputs, j), parameters={"c": c[j]}, **given)
         assert (runs.t == run.t).all()
         assert runs.steps[j] == run.steps
         assert_allclose(runs.q[:, j], run.q, rtol=0, atol=tolerance)
@@ -99,16 +99,16 @@ def test_by_steps_of_their_own_each_is_that_of_drive_to_the_bit(pendulum, tolera
     stepper, (values, c) = compile_stepper(pendulum, SVI(4)), own_values()
     inputs = {"u": (KNOTS, values), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubic")}
     ends, (q, p) = np.linspace(0.2, 2.5, COUNT), starts(1)
-    there = stepper.drive_ensemble(q, p, inputs=inputs, t_end=ends, tolerance=tolerance, parameters={"c": c})
+    there = stepper.integrate_ensemble(q, p, inputs=inputs, t_end=ends, tolerance=tolerance, parameters={"c": c})
     assert there.ok.all()
     for j, (t, q_j, p_j, _, steps) in enumerate(there.each()):
         given = {"inputs": of_one(inputs, j), "tolerance": tolerance, "parameters": {"c": c[j]}}
-        run = stepper.drive(q[j], p[j], t_end=ends[j], **given)
+        run = stepper.integrate(q[j], p[j], t_end=ends[j], **given)
         assert steps == run.steps
         for found, expected in ((t, run.t), (q_j, run.q), (p_j, run.p)):
             assert np.array_equal(found, expected)
         assert np.array_equal(there.energy()[: len(t), j], run.energy())
-    back = stepper.drive_ensemble(
+    back = stepper.integrate_ensemble(
         there.ends[1], there.ends[2], inputs=inputs, t=2.5, t_end=0.0, parameters={"c": c}, save_every=5
     )
     assert_allclose(back.ends[1][-1], q[-1], atol=1e-4 if tolerance else 1e-11)
@@ -120,7 +120,9 @@ def test_a_trajectory_that_vanishes_keeps_what_came_before():
         name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
     )
     inputs = {"u": ([0.0, 0.5, 3.0], [0.0, 0.1, 0.1])}
-    runs = compile_stepper(singular, SVI(4)).drive_ensemble([[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5)
+    runs = compile_stepper(singular, SVI(4)).integrate_ensemble(
+        [[1.0], [9.0]], [[0.0], [0.0]], inputs=inputs, t_end=2.5
+    )
     assert runs.status.tolist() == ["vanished", "ok"]
     t = next(runs.each())[0]
     assert (t[0], 0.5 in t) == (0.0, True)
@@ -132,15 +134,15 @@ def test_velocities_are_taken_with_the_inputs_of_the_start(coupled):
     stepper = compile_stepper(coupled, SVI(3))
     q, v = starts(2)
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
-    runs = stepper.drive_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
+    runs = stepper.integrate_ensemble(q, velocity=v, inputs=inputs, h=0.1, t_end=0.2)
     assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
 
 
 def test_splines_of_scipy(pendulum):
     stepper, (u, _) = compile_stepper(pendulum, SVI(3)), own_values()
     w, given = ([0.0, 3.0], [0.0, 0.3]), {"h": 0.05, "steps": 40}
-    by_values = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u, "cubic"), "w": w}, **given)
-    by_spline = stepper.drive_ensemble(*starts(1), inputs={"u": CubicSpline(KNOTS, u, axis=1), "w": w}, **given)
+    by_values = stepper.integrate_ensemble(*starts(1), inputs={"u": (KNOTS, u, "cubic"), "w": w}, **given)
+    by_spline = stepper.integrate_ensemble(*starts(1), inputs={"u": CubicSpline(KNOTS, u, axis=1), "w": w}, **given)
     assert by_values.t[-1] == 2.0
     assert (by_values.q == by_spline.q).all()
 
@@ -155,9 +157,9 @@ def test_a_trajectory_that_fails_leaves_the_others_alone():
         inputs=["u"],
     )
     stepper, u = compile_stepper(system, SVI(3)), np.abs(own_values()[0]) + 0.1
-    fine = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    fine = stepper.integrate_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
     u[2, 4] = -3.0
-    runs = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    runs = stepper.integrate_ensemble(*starts(1), inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
     others = np.arange(COUNT) != 2
     assert runs.ok.tolist() == others.tolist()
     assert (runs.q[:, others] == fine.q[:, others]).all()
@@ -175,9 +177,9 @@ def test_a_lane_whose_sweeps_fail_goes_on_alone_across_breakpoints():
     stepper, u = compile_stepper(system, SVI(2)), np.tile(VALUES**2, (COUNT, 1))
     u[4, 2:] = 4000.0
     q, p = starts(1)
-    runs = stepper.drive_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
+    runs = stepper.integrate_ensemble(q, p, inputs={"u": (KNOTS, u)}, h=0.1, t_end=2.3)
     assert runs.ok.all()
-    run = stepper.drive(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
+    run = stepper.integrate(q[4], p[4], inputs={"u": (KNOTS, u[4])}, h=0.1, t_end=2.3)
     assert_allclose(runs.q[:, 4], run.q, atol=1e-11)
     assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
 
@@ -186,8 +188,8 @@ def test_threads_portions_and_every_change_nothing(pendulum):
     stepper = compile_stepper(pendulum, SVI(3))
     inputs, told = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     given = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
-    full = stepper.drive_ensemble(*starts(1), **given, progress=told.append)
-    fewer = stepper.drive_ensemble(*starts(1), **given, save_every=100, threads=1)
+    full = stepper.integrate_ensemble(*starts(1), **given, progress=told.append)
+    fewer = stepper.integrate_ensemble(*starts(1), **given, save_every=100, threads=1)
     assert told[-1] == full.steps[0]
     rows = np.isin(full.t, fewer.t)
     assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
@@ -198,7 +200,9 @@ def test_threads_portions_and_every_change_nothing(pendulum):
 def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
     stepper = compile_stepper(pendulum, SVI(3))
     w = np.outer(np.arange(COUNT), [0.0, 0.1])
-    runs = stepper.drive_ensemble(*starts(1), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3)
+    runs = stepper.integrate_ensemble(
+        *starts(1), inputs={"u": (KNOTS, VALUES), "w": ([0.0, 3.0], w)}, h=0.05, t_end=2.3
+    )
     table = runs.to_xarray()
     rising = 1 + np.outer(runs.t, np.arange(COUNT)) / 30
     assert_allclose(table["energy"], runs.p[:, :, 0] ** 2 / 2 - rising * np.cos(runs.q[:, :, 0]), atol=1e-14)
@@ -224,7 +228,7 @@ def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
 def test_what_is_refused(pendulum, change, said):
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3} | change
     with pytest.raises(StateError, match=said):
-        compile_stepper(pendulum, SVI(3)).drive_ensemble(*starts(1), **given)
+        compile_stepper(pendulum, SVI(3)).integrate_ensemble(*starts(1), **given)
 
 
 def test_no_steps_at_all_and_pickled_results(pendulum):
@@ -232,10 +236,10 @@ def test_no_steps_at_all_and_pickled_results(pendulum):
         compile_stepper(pendulum, SVI(3)),
         {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1},
     )
-    still = stepper.drive_ensemble(*starts(1), **given, t=0.4, t_end=0.4)
+    still = stepper.integrate_ensemble(*starts(1), **given, t=0.4, t_end=0.4)
     assert still.t.tolist() == [0.4]
     assert still.ok.all()
     assert still.energy().shape == (1, COUNT)
-    runs = stepper.drive_ensemble(*starts(1), **given, t_end=1.0)
+    runs = stepper.integrate_ensemble(*starts(1), **given, t_end=1.0)
     again = pickle.loads(pickle.dumps(runs))
     assert (again.energy() == runs.energy()).all()

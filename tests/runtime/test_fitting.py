@@ -127,7 +127,7 @@ def test_a_known_start_and_inputs_that_are_data():
     )
     stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
-    run = stepper.drive([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
+    run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
     times = np.linspace(0.13, 7.9, 60)
     found = fit(
         stepper,
@@ -338,7 +338,7 @@ def test_segments_with_a_known_start_and_inputs():
     )
     stepper = compile_stepper(system, SVI(4), flags=QUICK_FLAGS)
     push = {"u": (np.linspace(0.0, 8.0, 9), np.random.default_rng(4).normal(size=9))}
-    run = stepper.drive([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
+    run = stepper.integrate([0.5], [0.0], inputs=push, h=0.05, t_end=8.0)
     times = np.linspace(0.13, 7.9, 60)
     known = {"q": [0.5], "p": [0.0], "start": 0.0, "h": 0.05, "inputs": push, "fit_initial_state": False}
     found = fit(stepper, times, run.at(times)[0], parameters={"m": 1.0, "k": 1.0}, segments=4, **known)

@@ -422,7 +422,7 @@ class TestOtherRuns:
             stepper = sc.compile_indexed(system, "svi:6")
         else:
             stepper = sc.compile_stepper(made("i", ["q"], "q_dot**2/2 - q**2/2 + u*q", inputs=["u"]), "svi:6")
-        run = stepper.drive([0.3], [0.1], inputs={"u": table}, t=0.5, t_end=6.0, error=1e-9)
+        run = stepper.integrate([0.3], [0.1], inputs={"u": table}, t=0.5, t_end=6.0, error=1e-9)
         q = (run.q["q"] if indexed else run.q)[:, 0]
 
         def pushed(t):

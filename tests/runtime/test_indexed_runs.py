@@ -205,7 +205,7 @@ class TestInputs:
     @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 4.9}, {"t_end": 4.9}, {"h": 0.1, "steps": 33}])
     def test_runs_are_those_of_the_system_written_out(self, driven, way):
         own, other = (
-            each.drive(Q, velocity=V, inputs=DATA, save_every=4, **way)
+            each.integrate(Q, velocity=V, inputs=DATA, save_every=4, **way)
             for each in (sc.compile_indexed(driven, "svi:6"), written(driven))
         )
         assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
@@ -258,7 +258,7 @@ class TestInputs:
         run.advance(1)
         assert run.steps == 1
         with pytest.raises(StateError, match="is given from t = 0 to 5"):
-            stepper.drive(Q, inputs=DATA, h=0.1, t_end=6.0)
+            stepper.integrate(Q, inputs=DATA, h=0.1, t_end=6.0)
 
     def test_they_are_shown_by_name(self, driven):
         assert "F on q[N-1]" in str(driven)

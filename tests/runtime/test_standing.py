@@ -59,7 +59,7 @@ def test_inputs_that_are_missing():
     assert repr(run).endswith("waits for u>")
     run.set_inputs(u=0.0)
     assert "waits" not in repr(run)
-    driven = stepper.drive([1.0], [0.0], h=0.1, steps=10, inputs={"u": ([0.0, 0.5, 2.0], [0.0, 1.0, 0.0])})
+    driven = stepper.integrate([1.0], [0.0], h=0.1, steps=10, inputs={"u": ([0.0, 0.5, 2.0], [0.0, 1.0, 0.0])})
     assert repr(driven).endswith("11 states from t = 0 to 1, 10 steps, breakpoints between: 1>")
 
 

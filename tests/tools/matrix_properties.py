@@ -142,7 +142,7 @@ class Case:
         if self.kind == "driven":
             span = max(abs(given.get("steps", STEPS) * self.problem.h), 2.0 * abs(self.span))
             data = self.problem.data(self.given.t, self.given.t + math.copysign(span, self.span))
-            return stepper.drive(q, inputs=data, **given)
+            return stepper.integrate(q, inputs=data, **given)
         found = stepper.integrate(q, **given)
         return as_rows(found) if self.kind == "array" else found
 
@@ -327,7 +327,7 @@ def ensemble_of(case: Case, parameters: list[dict[str, Any]], **more: Any) -> An
     call, given = case.stepper.integrate_ensemble, {**case.common(), **moving, "parameters": each, **more}
     if case.kind == "driven":
         data = case.problem.data(case.given.t, case.given.t + 2 * case.span)
-        call, given["inputs"] = case.stepper.drive_ensemble, data
+        call, given["inputs"] = case.stepper.integrate_ensemble, data
     return call(q, **given)
 
 

@@ -292,7 +292,7 @@ def _check_inputs(run: Run) -> None:
     except StateError as error:
         raise StateError(
             f"{error}. A folder records a run whose inputs are held at numbers; one that follows data is kept in "
-            "memory and written to a file: stepper.drive(...).save('run.npz')"
+            "memory and written to a file: stepper.integrate(..., inputs=...).save('run.npz')"
         ) from error
 
 
