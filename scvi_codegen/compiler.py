@@ -95,7 +95,8 @@ def compile_stepper(
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
-    Args:        system: the mechanical system.
+    Args:
+        system: the mechanical system.
         method: the discretisation, or a name as on the command line: ``"svi"``, ``"svi:6"``.
         solver: solver of the stage equations. ``"fixed-point"`` is fast (stages are SIMD lanes) and available for
             methods with at most 32 stages, except variational SCVI with more than 8 coordinates and SVI with fewer

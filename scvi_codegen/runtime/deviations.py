@@ -95,7 +95,7 @@ class ChaosIndicators:
         return volume
 
     def sali(self) -> Array:
-        """Return (n,) the smaller alignment index min(|u + v|, |u - v|) of the first two normalised tangent vectors.
+        """Return (n,) the alignment index ``min(|u + v|, |u - v|)`` of the first two normalised tangent vectors.
 
         Skokos, J. Phys. A 34 (2001) 10029.
         """

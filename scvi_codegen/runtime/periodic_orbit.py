@@ -79,7 +79,7 @@ class PeriodicOrbit:
 
     @property
     def reciprocal_error(self) -> float:
-        """Deviation of the moduli of multipliers from the pairs s, 1/s of symplectic maps: the largest |s s' - 1|."""
+        """Deviation of the multipliers' moduli from the pairs s, 1/s of symplectic maps: the largest ``|s s' - 1|``."""
         sizes = np.abs(self.multipliers)
         return float(np.abs(sizes * sizes[::-1] - 1.0).max())
 

@@ -131,6 +131,73 @@ def test_the_paper_is_run_again_as_its_page_says(tmp_path, monkeypatch):
     assert (tmp_path / "paper.html").is_file()
 
 
+QUERIES = {
+    "adaptive step size": "steps",
+    "variable step": "steps",
+    "step size control": "steps",
+    "checkpoint": "long_runs",
+    "restart": "long_runs events",
+    "resume": "long_runs",
+    "sensitivity": "derivatives",
+    "variational equations": "derivatives",
+    "adjoint": "derivatives",
+    "gradient": "derivatives",
+    "DAE": "mechanisms",
+    "holonomic constraint": "mechanisms",
+    "Lagrange multiplier": "mechanisms",
+    "nonholonomic": "mechanisms",
+    "closed loop": "mechanisms",
+    "rigid body": "mechanisms systems",
+    "quaternion": "limits",
+    "zero-order hold": "inputs",
+    "feedback control": "inputs",
+    "periodic boundary": "array_tables",
+    "minimum image": "array_tables limits",
+    "Lyapunov exponent": "chaos",
+    "Poincare section": "events",
+    "phase portrait": "pictures",
+    "parameter estimation": "fits",
+    "least squares": "fits",
+    "optimal control": "optimal_control",
+    "MPC": "optimal_control",
+    "Noether": "symmetries",
+    "first integral": "symmetries",
+    "energy drift": "conserved",
+    "discrete Euler-Lagrange": "derivation",
+    "symplectic": "conserved",
+    "Sundman": "steps",
+    "time transformation": "steps",
+    "leapfrog": "methods",
+    "Stoermer-Verlet": "methods",
+    "dense output": "events",
+    "ensemble": "ensembles",
+    "SIMD": "ensembles",
+    "threads": "array_solvers",
+    "GPU": "limits",
+    "embedded": "embedded",
+    "FMU": "fmu",
+    "Simulink": "fmu",
+    "benchmark": "performance",
+    "installation": "setup",
+    "quickstart": "quickstart",
+    "tutorial": "tutorials/index tutorials/orbit tutorials/mechanism tutorials/lattice tutorials/fit",
+    "API reference": "reference/index",
+}
+"""What users search for, and the pages of which one must be among the first three results."""
+SETTLED = """() => {
+    const count = document.querySelectorAll('#search-results li').length;
+    const same = count === window.shownBefore;
+    window.shownBefore = count;
+    return same;
+}"""
+"""The list of results, which the search extends one by one, has stopped growing."""
+FIRST_RESULTS = """() => {
+    const pages = [...document.querySelectorAll('#search-results li > a')].map(a => a.href.split(/[?#]/)[0]);
+    const root = document.baseURI.split('search.html')[0];
+    return pages.slice(0, 3).map(page => page.replace(root, '').replace('.html', ''));
+}"""
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built without a warning, and without the network."""
@@ -192,8 +259,15 @@ class TestTheSite:
             timeout=5000,
         )
 
-    def test_the_search_finds(self, site, browser):
+    def test_the_search_finds_the_page_among_the_first_three(self, site, browser):
+        missed = {}
         with looked_at(browser, "desk", "light") as view:
-            view.goto((site / "search.html").as_uri() + "?q=momentum")
-            view.wait_for_selector("#search-results li")
-            assert view.locator("#search-results li").count() > 3
+            for query, wanted in QUERIES.items():
+                view.goto(f"{(site / 'search.html').as_uri()}?q={query.replace(' ', '+')}")
+                view.wait_for_function("document.querySelector('#search-results .search-summary')?.innerText > ''")
+                view.wait_for_selector("#search-results li", timeout=10_000)
+                view.wait_for_function(SETTLED, polling=100)
+                found = view.evaluate(FIRST_RESULTS)
+                if not {*wanted.split()} & {*found}:
+                    missed[query] = found
+        assert missed == {}
