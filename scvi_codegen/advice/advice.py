@@ -101,8 +101,8 @@ class Advice:
             (plain(f"{h:.4g}"), plain(f"{error:.1e}"), plain(f"{iterations:.1f}"), plain(f"{seconds:.2e}"))
             for h, error, iterations, seconds in self.evidence
         ]
-        head = ("h", "error at the end", "iterations a step", "seconds a unit of time")
-        pilots = grid(rows, head=head, caption="What pilot runs found") if rows else Html("")
+        head = ("h", "error at the end", "iterations per step", "seconds per unit of time")
+        pilots = grid(rows, head=head, caption="Pilot runs") if rows else Html("")
         return card(f"Advice: {self.method.title}", facts, pilots)
 
 
@@ -154,10 +154,12 @@ def advise(
     """
     method = as_method(method, system)
     if system.clock is not None:
-        raise MethodError(f"the step of '{system.name}' is one of transformed time, of which there is no advice: try h")
+        raise MethodError(
+            f"'{system.name}' is in transformed time: no step size is recommended; use longest_step or try h"
+        )
     length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0:
-        raise StateError("the span is 0")
+        raise StateError("the span is 0: it must be positive, or negative to integrate backward")
     if target <= 0.0:
         raise StateError(f"the tolerance must be positive, not {tolerance!r}")
     state = {"p": p, "t": t, "parameters": parameters, "options": options}
@@ -217,7 +219,7 @@ def _candidates(method: Method) -> list[Method]:
     specification = dict(method.specification())
     sized = [name for name in ("degree", "stages") if name in ARGUMENTS[str(specification["method"])]]
     if not sized:
-        raise MethodError(f"{method.name} has no degree to choose")
+        raise MethodError(f"{method.name} has no degree or number of stages to choose: pass degree=False")
     if specification.get("quadrature") == f"gauss-legendre:{specification.get('degree')}":
         del specification["quadrature"]  # the default of its degree: each degree has its own
     return [method_from_specification(specification | {sized[0]: number}) for number in DEGREES]
@@ -257,8 +259,8 @@ def _choose(pilot: Pilot, tolerance: float) -> _Choice:
     if ratio > 1.0 and abs(math.log(ratio, fine / coarse) - pilot.order) <= ORDER_MARGIN * pilot.order:
         return _Choice(fine * missed ** (1.0 / pilot.order), goal, doubts, tried=False)
     words = (
-        f"the tolerance cannot be promised: the errors of runs with steps down to {pilot.step(pilot.finest):.3g} "
-        "do not follow the order of the method yet"
+        f"the tolerance may be missed: the errors of runs with steps down to {pilot.step(pilot.finest):.3g} do not "
+        "follow the order of the method yet"
     )
     return _Choice(fine, min(1.0, pilot.error(fine)), (*doubts, words))
 
@@ -268,18 +270,18 @@ def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
     floor = pilot.floor_at_end
     if pilot.rate:
         tenfold = math.log(10.0) / pilot.rate
-        chaos = f"nearby motions part by a factor of 10 every {tenfold:.3g} units of time (chaos)"
+        chaos = f"neighbouring trajectories diverge tenfold every {tenfold:.3g} units of time (chaos)"
         if floor <= tolerance:
-            yield f"{chaos}, and how fast later is not certain"
+            yield f"{chaos}, at an uncertain rate later"
             return
-        yield f"the tolerance cannot be met: {chaos}, so rounding alone spoils it"
+        yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
         digits = math.log10(tolerance / max(pilot.late_error(n), 2.0**-52))
         kept = max(0.0, abs(pilot.length) + digits * tenfold)
-        yield f"the step given keeps to it for about {kept:.3g} units of time"
+        yield f"the recommended step meets it for about {kept:.3g} units of time"
     elif floor > tolerance / SAFETY:
-        yield f"rounding alone leaves an error of about {floor:.1g} at the end, whatever the step"
+        yield f"round-off alone causes an error of about {floor:.1g} at the end, for any step size"
     elif not pilot.whole and pilot.growth > STEEP:
-        yield f"errors grew like t^{pilot.growth:.1f} in the pilot runs, which cannot be relied upon to go on so"
+        yield f"errors grew like t^{pilot.growth:.1f} in the pilot runs, a rate that may not continue"
 
 
 def _bisected(pilot: Pilot, goal: float) -> int | None:
@@ -342,13 +344,13 @@ def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int) -> Ite
         growth = "exponentially" if pilot.rate else f"like t^{pilot.growth:.1f}"
         yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
     if not choice.tried:
-        yield f"So short a step was not tried: the error follows order {pilot.order}."
+        yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
     failing = [n for n, leg in pilot.legs.items() if leg.failure]
     if failing:
         n = max(failing)
-        yield f"A step of {pilot.step(n):.3g} is far too large for the solver: {pilot.legs[n].failure}."
+        yield f"The solver fails at a step size of {pilot.step(n):.3g}: {pilot.legs[n].failure}."
     useless = [n for n in pilot.judged if pilot.error(n) >= 1.0]
     if useless and len(useless) < len(pilot.judged):
-        yield f"With a step of {pilot.step(max(useless)):.3g} no digit is right."
+        yield f"At a step size of {pilot.step(max(useless)):.3g} no digit is correct."
     if pilot.symplectic:
-        yield "The step is to stay fixed, which keeps the method symplectic."
+        yield "The method is symplectic only at this fixed step size."

@@ -176,8 +176,8 @@ def _stepper(
     """Return the stepper, and its system and method if it was compiled here; ``pace`` is g and its controller."""
     if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or pace != (None, None)):
         raise StateError(
-            "a tolerance of the end chooses steps of one length, h gives it, rtol lets each choose its own: give one, "
-            "and of h and rtol with a monitor"
+            "tolerance (fixed step size for an error at the end), h (fixed step size) and rtol (adaptive step size) "
+            "exclude each other: give one of them, and with a time transformation h or rtol"
         )
     if not isinstance(system, Stepper):
         system, monitor = with_monitor(system, *pace)
@@ -185,7 +185,8 @@ def _stepper(
         return compile_stepper(system, chosen, monitor=monitor), (system, chosen)
     if method is not None or pace != (None, None) or wish.tolerance is not None:
         raise StateError(
-            "a compiled stepper has its method and monitor, and its step is h, or its own: leave out tolerance"
+            "method, monitor, controller and tolerance need a system, not a compiled stepper: omit them, give h (fixed "
+            "step size) or rtol (adaptive step size)"
         )
     return system, None
 
@@ -219,13 +220,13 @@ def _unconfirmed(trajectory: Trajectory) -> str:
     found = trajectory.confirmation
     if found is None or found.confirmed:
         return ""
-    return f"The global error {found.requested:g} is confirmed until t = {found.confirmed_until:.6g} only."
+    return f"The bound {found.requested:g} on the global error is confirmed only until t = {found.confirmed_until:.6g}."
 
 
 INSTEAD = {
-    "atol": "the error of a step is relative to the size of its state: give rtol",
-    "max_step": "steps choose their length with rtol, or all have one: give h, the longest that may be",
-    "first_step": "the first step chooses its length like the others: give rtol, or h for steps of one length",
+    "atol": "local errors are relative to the size of the state: give rtol",
+    "max_step": "the step size is adaptive with rtol, or fixed: give h, its upper bound",
+    "first_step": "the first step is adaptive like the others: give rtol, or h for a fixed step size",
 }
 """Alternatives to arguments of ``solve_ivp`` that are not supported."""
 
@@ -268,7 +269,7 @@ def _outcome(trajectory: Trajectory, plan: _Chosen) -> tuple[int, str]:
     if broken := plan.broken(trajectory):
         return BROKEN, broken
     if trajectory.ended_by is not None:
-        return EVENT, f"The terminal event '{trajectory.ended_by.function}' was met."
+        return EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
     return REACHED, "The end of the span was reached."
 
 
@@ -299,7 +300,7 @@ def _span(t_span: Sequence[float]) -> tuple[float, float]:
     try:
         start, end = t_span
     except (TypeError, ValueError) as error:
-        raise StateError(f"t_span is two times, not {t_span!r}") from error
+        raise StateError(f"t_span must be two times, not {t_span!r}") from error
     start, end = checked_number(start, "t_span[0]"), checked_number(end, "t_span[1]")
     if start == end:
         raise StateError(f"t_span begins and ends at {start:g}: there is nothing to integrate")
@@ -312,5 +313,5 @@ def _halves(y0: ArrayLike) -> tuple[ArrayLike, ArrayLike | None]:
     except (TypeError, ValueError) as error:
         raise StateError(f"y0 must be real numbers: {error}") from error
     if y.ndim != 1 or y.size % 2:
-        raise StateError(f"y0 is 2 m numbers, positions and then momenta, not an array of shape {y.shape}")
+        raise StateError(f"y0 must be 2 m numbers, positions and then momenta, not an array of shape {y.shape}")
     return y[: y.size // 2], y[y.size // 2 :]

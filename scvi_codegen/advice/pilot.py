@@ -83,9 +83,9 @@ def launch(
     h, failure = longer.step(longer.finest), longer.legs[longer.finest].failure
     if pilot is None or (failure and CUT * h < pilot.step(pilot.finest)):
         raise StateError(
-            f"no run over {longer.length:.3g} succeeds, with steps down to {h:.3g}: "
-            "the motion may end in a singularity, or is too fast there for steps of one length: let them "
-            "choose their length (t_end, --tolerance), or try a shorter span"
+            f"no pilot run over t = {longer.length:.3g} succeeds, with step sizes down to {h:.3g}: the solution may "
+            "end in a singularity or have a close encounter; use adaptive step size (t_end, --tolerance), or a shorter "
+            "span"
         )
     if not pilot.whole:
         pilot.rate = pilot.rate_of_parting(most // SEARCH)

@@ -22,7 +22,7 @@ ROUNDING = 1e-11
 """Relative energy error that round-off may cause."""
 SECOND_MARGIN, KNOWN_TO = 2.0, 1e-12
 """Safety factor and absolute slack for the error measured with a second run, which has errors, too."""
-INSTEAD = "let steps choose their length (t_end, --tolerance)"
+INSTEAD = "use adaptive step size (t_end, --tolerance)"
 """Remedy that the messages name."""
 
 
@@ -52,8 +52,8 @@ def broken_promise(
     error = float(np.linalg.norm(known.q)) / (_late_size(trajectory) or 1.0)
     if error <= SECOND_MARGIN * tolerance + KNOWN_TO:
         return ""
-    said = doubt or f"the tolerance {tolerance:g} is not kept"
-    return f"{said}: a second run, of other steps, ends {error:.1e} away; {INSTEAD}"
+    said = doubt or f"the tolerance {tolerance:g} is missed"
+    return f"{said}: a second run with other steps differs by {error:.1e} at the end; {INSTEAD}"
 
 
 def _late_size(trajectory: Trajectory | DrivenTrajectory) -> float:
@@ -66,7 +66,7 @@ def _worst_step(trajectory: Trajectory | DrivenTrajectory, tolerance: float) -> 
     if not trajectory.step_error > STEP_MARGIN * tolerance:
         return ""
     return (
-        f"the tolerance {tolerance:g} is not kept: the step from t = {trajectory.worst_step_time:g} alone has a "
+        f"the tolerance {tolerance:g} is missed: the step from t = {trajectory.worst_step_time:g} alone has a "
         f"relative error of about {trajectory.step_error:.1e}"
     )
 
@@ -82,4 +82,4 @@ def _lost_energy(system: MechanicalSystem, trajectory: Trajectory | DrivenTrajec
     change = float(np.abs(energy - energy[0]).max()) / (size or 1.0)
     if math.isfinite(change) and change <= ENERGY_MARGIN * tolerance + ROUNDING:
         return ""
-    return f"the tolerance {tolerance:g} is not kept: the energy, which the motion conserves, is off by {change:.1e}"
+    return f"the tolerance {tolerance:g} is missed: the conserved energy has a relative error of {change:.1e}"

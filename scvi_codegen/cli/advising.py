@@ -36,7 +36,7 @@ def controlled_model(model: AnyModel, tolerance: float) -> AnyModel:
     """
     check_tolerance(tolerance)
     if tolerance < ROUND_OFF:
-        click.echo(f"Warning: doubles do not allow {tolerance:g}: steps are as accurate as they do", err=True)
+        click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
     allowed = tolerance if tolerance >= ROUND_OFF else None
     return replace(model, h=None, tolerance=allowed, error=None, steps=None, span=model.covered)
 
@@ -70,8 +70,8 @@ def confirmed_model(
         "runs": found.runs,
     }
     tell(
-        f"global error: estimated at {found.estimate:.1e} (relative) from {found.runs} runs of different steps; "
-        f"{error:g} is confirmed until t = {found.confirmed_until:g}, with a local tolerance of {local}",
+        f"global error: estimated at {found.estimate:.1e} (relative) from {found.runs} runs; the bound {error:g} "
+        f"is confirmed until t = {found.confirmed_until:g}, with a local tolerance of {local}",
         global_error=numbers,
     )
     return replace(wanted, tolerance=found.local_tolerance, error=None), found
@@ -87,7 +87,7 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
             than ``MOST_STEPS`` steps are needed.
     """
     if model.paced:
-        raise StateError("steps of tau are chosen by the error of a step: give --tolerance in place of --advise")
+        raise StateError("--advise is not available with a time transformation: use --tolerance (local error)")
     advice = advise(
         model.system,
         model.method,
@@ -105,8 +105,8 @@ def advised_model(model: Model, tolerance: float, *, solver: str, options: Solve
         click.echo(f"Warning: {warning}", err=True)
     if advice.steps > MOST_STEPS:
         raise StateError(
-            f"{advice.steps} steps are too many to begin without being told: take a method of higher order, "
-            f"a larger --tolerance or a shorter --span, or say --step {advice.h:.6g}"
+            f"the recommended run has {advice.steps} steps, more than {MOST_STEPS:g}: use a method of higher order, a "
+            f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
         )
     return replace(model, h=advice.h, tolerance=None, error=None, steps=advice.steps, span=None)
 
@@ -120,5 +120,5 @@ def _text(advice: Advice) -> str:
 def _outcome(row: Evidence, span: float) -> str:
     if not math.isfinite(row.error):
         return "fails"
-    error = f"error {row.error:.2g}" if row.error < 1.0 else "no digit right"
-    return f"{error:15} {duration(row.seconds * span)} for the span"
+    error = f"error {row.error:.2g}" if row.error < 1.0 else "no correct digit"
+    return f"{error:15} {duration(row.seconds * span)} for the whole span"

@@ -121,8 +121,8 @@ def _packages(extra: str, name: str) -> Equipment:
     return Equipment(
         name=name,
         status=LACKS if extra else FAILS,
-        found=", ".join(present) or "none of them",
-        remedy=f"for {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'",
+        found=", ".join(present) or "none installed",
+        remedy=f"missing {', '.join(absent)}: pip install '{PACKAGE}{f'[{extra}]' if extra else ''}'",
     )
 
 
@@ -161,14 +161,14 @@ def _trial(folder: Path) -> Equipment:
         try:
             said, errors = process.communicate(timeout=TRIAL_SECONDS)
         except subprocess.TimeoutExpired:
-            return _untried(f"not ready after {TRIAL_SECONDS} s")
+            return _untried(f"no result within {TRIAL_SECONDS} s")
     if process.returncode:
         return _untried(errors.strip() or _ending(process.returncode))
     error = float(said)
     if not error < KEPT:
-        return _untried(f"its energy is off by {error:.0e}: the compiler, or its flags, break the arithmetic")
+        return _untried(f"its relative energy error is {error:.0e}: compiler or flags violate IEEE 754 arithmetic")
     took = f"compiled and run in {time.perf_counter() - began:.1f} s"
-    return Equipment(name="trial", status=OK, found=f"a pendulum, {took}, keeps its energy to {error:.0e}")
+    return Equipment(name="trial", status=OK, found=f"a pendulum, {took}, relative energy error {error:.0e}")
 
 
 def _untried(why: str) -> Equipment:
@@ -177,7 +177,7 @@ def _untried(why: str) -> Equipment:
         name="trial",
         status=FAILS,
         found="a pendulum could not be compiled and run",
-        remedy="\n".join([*last, f"take another compiler (CC=gcc, CC=clang), or look at {FLAGS_VARIABLE}"]),
+        remedy="\n".join([*last, f"use another compiler (CC=gcc, CC=clang), or check {FLAGS_VARIABLE}"]),
     )
 
 
@@ -185,19 +185,19 @@ def _ending(status: int) -> str:
     """Return the reason why a process without output ended; shells report a signal as 128 + its number."""
     number = -status if status < 0 else status - 128
     with suppress(ValueError):
-        return f"what was compiled ended by {signal.Signals(number).name}"
-    return f"it ended with status {status}"
+        return f"the compiled program was ended by {signal.Signals(number).name}"
+    return f"the trial run ended with status {status}"
 
 
 def _vectors(folder: Path) -> Equipment:
     """Check if the compiled library calls glibc's vector functions."""
     if any(VECTOR_CALL in library.read_bytes() for library in folder.glob("_scvi_*/*.so")):
-        return Equipment(name="vectors", status=OK, found="libmvec: sines and exponentials of several points at once")
+        return Equipment(name="vectors", status=OK, found="libmvec: vectorised sines and exponentials")
     return Equipment(
         name="vectors",
         status=LACKS,
-        found="no libmvec: sines and exponentials are computed one by one",
-        remedy="only glibc 2.22 or later on x86-64 has it, and -march=native must be among the flags "
+        found="no libmvec: scalar sines and exponentials",
+        remedy="it requires glibc 2.22 or later on x86-64 and -march=native among the flags "
         "(Debian, Ubuntu: apt install libc6-dev)",
     )
 
@@ -211,9 +211,9 @@ def _cache() -> Equipment:
     except BuildError as error:
         return Equipment(name="cache", status=LACKS, found=str(folder), remedy=str(error))
     if exposed(folder):
-        remedy = f"it is not used, because {remedy_of(folder)}"
+        remedy = f"the cache is not used, because {remedy_of(folder)}"
         return Equipment(name="cache", status=LACKS, found=held, remedy=remedy)
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-        remedy = f"it cannot be written, so nothing is kept: name another folder in {CACHE_VARIABLE}"
+        remedy = f"the folder is not writable, nothing is cached: set {CACHE_VARIABLE} to another one"
         return Equipment(name="cache", status=LACKS, found=held, remedy=remedy)
     return Equipment(name="cache", status=OK, found=held)

@@ -88,7 +88,7 @@ def _numbers(context: click.Context, parameter: click.Parameter, value: str | No
     try:
         return tuple(float(word) for word in re.split(r"[,\s]+", value.strip()))
     except ValueError as error:
-        raise click.BadParameter(f"{error}; write numbers with commas between them, as in 0.5,-1.2e-3") from error
+        raise click.BadParameter(f"{error}; give numbers separated by commas, as in 0.5,-1.2e-3") from error
 
 
 def _numbers_or_name(
@@ -118,7 +118,7 @@ def _assignments(
 def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
     for name, value in (found := _assignments(context, parameter, values)):
         if not value.is_integer():
-            raise click.BadParameter(f"the size {name} is a whole number, not {value:g}")
+            raise click.BadParameter(f"the size {name} must be an integer, not {value:g}")
     return tuple((name, int(value)) for name, value in found)
 
 
@@ -179,7 +179,7 @@ METHOD_OPTIONS = (
     _option(
         "--space",
         metavar="NAME",
-        help="Curves of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
+        help="Trial space of an SVI: polynomials, trigonometric:RADIANS_A_STEP[:HARMONICS] or splines:PIECES.",
     ),
     _option("--form", metavar="NAME", help="phase-space or position (sc and Runge-Kutta methods)."),
     _option(
@@ -208,33 +208,33 @@ STATE_OPTIONS = (
         multiple=True,
         metavar="NAME=FILE[:KIND]",
         callback=_input_files,
-        help="Values of an input: columns t and value of a .csv or .npz file, between them constant, linear (so unless "
-        "said) or cubic; may be repeated.",
+        help="Tabulated input: columns t and value of a .csv or .npz file, interpolated constant, linear (default) or "
+        "cubic; may be repeated.",
     ),
     _option(
         "--size",
         multiple=True,
         metavar="NAME=N",
         callback=_sizes,
-        help="Size of the arrays of a model of sums over indices, as N=1000; may be repeated.",
+        help="Array size of an indexed model, as N=1000; may be repeated.",
     ),
     _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
     _option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
     _option("--time", type=float, metavar="T", help="Initial time."),
-    _option("--step", type=float, metavar="H", help="Step size; negative to go back; with --monitor of tau."),
-    _option("--span", type=float, metavar="T", help="Length of time to cover."),
+    _option("--step", type=float, metavar="H", help="Fixed step size; negative: backward; with --monitor: of tau."),
+    _option("--span", type=float, metavar="T", help="Duration of the run."),
     _option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
-    _option("--save-every", type=int, metavar="N", help="Keep each N-th state."),
+    _option("--save-every", type=int, metavar="N", help="Save every N-th state."),
     _option(
         "--monitor",
         metavar="G",
-        help="Steps of one length in tau, dt = G dtau: frequency, distance, potential, arclength or a formula.",
+        help="Time transformation dt = G dtau: frequency, distance, potential, arclength or a formula.",
     ),
     _option(
         "--controller",
         type=click.Choice(CONTROLLERS),
-        help="With --monitor: symplectic (so unless said), for motions that conserve energy; or reversible, for all.",
+        help="With --monitor: symplectic (default; energy must be conserved), or reversible (any system).",
     ),
 )
 
@@ -244,8 +244,8 @@ SOLVER_OPTION = _option(
     type=click.Choice(["auto", "fixed-point", "newton", "explicit"]),
     default="auto",
     show_default=True,
-    help="Of the stage equations; auto: explicit or fixed point where there is one, Newton where that fails; "
-    "of sums over indices what the model says.",
+    help="Solver of the stage equations; auto: explicit or fixed-point iteration if possible, Newton as fallback; "
+    "for indexed models that of the model.",
 )
 
 
@@ -297,5 +297,5 @@ def read_model(name: str, choices: Choices) -> Model | IndexedModel:
         try:
             problem(name)
         except SystemDefinitionError as error:
-            raise SystemDefinitionError(f"{error} (There is no model file '{name}', either.)") from error
+            raise SystemDefinitionError(f"{error} (There is no model file '{name}' either.)") from error
     return catalogue_model(name, choices.sections())

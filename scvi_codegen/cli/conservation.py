@@ -61,7 +61,7 @@ def energy_report(
     what = "relative energy error" if scale else "energy error"
     if why := system.changes_energy:
         changed = f"energy: {why}, it changed by {np.abs(energy - energy[0]).max():.3g} at most"
-        return changed if balance is None else f"{changed}; all but {balance.error:.1e} of that is work (E - E0 - W)"
+        return changed if balance is None else f"{changed}; energy balance |E - E0 - W| {balance.error:.1e} at most"
     largest = np.abs(error).max()
     drift = f"drift {_drift(trajectory.t, error):+.1e} over the run"
     return f"{what}: {largest:.2e} at most, {drift}{_verdict(largest) if scale else ''}"
@@ -72,7 +72,7 @@ def _verdict(error: float) -> str:
     if error < LARGE_ERROR:
         return ""
     warn(
-        f"what the motion conserves is off by {error:.2g} of its size: take a smaller step, or more stages",
+        f"a conserved quantity has a relative error of {error:.2g}: use a smaller step size or more stages",
         MethodWarning,
     )
     return ": NOT conserved" if error >= LOST else ": hardly conserved"
@@ -99,4 +99,4 @@ def momentum_report(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) 
         note = "" if exact else " (not guaranteed by this method)"
         yield f"relative error of {name}: {error:.2e} at most{note}{_verdict(error)}"
     if len(largest) > MOST_SHOWN:
-        yield f"and {len(largest) - MOST_SHOWN} conserved quantities more, {largest[MOST_SHOWN:].max():.2e} at most"
+        yield f"and {len(largest) - MOST_SHOWN} more conserved quantities, {largest[MOST_SHOWN:].max():.2e} at most"

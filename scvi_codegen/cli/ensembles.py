@@ -114,8 +114,8 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
-        f"{_way(model, result)} kept of each",
-        f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} a step of a trajectory; "
+        f"{_way(model, result)} saved of each",
+        f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
         *(
             []
@@ -129,7 +129,7 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
 
 def _way(model: Model, result: EnsembleTrajectory) -> str:
     if model.h is None:
-        steps = f"{int(result.steps.min())} to {int(result.steps.max())} steps of their own lengths"
+        steps = f"{int(result.steps.min())} to {int(result.steps.max())} adaptive steps"
         return f"{steps} from t = {model.t:g} to t = {model.t + model.covered:g}; up to {len(result.t)} states"
     steps = f"{counted(int(result.steps.max()), 'step')} of {model.h:g}"
     return f"{steps} from t = {model.t:g}; {counted(len(result.t), 'state')}"
@@ -160,7 +160,7 @@ def _energy_report(model: Model, result: EnsembleTrajectory) -> str:
     relative = bool((sizes > 0.0).all()) and not why
     changes = np.abs(energies - energies[0]) / (sizes if relative else 1.0)
     if not np.isfinite(changes).any():
-        return "energy: no state has one"
+        return "energy: not finite in any state"
     state, worst = (int(index) for index in np.unravel_index(np.nanargmax(changes), changes.shape))
     if why:
         return f"energy: {why}, it changed by {changes[state, worst]:.3g} at most"

@@ -139,7 +139,7 @@ class Commands(click.Group):
         except OSError as error:
             raise CommandFailure(str(error), FAILURE) from error
         except MemoryError as error:
-            raise CommandFailure("there is not enough memory for that", FAILURE) from error
+            raise CommandFailure("not enough memory", FAILURE) from error
         except KeyboardInterrupt as error:
             raise CommandFailure("interrupted", INTERRUPTED) from error
 
@@ -169,14 +169,14 @@ def reporting(command: Command) -> Command:
             is_flag=True,
             expose_value=False,
             callback=_begin_report,
-            help="Print one JSON document in place of text.",
+            help="Print one JSON document instead of text.",
         ),
         click.option(
             *("--quiet", "quiet"),
             is_flag=True,
             expose_value=False,
             callback=_be_quiet,
-            help="Print nothing but errors and warnings; the exit status tells.",
+            help="Print only errors and warnings; see the exit status.",
         ),
     )
     for option in options:
@@ -250,7 +250,7 @@ def check_writable(path: Path, hint: str) -> None:
     if not path.parent.is_dir():
         raise click.BadParameter(f"there is no folder '{path.parent}'", param_hint=hint)
     if not os.access(path.parent, os.W_OK):
-        raise click.BadParameter(f"the folder '{path.parent}' cannot be written", param_hint=hint)
+        raise click.BadParameter(f"the folder '{path.parent}' is not writable", param_hint=hint)
 
 
 def emit(text: str, /, output: str | None, **numbers: Any) -> None:

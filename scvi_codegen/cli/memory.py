@@ -34,7 +34,7 @@ def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
     Raises:
         StateError: as :func:`check_memory`.
     """
-    folder = "write them into a folder as they come (-o NAME.run)"
+    folder = "record the run in a folder (-o NAME.run)"
     check_states(len(model.q), steps, model.save_every, trajectories, ways=[folder] if trajectories == 1 else [])
 
 
@@ -50,9 +50,9 @@ def check_states(m: int, steps: int, save_every: int, trajectories: int = 1, *, 
     if kept <= room:
         return
     states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
-    ways = [*([f"keep fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
+    ways = [*([f"save fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
     needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
-    raise StateError(f"{states} need {needed}: {' or '.join(ways or ['run fewer'])}")
+    raise StateError(f"{states} need {needed}: {' or '.join(ways or ['reduce the number of steps'])}")
 
 
 def usable_memory() -> float:

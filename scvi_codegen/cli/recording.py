@@ -62,7 +62,7 @@ def check_resumed(context: click.Context) -> None:
         if given and name not in WITH_RESUME:
             word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
             raise click.UsageError(
-                f"{word} does not go with --resume: the folder says what runs; --steps or --span say how far"
+                f"{word} is not allowed with --resume: the folder defines the run; only --steps or --span may extend it"
             )
 
 
@@ -92,7 +92,7 @@ class RecordedOutcome:
         lines = [standing(self.recorded)]
         if steps:
             since = f" since step {self.first}" if self.first else ""
-            lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} a step, with writing")
+            lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} per step, including writing")
         return "\n".join(
             [*lines, *self._conserved(), *final_state(self.run.stepper.coordinates, self.run.q, self.run.p)]
         )
@@ -105,15 +105,15 @@ class RecordedOutcome:
         stride = -(-len(self.recorded) // LOOKED_AT)
         with np.errstate(all="ignore"):
             lines = list(conserved(parse_model(text), self.recorded[::stride]))
-        return [f"in one of {stride} states kept:", *lines] if stride > 1 else lines
+        return [f"in every {stride}th saved state:", *lines] if stride > 1 else lines
 
     def kept(self) -> str:
         """Return a line on what was written, and the command that continues the run unless a step failed."""
         folder = self.recorded.folder
-        states = f"the {len(self.recorded)} states up to there are in '{folder}'"
+        states = f"the {len(self.recorded)} states computed before are in '{folder}'"
         if self.failure is not None:
             return states
-        return f"{states}; go on with: scvi-codegen run --resume {shlex.quote(str(folder))}"
+        return f"{states}; continue with: scvi-codegen run --resume {shlex.quote(str(folder))}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +135,7 @@ class Recording:
         given = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
         for name, value in given.items():
             if value is not None and not recorded:
-                raise click.UsageError(f"{name} is for a run that is written into a folder (-o NAME{SUFFIX})")
+                raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
 
     def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions | None) -> RecordedOutcome:
         """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
@@ -143,7 +143,9 @@ class Recording:
         with suppress(ModelFileError):
             text = dump_model(model)
         if model.system.clock is not None and model.ends_at_time:
-            raise click.UsageError("in transformed time a folder holds a number of steps: give --step and --steps")
+            raise click.UsageError(
+                "a recorded run in transformed time needs a number of steps: give --step and --steps"
+            )
         run = model.start(model.stepper(solver=solver), options=options)
         if not run.goal:
             tell("\n".join(whole_steps(model.span, model.step, model.step_count, model.t)))
@@ -167,7 +169,9 @@ class Recording:
         if manifest.goal and span is not None:
             further["t_end"] = manifest.t + math.copysign(span, manifest.goal.t_end - manifest.t)
         elif span is not None and manifest.interface.energy_parameter:
-            raise click.UsageError("in transformed time a folder holds a number of steps: give --steps, not --span")
+            raise click.UsageError(
+                "a recorded run in transformed time needs a number of steps: give --steps, not --span"
+            )
         elif span is not None:
             steps = max(1, round(span / abs(manifest.h)))
             tell("\n".join(whole_steps(span, manifest.h, steps, manifest.t)))
@@ -206,7 +210,7 @@ def standing(recorded: RecordedRun) -> str:
     manifest = recorded.manifest
     done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
     if manifest.goal:
-        how = f"of {manifest.goal.tau:g} in tau" if manifest.goal.tau else "of their own lengths"
+        how = f"of {manifest.goal.tau:g} in tau" if manifest.goal.tau else "of adaptive size"
         way = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
         way += "" if recorded.finished else f" (of {manifest.goal.t_end:g})"
     else:
@@ -214,5 +218,5 @@ def standing(recorded: RecordedRun) -> str:
         if manifest.interface.energy_parameter:
             done, t = f"{done} in tau", float(recorded.t[-1])
         way = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
-    kept = f"{counted(len(recorded), 'state')} kept in '{recorded.folder}'"
+    kept = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"
     return f"{' '.join(manifest.interface.title.split())}\n{way}; {kept}"

@@ -209,7 +209,7 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
         model.system.name,
         f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
         f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {outcome.end[0]:g}; "
-        f"{counted(len(trajectory), 'state')} kept",
+        f"{counted(len(trajectory), 'state')} saved",
         *([] if _by_time(model) else whole_steps(model.span, model.step, model.step_count, model.t)),
     ]
     if run.steps:
@@ -224,7 +224,7 @@ def _geometry(model: Model, run: Run) -> str:
     """Return whether the map is symplectic; adaptive steps destroy this property."""
     if not is_symplectic(model.method, model.system):
         return "not symplectic"
-    return "symplectic" if run.goal is None else "symplectic where steps have one length"
+    return "symplectic" if run.goal is None else "symplectic only at fixed step size"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
@@ -241,7 +241,7 @@ def of_length(h: float | None, run: Run) -> str:
         return f"of {run.h:g} in tau"
     if run.goal and run.goal.tau:
         return f"of {run.goal.tau:g} in tau by the reversible controller"
-    return f"of their own lengths ({run.rejected_steps} rejected)" if run.goal or h is None else f"of {h:g}"
+    return f"of adaptive size ({run.rejected_steps} rejected)" if run.goal or h is None else f"of {h:g}"
 
 
 def _speed(outcome: RunOutcome, save_every: int) -> str:
@@ -271,14 +271,14 @@ def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) ->
     """
     error, begun = trajectory.step_error, f"from t = {trajectory.worst_step_time:g}"
     if math.isnan(error):
-        yield "worst step: its error is not known, nothing tells it here"
+        yield "largest local error: unknown, this method has no error estimate here"
     else:
         too_long = error > TOLERABLE_ERROR
-        yield f"worst step: relative error estimated at {error:.1e}, {begun}{': too long' * too_long}"
+        yield f"largest local error: {error:.1e} (relative, estimated), step {begun}{': too large' * too_long}"
         if too_long:
             warn(
-                f"the step {begun} is too long: the relative error of its end is about {error:.1e}; take a shorter "
-                "--step, or --tolerance",
+                f"the step {begun} is too large: its estimated relative error is {error:.1e}; use a smaller --step or "
+                "--tolerance",
                 AccuracyWarning,
             )
 
@@ -292,14 +292,18 @@ def final_state(names: Sequence[str], positions: Array, momenta: Array, known: K
         known_q, known_p = (known.q[i], known.p[i]) if known else (0.0, 0.0)
         yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:
-        yield f"  and {len(names) - SHOWN_COORDINATES} coordinates more"
+        yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
 
 
 def _how_known(known: Known | None) -> str:
     if known is None:
-        return "no second run tells how many of these digits are right"
-    said = "in the digits that a second run confirms"
-    return f"{said}; chaotic: nearby motions part tenfold every {known.tenfold:.2g}" if known.chaotic else said
+        return "accuracy unknown: no second run to compare with"
+    said = "in the digits confirmed by a second run"
+    return (
+        f"{said}; chaotic: neighbouring trajectories diverge tenfold every {known.tenfold:.2g}"
+        if known.chaotic
+        else said
+    )
 
 
 def _joined(pieces: list[Trajectory]) -> Trajectory:

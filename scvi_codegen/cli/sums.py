@@ -55,8 +55,8 @@ def refuse(what: dict[str, object]) -> None:
     """
     for name, value in what.items():
         if value not in (None, False):
-            instead = INSTEAD.get(name, "leave it out, or write the system out (unroll_sums)")
-            raise click.UsageError(f"--{name.replace('_', '-')} is not for sums over indices: {instead}")
+            instead = INSTEAD.get(name, "omit it, or unroll the sums (unroll_sums)")
+            raise click.UsageError(f"--{name.replace('_', '-')} is not available for indexed models: {instead}")
 
 
 def solved_by(solver: str, model: IndexedModel) -> IndexedModel:
@@ -132,8 +132,8 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
     geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
     yield f"{method.title}; {order}, {geometry}"
     kept = counted(len(trajectory.t), "state")
-    lengths = "of their own lengths" if run.goal else f"of {run.h:g}"
-    yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} kept"
+    lengths = "of adaptive size" if run.goal else f"of {run.h:g}"
+    yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} saved"
     if model.h is not None:
         yield from whole_steps(model.span, model.step, model.step_count, model.t)
     if run.steps:

@@ -48,7 +48,7 @@ class Ends:
         forms, system = forms_of(self.system), self.system
         bound = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
         if any(each.free_symbols - {*self.symbols} for each in bound):
-            raise MethodError("momenta depend on an input, and would jump where it does: let inputs be forces")
+            raise MethodError("momenta depend on an input and would jump with it: use inputs only in forces")
         return self._function(bound)
 
     @cached_property
@@ -60,7 +60,7 @@ class Ends:
         """
         found = [each for each in (*positions_held(self.system), *constraint_rates(self.system)) if each != 0]
         if any(each.free_symbols - {*self.symbols} for each in found):
-            raise MethodError("a constraint has an input in it, and would jump where it does: let inputs be forces")
+            raise MethodError("a constraint depends on an input and would jump with it: use inputs only in forces")
         return self._function(found)
 
     def momentum(self, q: Any, v: Any, t: Any, parameters: Any) -> Any:

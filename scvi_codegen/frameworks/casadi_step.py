@@ -68,9 +68,9 @@ def casadi_step(
     """
     ca = imported("casadi", "casadi")
     if system.clock:
-        raise MethodError(f"'{system.name}' moves in transformed time: give the system as it was before")
+        raise MethodError(f"'{system.name}' is in transformed time: pass the original system")
     if checked_count(degree, "degree", least=0) > HIGHEST:
-        raise MethodError(f"inputs are polynomials of degree {HIGHEST} at most, not {degree}")
+        raise MethodError(f"degree must be at most {HIGHEST} (polynomial inputs), not {degree}")
     stages = discretise(system, as_method(method, system))
     written = _Written(ca, system, stages, degree)
     *rows, p1 = written.rows()
@@ -158,8 +158,8 @@ class _Written:
         known = {*system.coordinates, *system.velocities}
         if not families or any(family.scalar_power or not known <= {*family.arguments} for family in families):
             raise MethodError(
-                "this method has no quadrature of functions along its curve: take an SVI, an SCVI or a Gauss method, "
-                "whose discrete Lagrangian is one"
+                "this method has no quadrature along its curve, so formulas cannot be integrated: use an SVI, SCVI or "
+                "Gauss method"
             )
         held = tuple(symbol(name) for name in system.inputs)
         around = (system.time, *own_parameters(system), *held)

@@ -90,8 +90,8 @@ class Task:
         """Raise MethodError unless the quadrature has more points than the degree of the inputs."""
         if self.degree >= points:
             raise MethodError(
-                f"inputs of degree {self.degree} have {self.degree + 1} coefficients a step, which the {points} points "
-                f"of the quadrature of {self.method.name} cannot tell: take degree {points - 1} at most, or more points"
+                f"inputs of degree {self.degree} have {self.degree + 1} coefficients per step, but the quadrature of "
+                f"{self.method.name} has {points} points: use degree {points - 1} or less, or more points"
             )
 
     def _input_limits(self) -> tuple[Array, Array]:
@@ -172,11 +172,11 @@ def interval(name: str, value: Any) -> tuple[float, float]:
         number = checked_number(value, name)
         return number, number
     if len(value) != 2:
-        raise StateError(f"{name} is a number or two, the least and the largest, not {value!r}")
+        raise StateError(f"{name} must be a number, or two numbers (least, largest), not {value!r}")
     ends = zip(value, (-np.inf, np.inf), strict=True)
     least, largest = (none if end is None else checked_number(end, name) for end, none in ends)
     if least > largest:
-        raise StateError(f"{name} has no number between {least:g} and {largest:g}")
+        raise StateError(f"{name}: the lower bound {least:g} exceeds the upper bound {largest:g}")
     return least, largest
 
 
@@ -191,5 +191,5 @@ def _resampled(name: str, values: Any, at: Array) -> Array:
     """Return values at equidistant points of [0, 1], or one number, interpolated linearly at ``at``."""
     own = np.atleast_1d(real_array(values, f"the guess of {name}"))
     if own.ndim != 1 or not np.isfinite(own).all():
-        raise StateError(f"the guess of {name} is a finite number, or a list of them from start to end")
+        raise StateError(f"the guess of {name} must be a finite number, or a list of them from start to end")
     return np.interp(at, np.linspace(0.0, 1.0, len(own)), own) if len(own) > 1 else np.full(len(at), own[0])

@@ -43,7 +43,7 @@ class Flow:
         save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
         if save_every and steps % save_every:
             raise StateError(
-                f"{steps} steps are no multiple of save_every={save_every}, so that the end would not be kept"
+                f"steps = {steps} must be a multiple of save_every = {save_every}, so that the final state is saved"
             )
         return cls(stepper, steps, save_every)
 

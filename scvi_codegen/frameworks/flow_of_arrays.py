@@ -85,5 +85,5 @@ class ArrayFlow(Flow):
         try:
             batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))
         except ValueError as error:
-            raise StateError(f"the leading axes of q, p, parameters, t and h do not fit: {error}") from error
+            raise StateError(f"the leading axes of q, p, parameters, t and h cannot be broadcast: {error}") from error
         return self._arrays.joined([self._arrays.expanded(part, (*batch, part.shape[-1])) for part in parts])

@@ -102,8 +102,8 @@ def _states_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) 
 def _push_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
     if type(changes[0]) is not ad.Zero:
         raise MethodError(
-            "a flow has no second derivatives forward of forward, as jacfwd of jacfwd and jacrev of jacfwd ask for, "
-            "and no third derivatives: take jax.hessian, or jacfwd or jacrev of jacrev"
+            "a flow has no forward-over-forward second derivatives (jacfwd of jacfwd, jacrev of jacfwd) and no third "
+            "derivatives: use jax.hessian, or jacfwd or jacrev of jacrev"
         )
     return PUSH.bind(*given, **static), PUSH.bind(given[0], changes[1], **static)
 
@@ -141,7 +141,7 @@ def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
 def _bend_transposed(slopes: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
     """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
     if ad.is_undefined_primal(own):
-        raise MethodError("a flow has no second derivatives forward of forward: take jacfwd or jacrev of jacrev")
+        raise MethodError("a flow has no forward-over-forward second derivatives: use jacfwd or jacrev of jacrev")
     if type(slopes) is ad.Zero:
         return None, None, ad.Zero(moved.aval)
     return None, None, BEND.bind(x, own, slopes, **static)

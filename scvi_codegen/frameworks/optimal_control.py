@@ -111,8 +111,8 @@ def optimal_control(
     motion = task.motion(program, *program.solved(task.first(guess or {}), options or {}))
     if not motion.solved:
         raise ControlError(
-            f"no optimal control was found: IPOPT says {motion.status} after {motion.iterations} iterations; try a "
-            "better guess, a longer duration or wider bounds",
+            f"no optimal control was found: IPOPT ended with {motion.status} after {motion.iterations} iterations; try "
+            "a better guess, a longer duration or wider bounds",
             motion,
         )
     return motion
@@ -120,14 +120,14 @@ def optimal_control(
 
 def _check_controllable(system: MechanicalSystem) -> None:
     if not system.inputs:
-        raise MethodError(f"'{system.name}' has no inputs: give inputs=[..], which its forces have in them")
+        raise MethodError(f"'{system.name}' has no inputs: define it with inputs=[..] that its forces contain")
 
 
 def _checked_duration(given: float | tuple[float, float]) -> tuple[float, float]:
     """Return the least and the largest duration."""
     shortest, longest = interval("duration", given)
     if not 0 < shortest <= longest < np.inf:
-        raise StateError(f"a duration is a positive number, or two from the shortest to the longest, not {given}")
+        raise StateError(f"duration must be a positive number, or two numbers (least, largest), not {given}")
     return shortest, longest
 
 

@@ -111,7 +111,7 @@ def _check_plain(simulation: Any) -> None:
     massless = [i for i, particle in enumerate(particles) if not particle.m > 0.0]
     oddities = {
         "fewer than two bodies": len(particles) < 2,
-        f"body {massless[:1]} without mass: leave it out, or give it one": bool(massless),
+        f"body {massless[:1]} without mass: remove it, or set its mass": bool(massless),
         f"softening = {simulation.softening}": simulation.softening != 0.0,
         f"gravity = {simulation.gravity!r}": simulation.gravity not in NEWTON,
         f"boundary = {simulation.boundary!r}": simulation.boundary != "none",
@@ -121,7 +121,7 @@ def _check_plain(simulation: Any) -> None:
     }
     found = [what for what, there in oddities.items() if there]
     if found:
-        raise SystemDefinitionError(f"only masses that attract each other are taken; this simulation has {found[0]}")
+        raise SystemDefinitionError(f"only gravity between masses is supported; this simulation has {found[0]}")
 
 
 def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
@@ -148,8 +148,8 @@ def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
                 if G > 0.0:
                     return axes, G, masses.tolist()
     raise SystemDefinitionError(
-        f"'{system.name}' is not of bodies that attract each other by Newton's law, in Cartesian coordinates, one body "
-        "after the other"
+        f"'{system.name}' is not a system of bodies with Newtonian gravity in Cartesian coordinates, one body after "
+        "the other"
     )
 
 

@@ -62,9 +62,7 @@ class _Tensors:
 
         tensor = torch.as_tensor(value, dtype=None if isinstance(value, torch.Tensor) else torch.float64)
         if tensor.device.type != "cpu":
-            raise StateError(
-                f"{name} is on the device {tensor.device}, but a flow is computed on processors: {name}.cpu()"
-            )
+            raise StateError(f"{name} is on the device {tensor.device}, but a flow runs on the CPU: pass {name}.cpu()")
         if tensor.is_floating_point() and tensor.dtype != torch.float64:
             raise StateError(f"{name} is {tensor.dtype}, but a flow is computed in binary64: give torch.float64")
         return tensor.to(torch.float64)

@@ -34,7 +34,7 @@ def _call(
     if rows and found.numel():
         status = binding.function(name)(*part, flow.steps, flow.spacing, count, rows, *pointers, report)
         if status == NO_MEMORY:
-            raise MemoryError("there is no memory for the states of a flow")
+            raise MemoryError("not enough memory for the states of a flow")
         if status:
             raise step_failure(status, report, step=int(report.steps), h=0.0)
     return found
@@ -130,8 +130,8 @@ class Push(_Linear):
     def jvp(ctx: Any, of_x: Any, of_changes: Any, _: Any) -> Any:
         if of_x is not None:
             raise MethodError(
-                "a flow has no second derivatives forward of forward, as jacfwd of jacfwd asks for: take "
-                "torch.func.hessian, or jacrev of either"
+                "a flow has no forward-over-forward second derivatives (jacfwd of jacfwd): use torch.func.hessian, or "
+                "jacrev of either"
             )
         return Push.apply(ctx.saved_tensors[0], of_changes, ctx.flow)
 
@@ -178,7 +178,7 @@ class Bend(_Linear):
         """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
         x, slopes, _ = ctx.saved_tensors
         if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
-            raise MethodError("a flow has no third derivatives, and no second ones forward of forward")
+            raise MethodError("a flow has no third derivatives and no forward-over-forward second derivatives")
         return None, None, Bend.apply(x, slopes, back, ctx.flow), None
 
     @staticmethod

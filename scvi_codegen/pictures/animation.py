@@ -113,7 +113,7 @@ class Film:
 
         kind = Path(path).suffix.lower()
         if kind == ".mp4" and not writers.is_available("ffmpeg"):
-            raise PlotError("films of the kind .mp4 need ffmpeg, which is not installed; .gif and .html do not")
+            raise PlotError(".mp4 animations need ffmpeg, which is not installed; use .gif or .html")
         with style(), replaced(path) as made:
             if kind == ".html":
                 made.write_text(self.animation.to_jshtml(), encoding="utf-8")

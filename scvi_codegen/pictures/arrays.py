@@ -68,9 +68,11 @@ def plot_arrays(
         raise StateError(f"there is no array '{name}'{closest(name, trajectory.q)} Known: {', '.join(trajectory.q)}")
     values = trajectory.q[name]
     if trajectory.observed is not None and values.ndim == 2:
-        raise StateError("of an observed run the first and the last state alone are kept: run it without observe")
+        raise StateError(
+            "a run with observe saves only its first and last state: run it without observe to draw this array"
+        )
     if values.ndim > 3:
-        raise StateError(f"'{name}' has {values.ndim - 1} axes: arrays of one or two are drawn")
+        raise StateError(f"'{name}' has {values.ndim - 1} indices: only arrays with one or two can be drawn")
     with panel(path, ax) as drawn:
         drawn.grid(visible=False)
         if values.ndim == 3 and values.shape[2] in IN_SPACE:

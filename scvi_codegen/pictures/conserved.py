@@ -59,7 +59,9 @@ def plot_momentum_maps(
     """
     names = trajectory.stepper.interface.map_names
     if not names:
-        raise StateError(f"no symmetry of '{trajectory.stepper.interface.system}' is known: it has no momentum maps")
+        raise StateError(
+            f"'{trajectory.stepper.interface.system}' has no known symmetry, and therefore no momentum maps"
+        )
     errors = np.abs(trajectory.momentum_errors())
     with panel(path, ax) as drawn:
         for number, name in enumerate(names):

@@ -114,6 +114,6 @@ def column(interface: Interface, states: Any, name: str) -> Array:
     columns = dict(zip(interface.momenta, states.p.T, strict=True))
     columns |= dict(zip(interface.coordinates, states.q.T, strict=True))
     if name not in columns:
-        raise StateError(f"{name!r} is neither a coordinate nor a momentum; there are {', '.join(sorted(columns))}")
+        raise StateError(f"{name!r} is neither a coordinate nor a momentum; known are {', '.join(sorted(columns))}")
     values: Array = columns[name]
     return values

@@ -43,6 +43,6 @@ class ResidualPlot:
                 drawn.plot(self.t, column, ".", markersize=4, color=color(number), label=plain(name))
                 drawn.axhspan(-2.0 * deviation, 2.0 * deviation, color=color(number), alpha=0.1, linewidth=0)
             drawn.axhline(0.0, color="black", linewidth=0.6)
-            drawn.set(xlabel="t", title="measured less computed; bands of two standard deviations")
+            drawn.set(xlabel="t", title="measured minus computed; bands of two standard deviations")
             drawn.legend(loc="best", fontsize=8)
         return drawn

@@ -151,7 +151,7 @@ def _given(
     system: MechanicalSystem, stepper: Stepper, q: ArrayLike | None, p: ArrayLike | None, h: float | None, t: float
 ) -> State:
     if (q is None) != (p is None):
-        raise StateError("give both q and p, or neither")
+        raise StateError("only one of q and p was passed: give both, or neither")
     if q is None or p is None:
         return _found(system, stepper, h, t)
     position, momentum = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
@@ -174,7 +174,9 @@ def _found(system: MechanicalSystem, stepper: Stepper, h: float | None, t: float
         except (StateError, StepFailedError):
             continue
         return State(q, p, t, step)
-    raise StateError(f"no state of '{system.name}' of size 1 was found at which a step succeeds: give q, p and h")
+    raise StateError(
+        f"no random state of '{system.name}' of size 1 was found at which a step succeeds: give q, p and h"
+    )
 
 
 def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
@@ -190,4 +192,4 @@ def _step(stepper: Stepper, q: Array, p: Array, t: float) -> float:
         if change <= PART:
             return h
         h /= 2
-    raise StateError("no step succeeds at this state: give h, or another state")
+    raise StateError("no step of any size succeeds at this state: give h, or another state")

@@ -34,8 +34,8 @@ __all__ = [
 class Outcome(StrEnum):
     """Result of a check."""
 
-    KEPT = "kept"
-    BROKEN = "BROKEN"
+    KEPT = "satisfied"
+    BROKEN = "VIOLATED"
     NOT_MEASURED = "not measured"
     INFORMATION = "information"
 
@@ -166,7 +166,7 @@ class Certificate:
     def verdict(self) -> str:
         """Summary: whether properties are violated, and the number of checks by outcome."""
         counts = Counter(check.outcome for check in self.checks)
-        verdict = "every promise measured is kept" if self.passed else "PROMISES ARE BROKEN"
+        verdict = "all measured properties are satisfied" if self.passed else "PROPERTIES ARE VIOLATED"
         numbers = ", ".join(f"{counts[outcome]} {outcome.value}" for outcome in Outcome if counts[outcome])
         return f"{verdict}: {numbers}"
 
@@ -181,7 +181,7 @@ class Certificate:
             ("C source", plain(f"sha256 {self.checksum}")),
             ("step", plain(f"{self.h:g}")),
         )
-        head = ("", "outcome", "measured", "bound", "promise")
+        head = ("", "outcome", "measured", "bound", "property")
         return card(self.title, facts, grid(map(_row, self.checks), head=head))
 
     def to_json(self) -> str:

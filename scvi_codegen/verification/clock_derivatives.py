@@ -28,13 +28,13 @@ ROUGHNESS = 1e-12
 
 def clock_derivative_checks(pace: Pace) -> Iterator[Check]:
     """Yield the checks along one direction in which all arguments change, among them the energy."""
-    promise = "a step of tau and its time change by all they start from as the equations do (differences in 60 digits)"
+    promise = "derivatives of a step of tau and of its duration are those of the equations (differences, 60 digits)"
     yield from checked("derivatives in tau", promise, partial(_derivative, pace))
-    promise = "the energy on whose level steps are taken changes with the start as its formula does (60 digits)"
-    yield from checked("level", promise, partial(_level, pace))
-    yield from checked("adjoint in tau", "the transposed derivative is that, times included", partial(_transpose, pace))
+    promise = "derivatives of the energy of the start are those of its formula (60 digits)"
+    yield from checked("energy surface", promise, partial(_level, pace))
+    yield from checked("adjoint in tau", "VJP is the transpose of JVP, times included", partial(_transpose, pace))
     if is_symplectic(pace.subject.method, pace.transformed) and not pace.transformed.constraints:
-        promise = "J^T Omega J = Omega, J the compiled derivative of a step of tau at an energy that is given"
+        promise = "J^T Omega J = Omega, J the compiled Jacobian of a step of tau at fixed energy"
         yield from checked("symplecticity in tau", promise, partial(_symplecticity, pace))
 
 

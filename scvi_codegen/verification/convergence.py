@@ -57,11 +57,11 @@ RULES: Mapping[str, Callable[[int], int]] = {
 def convergence_checks(subject: Subject) -> Iterator[Check]:
     """Yield all checks of this module."""
     method = subject.method
-    promise = "order, symplecticity and symmetry are those known of the family"
-    yield from checked("claims", promise, partial(_claims, method))
-    order = f"order {method.order} in h" if method.order else "steps approach the motion (no order is claimed)"
+    promise = "order, symplecticity and symmetry are those in the literature"
+    yield from checked("known properties", promise, partial(_claims, method))
+    order = f"order {method.order} in h" if method.order else "steps converge to the exact motion (no order is claimed)"
     yield from checked("order", order, partial(_order, subject))
-    promise = "two degrees more shrink the error of a step at least fourfold"
+    promise = "two degrees more reduce the error of a step at least fourfold"
     yield from checked("rate in degree", promise, partial(_rate_in_degree, subject))
 
 
@@ -71,7 +71,7 @@ def _claims(method: Method) -> Finding | None:
     if expected is None:
         return None
     if own != expected:
-        raise BrokenError(f"they are {own}, known are {expected}")
+        raise BrokenError(f"(order, symplectic, symmetric) is {own}, in the literature {expected}")
     return Finding(0.0, 0.0, f"order {own[0]}")
 
 
@@ -95,9 +95,9 @@ def _order(subject: Subject) -> Finding | None:
     order = subject.method.order
     measured, error = _measured_order(subject)
     if measured is None:
-        return Finding(error, float(FLOOR), "a step is exact")
+        return Finding(error, float(FLOOR), "exact step")
     least = order - SLACK if order else LEAST_ORDER
-    return Finding(measured, least, f"where a step errs by {error:.1e}", at_least=True)
+    return Finding(measured, least, f"at a local error of {error:.1e}", at_least=True)
 
 
 def _measured_order(subject: Subject) -> tuple[float | None, float]:
@@ -146,7 +146,7 @@ def _rate_in_degree(subject: Subject) -> Finding | None:
     less, more = (_of_size(what, key, size + change) for change in (-2, 2))
     pair = (less, subject.method) if less else (subject.method, more) if more else None
     if pair is None:
-        raise StateError("neighbouring degrees do not exist with this quadrature")
+        raise StateError("no method of a neighbouring degree exists with this quadrature")
     h, (coarse, fine) = _errors_of(subject, pair)
     remark = f"{pair[0].name}: {float(coarse):.1e}, {pair[1].name}: {float(fine):.1e}, h = {float(h):.3g}"
     if coarse < FLOOR:

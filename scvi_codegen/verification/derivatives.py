@@ -29,12 +29,12 @@ MOST_BENT = 4
 
 def derivative_checks(subject: Subject) -> Iterator[Check]:
     """Yield the checks along one direction in which all arguments change."""
-    promise = "a step changes by its start, parameters, time and h as its equations do (differences in 60 digits)"
+    promise = "derivatives with respect to state, parameters, t and h are those of the equations (60 digits)"
     yield from checked("derivatives", promise, partial(_derivative, subject))
-    yield from checked("adjoint", "the transposed derivative is that", partial(_transpose, subject))
-    promise = "the slopes of a function of the end change as the equations bend (differences in 60 digits)"
+    yield from checked("adjoint", "VJP is the transpose of JVP", partial(_transpose, subject))
+    promise = "second derivatives of a function of the end are those of the equations (differences, 60 digits)"
     yield from checked("second derivatives", promise, partial(_second, subject))
-    yield from checked("Hessian", "second derivatives are the same in either order", partial(_symmetry, subject))
+    yield from checked("Hessian", "the Hessian is symmetric", partial(_symmetry, subject))
 
 
 def _derivative(subject: Subject) -> Finding | None:

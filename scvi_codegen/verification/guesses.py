@@ -38,8 +38,8 @@ def guess_checks(subject: Subject) -> Iterator[Check]:
     """Yield the check for implicit methods; one stage, or curves of degree 1, predict no more than a line."""
     method = subject.method
     if method.implicit and method.exactness.curve != 1 and len(discretise(subject.system, method).blocks) > 1:
-        promise = "from former steps an iteration leaves less to do than from a straight line, at a short step"
-        yield from checked("guesses", promise, partial(_guesses, subject))
+        promise = "one iteration leaves a smaller error from the predictor than from a straight line, at small h"
+        yield from checked("predictor", promise, partial(_guesses, subject))
 
 
 def _guesses(subject: Subject) -> Finding | None:
@@ -48,7 +48,7 @@ def _guesses(subject: Subject) -> Finding | None:
     if not seen:
         return None
     worst, h = max(seen)
-    return Finding(worst, GAINED, f"in parts of what the line leaves, h = {h:.3g}")
+    return Finding(worst, GAINED, f"ratio of the errors, h = {h:.3g}")
 
 
 def _worst(subject: Subject, stepper: Stepper) -> tuple[float, float] | None:

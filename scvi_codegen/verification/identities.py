@@ -67,14 +67,14 @@ class _Twin:
 
 def identity_checks(subject: Subject) -> Iterator[Check]:
     """Yield the identities that apply to the method and the system."""
-    promise = "the same step by another path"
+    promise = "another method or formulation gives the same step"
     for twin in _twins(subject.method, forms_of(subject.moved).separable):
         measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
         yield from checked(f"identity: {twin.name}", promise, measure)
     yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
-    promise = "a step is exact on the oscillator of the curves' frequency"
+    promise = "steps of the oscillator with the curves' frequency are exact"
     yield from checked("oscillator", promise, partial(_oscillator, subject.method))
-    yield from checked("Euler", "a step is the rates at its start times h", partial(_euler, subject))
+    yield from checked("Euler", "a step is h times the rates at its start", partial(_euler, subject))
 
 
 def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound: float) -> Finding:
@@ -164,7 +164,7 @@ def _legendre_twin(subject: Subject) -> Finding | None:
     if singular or shot or method.needs_lagrangian or system.constraints:
         return None
     if system.dimension > LARGEST_TWIN:
-        raise StateError(f"Legendre's transform is taken for {LARGEST_TWIN} coordinates at most")
+        raise StateError(f"Legendre transform: more than {LARGEST_TWIN} coordinates")
     twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
     return _compared(subject, twin, method, EQUAL)
 
@@ -192,7 +192,7 @@ def _euler(subject: Subject) -> Finding | None:
     if what["form"] == "phase-space":
         end = [*(q + v * h), *(p + force * h)]
     elif motion.hamiltonian:
-        raise StateError("positions and velocities of a Hamiltonian are not written out")
+        raise StateError("no formula for the position form of a Hamiltonian")
     else:
         end = [*(q + v * h), *motion.momentum(q + v * h, v + motion.acceleration(q, v, t) * h, t + h)]
     solved = subject.solved(0)

@@ -122,25 +122,25 @@ def pace_checks(pace: Pace) -> Iterator[Check]:
 
 
 def _clock(pace: Pace) -> Iterator[tuple[str, str, Any]]:
-    yield "steps of tau", "in transformed time they are those at the energy of their state", _at_their_energy
-    yield "time", "a step ends as near to the motion in t as to that in tau (60 digits)", _in_time
-    yield "end", "a run to a time ends there, as near to the motion in t (60 digits)", _at_its_end
+    yield "steps of tau", "they equal steps of the transformed system at the energy of their state", _at_their_energy
+    yield "time", "the error in t is of the size of the error in tau (60 digits)", _in_time
+    yield "final time", "a run to t_end ends at t_end with an error of that size (60 digits)", _at_its_end
     if pace.subject.method.symmetric:
-        yield "time back", f"{THERE_AND_BACK} steps, and as many of -h, give time and state back", _there_and_back
+        yield "reversal in tau", f"{THERE_AND_BACK} steps of h and of -h return to time and state", _there_and_back
 
 
 def _lengths(pace: Pace) -> Iterator[tuple[str, str, Any]]:
-    yield "lengths", "each step of a run that chooses them is the step of that length", _of_that_length
+    yield "adaptive steps", "each equals a single step of the same size", _of_that_length
     if pace.stepper.interface.monitor:
-        yield "pace", "half of tau brings lengths at least 2.5 times nearer to those of the monitor", _by_the_monitor
+        yield "step density", "halving tau reduces the deviation from dt = g dtau at least 2.5-fold", _by_the_monitor
         if pace.subject.method.symmetric:
-            yield "way back", "from the end of a step a run goes back to where it began", _turned
+            yield "reversal of adaptive steps", "a run backward from its end returns to its start", _turned
     else:
-        yield "tolerance", "steps that chose their length err by no more, in the median (60 digits)", _within_tolerance
+        yield "local error", "the median over adaptive steps is below the tolerance (60 digits)", _within_tolerance
     described = pace.stepper.interface
     for k, name in enumerate(described.map_names):
         if pace.subject.method.symplectic and described.map_exact[k]:
-            yield f"{name} at any pace", "steps of any length conserve it as they are solved", partial(_conserved, k)
+            yield f"{name}, adaptive steps", "conserved at variable step size", partial(_conserved, k)
 
 
 def _at_their_energy(pace: Pace) -> Finding:
@@ -164,7 +164,7 @@ def _at_its_end(pace: Pace) -> Finding:
     end = float(t[whole] + part * (t[whole + 1] - t[whole]))
     run = pace.run(h=start.h, t_end=end)
     if run.t[-1] != end:
-        return Finding(abs(run.t[-1] - end), 0.0, f"it ends at {run.t[-1]!r}, not {end!r}")
+        return Finding(abs(run.t[-1] - end), 0.0, f"the run ends at t = {run.t[-1]!r}, not {end!r}")
     return _as_near(pace, start, whole + 1, run.q[-1], run.p[-1], mp.mpf(end) - mp.mpf(start.t))
 
 
@@ -188,7 +188,7 @@ def _there_and_back(pace: Pace) -> Finding:
     back = pace.stepper.integrate(there.q[-1], there.p[-1], h=-first.h, t=float(there.t[-1]), **how)
     change = np.abs(np.concatenate([back.q[-1], back.p[-1]]) - first.z) / pace.subject.rounding(first)
     late = abs(float(back.t[-1]) - first.t) / (EPSILON * (abs(float(there.t[-1])) + abs(first.t)))
-    return Finding(max(float(change.max()), late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding, a step")
+    return Finding(max(float(change.max()), late) / THERE_AND_BACK, ROUNDINGS, "in units of rounding per step")
 
 
 def _chosen(pace: Pace, part: float = 1.0) -> Trajectory:
@@ -212,12 +212,12 @@ def _of_that_length(pace: Pace) -> Finding:
     for start, end in _steps_of(pace):
         unit = pace.subject.rounding(start) + pace.unsolved * pace.subject.scales(start)
         worst = max(worst, float(np.max(np.abs(pace.subject.ends(start) - end) / unit)))
-    return Finding(worst, ROUNDINGS, f"in units of what is not solved, and of rounding, {LOOKED_AT} steps")
+    return Finding(worst, ROUNDINGS, f"in units of residual and rounding, {LOOKED_AT} steps")
 
 
 def _by_the_monitor(pace: Pace) -> Finding:
     apart = [_apart_from_the_monitor(pace, _chosen(pace, part), part * pace.tau) for part in (1.0, 0.5)]
-    remark = f"tau = {pace.tau:.3g}: {apart[0]:.1e} apart, then {apart[1]:.1e}"
+    remark = f"tau = {pace.tau:.3g}: deviation {apart[0]:.1e}, then {apart[1]:.1e}"
     return Finding(apart[0] / apart[1], NEARER, remark, at_least=True)
 
 
@@ -242,7 +242,7 @@ def _turned(pace: Pace) -> Finding:
     back = pace.stepper.from_checkpoint(run.checkpoint(), h=pace.tau, t_end=first.t, parameters=pace.parameters)
     back.record()
     change = np.abs(np.concatenate([back.q, back.p]) - first.z) / pace.subject.rounding(first)
-    return Finding(float(change.max()) / run.steps, ROUNDINGS, f"in units of rounding, a step of {run.steps}")
+    return Finding(float(change.max()) / run.steps, ROUNDINGS, f"in units of rounding per step, {run.steps} steps")
 
 
 def _within_tolerance(pace: Pace) -> Finding:
@@ -250,7 +250,7 @@ def _within_tolerance(pace: Pace) -> Finding:
     for start, end in _steps_of(pace):
         errors.append(pace.distance(pace.motion, start, mp.mpf(start.h), end))
         rounding = max(rounding, ROUNDINGS * pace.rounding(start))
-    remark = f"relative, {LOOKED_AT} steps, of which one errs by {max(errors):.1e}"
+    remark = f"relative, {LOOKED_AT} steps, largest {max(errors):.1e}"
     return Finding(float(np.median(errors)), (pace.tolerance or EPSILON) + rounding, remark)
 
 

@@ -63,12 +63,12 @@ NO_TRUNCATION = 2.0**-56
 def roundoff_checks(subject: Subject) -> Iterator[Check]:
     """Yield all checks of this module."""
     for name, promise, measure in (
-        ("sums", f"{SHORT_STEPS} steps of h 2^-40 add up to one as long as all", _sums),
-        ("low parts", "what rounding cut off a state enters the next step", _low_parts),
-        ("ensemble", "lanes take the steps of single runs, with their low parts", _ensemble),
-        ("drift", "with sweeps that come to rest invariants walk at random: Student's t of their mean", _drift),
-        ("drift of ensembles", "the same in lanes", _drift_of_lanes),
-        ("rest of sweeps", "as sweeps stop by default, they move an invariant by part of a rounding a step", _rests),
+        ("compensated sums", f"{SHORT_STEPS} steps of h 2^-40 equal one of {SHORT_STEPS} h 2^-40", _sums),
+        ("low words", "the compensation terms of the state enter the next step", _low_parts),
+        ("ensemble", "SIMD lanes equal single runs, including compensation terms", _ensemble),
+        ("drift", "invariants drift no more than a random walk (Student's t), converged iterations", _drift),
+        ("drift of ensembles", "the same for SIMD lanes", _drift_of_lanes),
+        ("residual drift", "default convergence criterion: drift below part of a rounding per step", _rests),
     ):
         yield from checked(name, promise, partial(measure, subject))
 
@@ -135,7 +135,9 @@ def _low_parts(subject: Subject) -> Finding | None:
     (end, low), (other, other_low) = (_advanced(subject, subject.stepper, *way) for way in ways)
     scales = subject.scales(state)
     apart, moved = np.abs((end - other) + (low - other_low)) / scales, np.abs(end - state.z) / scales
-    return Finding(float(apart.max() / (LONG_CARRY * moved.max())), FORGOTTEN, "part of the effect of a long carry")
+    return Finding(
+        float(apart.max() / (LONG_CARRY * moved.max())), FORGOTTEN, "relative to the effect of a large compensation"
+    )
 
 
 def _ensemble(subject: Subject) -> Finding | None:
@@ -156,7 +158,7 @@ def _ensemble(subject: Subject) -> Finding | None:
             other, other_low = _advanced(subject, subject.stepper, start, steps, carry)
             apart = np.abs((end - other) + (low - other_low))
             worst = max(worst, float(np.max(apart / unit)))
-    return Finding(worst, 1.0, f"in units of {ROUNDINGS:g} roundings, lanes that differ")
+    return Finding(worst, 1.0, f"in units of {ROUNDINGS:g} roundings, lanes with different states")
 
 
 def _beside(state: State, scales: Array, lane: int) -> State:
@@ -176,7 +178,7 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
     block.lanes("carry_p")[:] = carry[m:, None]
     block.advance(steps)
     if block.left:
-        raise BrokenError("single runs take these steps, lanes fail")
+        raise BrokenError("single runs succeed, SIMD lanes fail")
     low = np.concatenate([block.lanes(name) for name in ("carry_q", "carry_p")])
     for lane in range(min(width, len(starts))):
         yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
@@ -268,7 +270,7 @@ def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Arr
         changes = (after - before) / sizes
         changes = changes[np.isfinite(changes)]
         if len(changes) < RUNS // 2:
-            raise StateError(f"{invariant.name}: runs of {steps} steps fail")
+            raise StateError(f"{invariant.name}: runs of {steps} steps failed")
         yield _Walk(invariant.name, steps, float(np.mean(changes)), float(np.std(changes, ddof=1)), len(changes))
 
 

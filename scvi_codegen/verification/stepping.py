@@ -47,15 +47,19 @@ def step_checks(subject: Subject) -> Iterator[Check]:
     """Yield all checks of this module."""
     for name, promise, measure in (
         ("stage equations", "a step solves the paper's equations (60 digits)", _artefact),
-        ("Newton's solver", "it solves the same equations", _newton),
-        ("solvers", "the artefact and Newton's solver alone give the same step", _agree),
-        ("Newton's matrix", "its first update is that of the exact one (finite differences, 60 digits)", _matrix),
-        ("fallback", "where sweeps fail, Newton's iteration solves the same equations", _fallback),
-        ("contraction", f"iterations shrink errors in proportion to h or better (count at h/{SMALLER})", _contraction),
-        ("run", "each step of a run, with its memory, is the step from the same state", _run),
-        ("stationarity", "p0, p1 are slopes of the action, others vanish (finite differences, 60 digits)", _action),
+        ("Newton's solver", "Newton's method alone solves the same equations", _newton),
+        ("solvers", "the default solver and Newton's method give the same step", _agree),
+        ("Newton's matrix", "its first update is that of the exact Jacobian (finite differences, 60 digits)", _matrix),
+        ("fallback", "if the fixed-point iteration fails, Newton's method solves the same equations", _fallback),
+        (
+            "convergence rate",
+            f"error factor per iteration proportional to h or better (count at h/{SMALLER})",
+            _contraction,
+        ),
+        ("run", "each step of a run, with its predictor, equals a single step from the same state", _run),
+        ("stationarity", "dS = p1 dq1 - p0 dq0 for the discrete action S (finite differences, 60 digits)", _action),
         ("Legendre transform", "momentum, velocity, energy are those of the formula (60 digits)", _transform),
-        ("discrete Lagrangian", "p0 and p1 are its slopes, compiled and by finite differences", _discrete),
+        ("discrete Lagrangian", "p0 and p1 are its derivatives, compiled and by finite differences", _discrete),
     ):
         yield from checked(name, promise, partial(measure, subject))
 
@@ -77,7 +81,7 @@ def _solves(subject: Subject, stepper: Stepper) -> Finding:
         try:
             worst = max(worst, _apart(subject, state, subject.ends(state, stepper), expected))
         except StepFailedError as failure:
-            raise BrokenError(f"they have a solution, but {failure}") from failure
+            raise BrokenError(f"the equations have a solution, but {failure}") from failure
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
@@ -108,14 +112,14 @@ def _matrix(subject: Subject) -> Finding | None:
     end = _joined(subject.solved(0))
     state, equations = subject.states[0], compiled_equations(subject.moved, subject.method)
     if equations.unknowns > LARGEST:
-        raise StateError(f"{equations.unknowns} unknowns are more than the {LARGEST} that are solved in 60 digits")
+        raise StateError(f"{equations.unknowns} unknowns exceed the limit of {LARGEST} in 60 digits")
     scales = subject.scales(state)
     exact = _joined(equations.first_update(state.q, state.p, state.h, state.t))
     v = subject.motion.velocity(numbers(state.q), numbers(state.p), mp.mpf(state.t))
     straight = np.concatenate([numbers(state.q) + v * state.h, numbers(state.p)])
     rounding = float(np.max(subject.rounding(state) / scales))
     if _size(end - straight, scales) < SHORTEST_WAY * rounding:
-        raise StateError("a straight line is the solution already")
+        raise StateError("the straight line is the solution")
     missed = _size(subject.ends(state, subject.newton, ANY_UPDATE) - exact, scales)
     return Finding(missed / rounding, ROUNDINGS, "in units of rounding")
 
@@ -139,7 +143,7 @@ def _fallback(subject: Subject) -> Finding | None:
                 break
             expected = subject.derived()(state.q, state.p, state.h, state.t)
             return Finding(_apart(subject, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}")
-    raise StateError("sweeps take no more iterations than Newton at the steps tried, so it is not reached")
+    raise StateError("the fallback was not reached: the fixed-point iteration converges as fast as Newton's method")
 
 
 def _counted(subject: Subject, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
@@ -162,7 +166,7 @@ def _contraction(subject: Subject) -> Finding:
 def _run(subject: Subject) -> Finding:
     """Compare the steps of a run, with predictor and compensation, with single steps from the same states."""
     worst = max(_run_of(subject, stepper) for stepper in {subject.stepper, subject.newton or subject.stepper})
-    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also by Newton's solver alone")
+    return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also with Newton's method alone")
 
 
 def _run_of(subject: Subject, stepper: Stepper) -> float:
@@ -219,7 +223,7 @@ def _discrete(subject: Subject) -> Finding | None:
         p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
         slopes = _slopes_of_action(subject, state, q1)
     except StepFailedError as failure:
-        raise BrokenError(f"the step has a curve from q0 to q1, but looking for it {failure}") from failure
+        raise BrokenError(f"a curve from q0 to q1 exists, but {failure}") from failure
     sizes = subject.scales(state)[len(q1) :]
     wrong = np.array([*(slopes + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
     return Finding(float(np.max(np.abs(wrong) / sizes)), SLOPES, "relative")

@@ -42,9 +42,9 @@ def structure_checks(subject: Subject) -> Iterator[Check]:
         promise = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
         yield from checked("conformal symplecticity", promise, partial(_symplecticity, subject))
     if subject.system.constraints:
-        promise = f"they and their rates are 0 but for rounding at {LOOKED_AT} states of {STEPS} steps"
+        promise = f"they and their rates are 0 up to round-off at {LOOKED_AT} states of {STEPS} steps"
         yield from checked("constraints", promise, partial(_constraints, subject))
-        promise = "with them the compiled multipliers keep the second derivatives of constraints at 0 (60 digits)"
+        promise = "the compiled multipliers are those of the exact motion (60 digits)"
         yield from checked("multipliers", promise, partial(_multipliers, subject))
     if subject.method.symmetric:
         yield from checked("reversal", "a step with -h undoes the step with h", partial(_reversal, subject))
@@ -52,7 +52,7 @@ def structure_checks(subject: Subject) -> Iterator[Check]:
         described = subject.stepper.interface
         for k, name in enumerate(described.map_names):
             if described.map_exact[k]:
-                promise = "a symmetry of the system conserves it to round-off"
+                promise = "conserved to round-off (symmetry of the system)"
                 yield from checked(name, promise, partial(_momentum, subject, k))
 
 
@@ -61,13 +61,13 @@ def _symplecticity(subject: Subject) -> Finding:
     for state in subject.states:
         around = subject.linearised(state)
         if around is None:
-            raise StateError("steps from nearby states fail")
+            raise StateError("steps from neighbouring states fail")
         shrunk = math.exp(-subject.damping * state.h)
         defect, noise = _defect(around, shrunk)
         if subject.system.constraints:
             defect, noise = _along(subject.tangents(state), around, shrunk)
         if noise.max() > TOO_ROUGH:
-            raise StateError(f"differences are good to {noise.max():.1g} only: try a smaller step")
+            raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
         place = np.unravel_index(np.argmax(defect / noise), defect.shape)
         found = Finding(float(defect[place]), float(noise[place]), "the bound is the noise of the differences")
         worst = max(worst, found, key=lambda finding: finding.measured / finding.bound)
@@ -175,7 +175,7 @@ def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
 
 def largest_step(subject: Subject) -> Check:
     """Return the largest step size at which the stage equations are solved three times in a row, by bisection."""
-    name, what = "largest step", f"stage equations are solved up to h, {TRIED} steps in a row"
+    name, what = "largest step", f"largest h at which {TRIED} steps in a row are solved"
     given = subject.states[0]
 
     def usable(h: float) -> bool:
@@ -194,7 +194,7 @@ def largest_step(subject: Subject) -> Check:
                 break
             good = bad
         else:
-            return information(name, what, good, "none that fails was found")
+            return information(name, what, good, "no failing step size was found")
     for _ in range(BISECTIONS):
         middle = (good + bad) / 2
         good, bad = (middle, bad) if usable(middle) else (good, middle)

@@ -121,9 +121,7 @@ class Subject:
             StateError: if it has too many coordinates.
         """
         if self.system.dimension > MOST_COORDINATES:
-            raise StateError(
-                f"{self.system.dimension} coordinates are more than the {MOST_COORDINATES} followed in 60 digits"
-            )
+            raise StateError(f"{self.system.dimension} coordinates exceed the limit of {MOST_COORDINATES} in 60 digits")
         return exact_motion(self.moved)
 
     @cached_property
@@ -242,9 +240,7 @@ class Subject:
         """
         found = derived_step(system or self.motion.system, method or self.method)
         if found.unknowns > LARGEST:
-            raise StateError(
-                f"{found.unknowns} unknowns a step are more than the {LARGEST} that are solved in 60 digits"
-            )
+            raise StateError(f"{found.unknowns} unknowns per step exceed the limit of {LARGEST} in 60 digits")
         return found
 
     @cached_property
@@ -257,9 +253,7 @@ class Subject:
             state, derived = self.states[index], self.derived()
             known = state.q, state.p, state.h, state.t
             if not self._solved and (whole := SUCH_STEPS * derived.seconds(*known)) > LONG_SECONDS:
-                tell(
-                    f"{derived.unknowns} unknowns a step are solved in 60 digits, which takes some {whole:.0f} s in all"
-                )
+                tell(f"{derived.unknowns} unknowns per step are solved in 60 digits, which takes about {whole:.0f} s")
             self._solved[index] = derived(*known)
         return self._solved[index]
 

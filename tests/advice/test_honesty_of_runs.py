@@ -134,7 +134,7 @@ class TestLongSteps:
         trajectory = verlet.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=3)
         assert math.isnan(trajectory.step_error)
         assert "not known" in trajectory._repr_html_()
-        assert "its error is not known" in run("kepler --method stoermer-verlet --step 0.1 --steps 3").output
+        assert "largest local error: unknown" in run("kepler --method stoermer-verlet --step 0.1 --steps 3").output
 
 
 class TestAnotherRoot:
@@ -225,7 +225,7 @@ class TestPromises:
         assert re.search(r"q1 =\s+1\.99", run(f"kepler {state} --tolerance 1e-9").output)
         refused = run(f"kepler {state} --advise 1e-9")
         assert refused.exit_code != 0
-        assert re.search("steps? .*choose their length|let them choose their length", refused.stderr)
+        assert re.search("use adaptive step size", refused.stderr)
 
     def test_by_default_steps_choose_their_length(self):
         system = sc.problem("kepler").system
@@ -255,7 +255,7 @@ class TestPromises:
         best = sc.compile_stepper(problem.system, "svi:8").integrate(problem.q, p, t_end=20.0)
         error = np.linalg.norm(found.q[-1] - best.q[-1]) / np.linalg.norm(best.q[-1])
         assert error < tolerance
-        assert "a second run, of other steps, ends" in broken_promise(problem.system, found, error / 5)
+        assert "a second run with other steps differs by" in broken_promise(problem.system, found, error / 5)
 
     def test_an_estimate_that_is_too_small_hides_nothing(self):
         """Where a second run is at hand: a step's error says nothing of how errors grow."""
@@ -264,7 +264,7 @@ class TestPromises:
         known = known_digits(system, trajectory, most=20_000)
         tolerance = trajectory.step_error
         assert broken_promise(system, trajectory, tolerance) == ""
-        assert "a second run, of other steps, ends" in broken_promise(system, trajectory, tolerance, known)
+        assert "a second run with other steps differs by" in broken_promise(system, trajectory, tolerance, known)
 
     def test_an_energy_that_is_not_conserved_breaks_it(self):
         euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
@@ -294,7 +294,7 @@ class TestPromises:
     def test_a_tolerance_that_doubles_do_not_allow_is_said_before(self):
         result = run("kepler --span 5 --tolerance 1e-30")
         assert result.exit_code == 0
-        assert "Warning: doubles do not allow 1e-30" in result.stderr
+        assert "Warning: tolerance 1e-30 is below double precision" in result.stderr
 
 
 class TestKnownDigits:
@@ -335,7 +335,7 @@ class TestKnownDigits:
 
     def test_on_the_command_line(self):
         said = run("kepler --steps 400").output
-        assert "in the digits that a second run confirms)" in said
+        assert "in the digits confirmed by a second run)" in said
         assert len(re.search(r"q1 =\s+(\S+)", said)[1]) < 17
 
 

@@ -102,10 +102,10 @@ def of_promise(**more):
     [
         (1e-7, {}, ""),
         (1.9e-6, {}, ""),
-        (2.1e-6, {}, "ends 2.1e-06 away"),
+        (2.1e-6, {}, "differs by 2.1e-06 at the end"),
         (1e-7, {"step_error": 1e-4}, ""),
         (1e-3, {"step_error": 1e-4}, "the step from t = 3.25 alone has a relative error of about 1.0e-04"),
-        (1e-3, {"energy": lambda: np.linspace(1.0, 1.01, 64)}, "the energy, which the motion conserves, is off by"),
+        (1e-3, {"energy": lambda: np.linspace(1.0, 1.01, 64)}, "the conserved energy has a relative error of"),
     ],
     ids=["kept", "just kept", "just broken", "doubt that a second run dispels", "worst step", "energy"],
 )

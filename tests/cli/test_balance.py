@@ -55,7 +55,7 @@ def test_it_is_that_of_the_run():
     assert work[-1] < -0.01
     assert 0.0 < error < 1e-6
     changed = np.abs(energy - energy[0]).max()
-    said = f"energy: forces act, it changed by {changed:.3g} at most; all but {error:.1e} of that is work (E - E0 - W)"
+    said = f"energy: forces act, it changed by {changed:.3g} at most; energy balance |E - E0 - W| {error:.1e} at most"
     assert said in text
     found = json.loads(output_of(MODEL, "--json"))
     assert found["work"] == pytest.approx(work[-1])
@@ -65,10 +65,10 @@ def test_it_is_that_of_the_run():
 def test_damping_and_inputs_have_one():
     damped = MODEL.replace("lagrangian", "damping = 0.1\nlagrangian").replace('[forces]\nx = "-x_dot/10"\n', "")
     assert "energy: damping takes it" in (text := output_of(damped))
-    assert "of that is work (E - E0 - W)" in text
+    assert "energy balance |E - E0 - W|" in text
     driven = MODEL.replace("-x_dot/10", "u").replace("coordinates", 'inputs = ["u"]\ncoordinates')
     inputs = "[inputs]\nu = { t = [0.0, 3.0, 7.0], values = [0.0, 1.0, 0.0] }\n"
-    assert "of that is work (E - E0 - W)" in output_of(driven + inputs)
+    assert "energy balance |E - E0 - W|" in output_of(driven + inputs)
 
 
 @pytest.mark.parametrize(

@@ -205,14 +205,14 @@ class TestChoices:
     def test_on_the_command_line(self):
         words = "--q -1,0 --velocity 0,-1.1 --parameter mu=1.5 --step 0.1 --steps 10 --method gauss --stages 2"
         text = output_of("run", "kepler", *words.split())
-        assert "10 steps of 0.1 from t = 0 to t = 1; 11 states kept" in text
+        assert "10 steps of 0.1 from t = 0 to t = 1; 11 states saved" in text
         assert "gauss:2" in text
 
     @pytest.mark.parametrize(
         ("words", "message"),
         [
             ("keplr", "did you mean 'kepler'?"),
-            ("keplr", "There is no model file 'keplr', either."),
+            ("keplr", "There is no model file 'keplr' either."),
             ("fput-chain:0", "a chain has 1 to 1024 masses, not 0\n"),
             ("nowhere.toml", "nowhere.toml cannot be read: No such file or directory"),
             ("kepler --p 0,1 --velocity 0,1", "--p and --velocity exclude each other"),
@@ -241,24 +241,27 @@ class TestChoices:
             ("kepler --step 0", "the step is 0"),
             ("kepler --steps -1", "steps must be at least 0"),
             ("kepler --save-every 0", "save_every must be at least 1"),
-            ("kepler --span 1e15", "GB of memory: keep fewer (--save-every "),
-            ("kepler --span 1e15", "or write them into a folder as they come (-o NAME.run)"),
+            ("kepler --span 1e15", "GB of memory: save fewer (--save-every "),
+            ("kepler --span 1e15", "or record the run in a folder (-o NAME.run)"),
             ("kepler --tolerance 0", "the tolerance must be positive"),
             ("kepler -o orbit.txt", "as .npz, .csv, .h5, .hdf5, .nc, .zarr or into a folder .run, not as 'orbit.txt'"),
             ("kepler -o no/orbit.npz", "there is no folder 'no'"),
             ("kepler --plot orbit.gif", "saved as .png or .svg"),
             ("relativistic-particle --velocity 2", "q = "),
             ("kepler --tolerance 1e-6 --advise 1e-6", "--tolerance and --advise exclude each other"),
-            ("kepler --advise 1e-6 --step 0.1", "--advise chooses the step: leave out --step"),
-            ("kepler --advise 1e-6 --monitor distance --step 0.1", "--advise chooses the step: leave out --step"),
-            ("kepler --advise 1e-6 --monitor distance", "give --tolerance in place of --advise"),
-            ("kepler --checkpoint 5", "--checkpoint is for a run that is written into a folder (-o NAME.run)"),
-            ("kepler -o orbit.npz --checkpoint-steps 5", "--checkpoint-steps is for a run that is written into a"),
-            ("kepler --monitor distance --step 0.1 --span 1 -o orbit.run", "a folder holds a number of steps"),
-            ("kepler -o orbit.run --plot orbit.png", "--plot is for a trajectory in memory, not for a run in a folder"),
-            ("kepler --ensemble states.csv --plot orbit.png", "--plot is for one trajectory, not for --ensemble"),
-            ("kepler --ensemble states.csv --advise 1e-6", "--advise is for one trajectory, not for --ensemble"),
-            ("kepler --ensemble states.csv --monitor distance --step 0.1", "every trajectory has its own times"),
+            ("kepler --advise 1e-6 --step 0.1", "--advise determines the step size: omit --step"),
+            ("kepler --advise 1e-6 --monitor distance --step 0.1", "--advise determines the step size: omit --step"),
+            ("kepler --advise 1e-6 --monitor distance", "--advise is not available with a time transformation"),
+            ("kepler --checkpoint 5", "--checkpoint requires a run recorded in a folder (-o NAME.run)"),
+            ("kepler -o orbit.npz --checkpoint-steps 5", "--checkpoint-steps requires a run recorded in a folder"),
+            (
+                "kepler --monitor distance --step 0.1 --span 1 -o orbit.run",
+                "a recorded run in transformed time needs a number of steps",
+            ),
+            ("kepler -o orbit.run --plot orbit.png", "--plot is not available for a run recorded in a folder"),
+            ("kepler --ensemble states.csv --plot orbit.png", "--plot is not available with --ensemble"),
+            ("kepler --ensemble states.csv --advise 1e-6", "--advise is not available with --ensemble"),
+            ("kepler --ensemble states.csv --monitor distance --step 0.1", "each trajectory has its own times"),
         ],
     )
     def test_mistakes_are_usage_errors(self, words, message):
@@ -279,7 +282,7 @@ class TestChoices:
 class TestRun:
     def test_steps_that_choose_their_length_are_not_called_symplectic(self):
         text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
-        assert "order 16, symplectic where steps have one length, symmetric" in text
+        assert "order 16, symplectic only at fixed step size, symmetric" in text
 
     def test_a_span_that_the_step_does_not_divide_is_reported(self):
         """Single runs, recorded ones, continued ones, ensembles and sums over indices; not where the step divides."""
@@ -325,7 +328,7 @@ class TestRun:
         words = ("run", "harmonic-oscillator", "--degree", "2", "--quadrature", "gauss-legendre:1", "--steps", "40")
         result = invoke(*words, "--step", "1.5", option)
         assert result.exit_code == 0
-        assert re.search(r"Warning: the step from t = \S+ is too long: .* take a shorter --step", result.stderr)
+        assert re.search(r"Warning: the step from t = \S+ is too large: .* use a smaller --step", result.stderr)
         assert "too long" not in invoke("run", "harmonic-oscillator", option).stderr
 
     def test_the_largest_energy_error_is_told_and_not_the_last(self):
@@ -338,7 +341,7 @@ class TestRun:
 
     def test_long_states_are_cut_short(self):
         text = output_of("run", "fput-chain:9", "--steps", "3")
-        assert "and 3 coordinates more" in text
+        assert "and 3 more coordinates" in text
         assert "q7" not in text
 
     def test_energy_of_driven_systems_is_not_called_an_error(self):
@@ -357,7 +360,7 @@ class TestRun:
         assert np.array_equal(table, np.column_stack(columns))
 
     def test_steps_fewer_than_every_and_none_at_all(self):
-        assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state kept" in output_of(
+        assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state saved" in output_of(
             "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"
         )
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
@@ -385,7 +388,7 @@ class TestRun:
         assert result.exit_code == 130
         assert "Error: interrupted at t = " in result.stderr
         t = arrays("orbit.npz")["t"]
-        assert f"the {len(t)} states up to there were kept: orbit.npz" in result.stderr
+        assert f"the {len(t)} states computed before were written: orbit.npz" in result.stderr
         assert 3 < len(t) < 1000
         assert np.allclose(np.diff(t), 0.25)
         assert "relative energy error" in result.stdout
@@ -399,7 +402,7 @@ class TestRun:
             re.search(r"Error: step (\d+) at t = \S+ with h = 0.01 failed: .* did not converge", result.stderr)[1]
         )
         assert step > 5
-        assert f"the {step + 1} states up to there were kept: fall.npz" in result.stderr
+        assert f"the {step + 1} states computed before were written: fall.npz" in result.stderr
         assert f"{step} steps of 0.01" in result.stdout
         written = arrays("fall.npz")
         assert np.array_equal(written["t"], 0.01 * np.arange(step + 1))
@@ -421,7 +424,7 @@ class TestRun:
 
     def test_unwritable_folders_are_found_before_the_run(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "access", lambda path, mode: False)
-        assert "cannot be written" in error_of("run", "kepler", "-o", str(tmp_path / "a.npz"))
+        assert "is not writable" in error_of("run", "kepler", "-o", str(tmp_path / "a.npz"))
 
     def test_missing_matplotlib_is_found_before_the_run(self, monkeypatch):
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

@@ -65,7 +65,7 @@ def test_a_run_is_that_of_drive_and_its_file_too(model):
         assert (file["p"] == expected.p).all()
     assert Path("run.png").stat().st_size > 1000
     assert "24 steps of 0.1 from t = 0 to t = 2.3" in text  # one more than without a breakpoint within a step
-    assert "in the digits that a second run confirms" in text
+    assert "in the digits confirmed by a second run" in text
     told = [re.search(r"[\d.]+ iterations a step", each)[0] for each in (text, output_of())]
     assert told[0] == told[1]
 
@@ -91,7 +91,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
         (["--input", "u=none.csv"], "none.csv: it cannot be read"),
         (["--span", "4"], "the input u is given from t = 0 to 3; the run is from 0 to 4"),
         (["-o", "long.run"], "-o NAME.npz"),
-        (["--advise", "1e-9"], "give --tolerance in its place"),
+        (["--advise", "1e-9"], "use --tolerance"),
         (["--parameter", "u_0=1"], "no parameter 'u_0'"),
     ],
 )
@@ -112,7 +112,7 @@ def test_an_ensemble_of_them(model):
     with np.load("many.npz") as file:
         assert (file["t"] == expected[0].t).all()
         assert_allclose(file["q"], np.stack([run.q for run in expected], axis=1), atol=2e-15)
-    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states kept of each" in text
+    assert "3 trajectories of 24 steps of 0.1 from t = 0; 25 states saved of each" in text
     changes = max(np.abs(run.energy() - run.energy()[0]).max() for run in expected)
     assert f"it changed by {changes:.3g} at most" in text
     Path("pushed.toml").write_text(MODEL.replace("step = 0.1", ""))
@@ -120,7 +120,7 @@ def test_an_ensemble_of_them(model):
 
 
 def test_no_steps_and_columns_that_inputs_say():
-    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state kept" in output_of("--steps", "0")
+    assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of("--steps", "0")
     Path("many.csv").write_text("q,u_0\n0.1,5\n")
     assert "'u_0' is no coordinate" in invoke("--ensemble", "many.csv").stderr
 
@@ -136,7 +136,7 @@ def test_a_step_that_fails_leaves_the_stretches_before_it(model):
     Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
     result = invoke("-o", "run.csv")
     assert result.exit_code == 1
-    assert "states up to there were kept: run.csv" in result.stderr
+    assert "states computed before were written: run.csv" in result.stderr
     found = np.loadtxt("run.csv", delimiter=",", skiprows=1)
     assert 1.0 < found[-1, 0] < 1.5
     assert 1.0 in found[:, 0]

@@ -181,7 +181,7 @@ constraints = ["x**2 + y**2 = 1"]
         steps=None,
         save_every=2,
         h=None,
-        symplectic="symplectic where steps have one length",
+        symplectic="symplectic only at fixed step size",
     ),
     "time in L": Kind(
         system=SPRINGS.replace("- k*", "- k*(2 + cos(t))*"),
@@ -350,9 +350,9 @@ def first_lines(done: Done, lines: list[str]) -> None:
     assert lines[0] == numbers["system"]
     title = re.fullmatch(r".*; order (\d+), (.*), symmetric", lines[1])
     assert (int(title[1]), title[2]) == (kind.method[2], kind.symplectic)
-    way = re.fullmatch(r"(\d+) steps of (.*) from t = (\S+) to t = (\S+); (\d+) states kept", lines[2])
+    way = re.fullmatch(r"(\d+) steps of (.*) from t = (\S+) to t = (\S+); (\d+) states saved", lines[2])
     assert (int(way[1]), int(way[5])) == (numbers["steps"], len(done.t))
-    assert way[2] == (f"{kind.h:g}" if kind.h else f"their own lengths ({numbers['rejected_steps']} rejected)")
+    assert way[2] == (f"{kind.h:g}" if kind.h else f"adaptive size ({numbers['rejected_steps']} rejected)")
     assert (way[3], way[4]) == (f"{T:g}", f"{done.t[-1]:g}")
     speed = re.fullmatch(r"(\S+) s, (\S+) (\w+) a step, (\S+) iterations a step; prepared in (\S+) s", lines[3])
     a_step = float(speed[2]) * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[speed[3]]
@@ -366,7 +366,9 @@ def energy_line(done: Done, line: str) -> None:
     kind, energy = done.kind, done.kind.energy(done.t, done.q, done.p)
     change = largest(energy - energy[0])
     if kind.drawn:
-        found = re.fullmatch(r"energy: (.*), it changed by (\S+) at most(?:; all but (\S+) of that is work .*)?", line)
+        found = re.fullmatch(
+            r"energy: (.*), it changed by (\S+) at most(?:; energy balance \|E - E0 - W\| (\S+) at most)?", line
+        )
         assert found[1] == kind.drawn
         assert same(found[2], change, ".3g")
         assert (found[3] is None) != kind.accounted
@@ -385,11 +387,13 @@ def test_every_line_of_the_text(done):
     for name in done.kind.maps:
         found = re.fullmatch(rf"relative error of {name}: (\S+) at most", rest.pop(0))
         assert float(found[1]) == pytest.approx(relative_map(done, name), abs=2e-15)
-    worst = re.fullmatch(r"worst step: relative error estimated at (\S+), from t = (\S+?)(: too long)?", rest.pop(0))
+    worst = re.fullmatch(
+        r"largest local error: (\S+) \(relative, estimated\), step from t = (\S+?)(: too large)?", rest.pop(0)
+    )
     assert worst[1] == f"{done.numbers['step_error']:.1e}"
     assert worst[2] == f"{done.numbers['worst_step_time']:g}"
     assert (worst[3] is not None) == (done.numbers["step_error"] > 1e-3)
-    assert rest.pop(0) == "final state (in the digits that a second run confirms)"
+    assert rest.pop(0) == "final state (in the digits confirmed by a second run)"
     for i, name in enumerate(done.kind.coordinates):
         found = re.fullmatch(rf" *{name} = +(\S+) +p_{name} = +(\S+) *", rest.pop(0))
         for text, x, known in ((found[1], done.q[-1, i], "q"), (found[2], done.p[-1, i], "p")):
@@ -447,7 +451,7 @@ def test_every_field_and_line_of_an_ensemble(springs):
     assert numbers.keys() <= checks.keys()
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
     lines = CliRunner().invoke(main, [*words, "grid.toml"]).stdout.splitlines()
-    assert lines[2] == f"6 trajectories of 90 steps of 0.125 from t = {T:g}; 31 states kept of each"
+    assert lines[2] == f"6 trajectories of 90 steps of 0.125 from t = {T:g}; 31 states saved of each"
     assert lines[4] == "6 ok"
     relative = np.abs(energy / energy[0] - 1.0)
     worst = np.unravel_index(np.argmax(relative), relative.shape)[1]
@@ -475,7 +479,7 @@ def test_every_field_and_line_of_a_recorded_run(springs):
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
     text = CliRunner().invoke(main, [*words, "-o", "again.run"]).stdout.splitlines()
     in_memory = CliRunner().invoke(main, list(words)).stdout.splitlines()
-    assert text[1] == f"90 steps (all) of 0.125 from t = {T:g} to t = {T + 11.25:g}; 31 states kept in 'again.run'"
+    assert text[1] == f"90 steps (all) of 0.125 from t = {T:g} to t = {T + 11.25:g}; 31 states saved in 'again.run'"
     assert text[3:5] == in_memory[4:6]
     finals = [float(x) for line in text for x in re.findall(r"= +(-?[\d.]{9,})", line)]
     expected = [memory["final"][letter][name] for name in ("x", "y") for letter in "qp"]
@@ -497,7 +501,7 @@ def test_every_number_of_advice(springs):
     assert 1e-8 < error < 1e-6
     assert float(re.search(r"expected error of (\S+)\.", advice["message"])[1]) > 0.3 * error
     lines = CliRunner().invoke(main, list(words)).stdout.splitlines()
-    pilots = [re.fullmatch(r"  h = (\S+) +(?:error (\S+)|no digit right|fails) .*", line) for line in lines[1:]]
+    pilots = [re.fullmatch(r"  h = (\S+) +(?:error (\S+)|no correct digit|fails) .*", line) for line in lines[1:]]
     rows = [(float(row[1]), row[2]) for row in pilots if row]
     assert len(rows) >= 3
     for h, said in rows:
@@ -569,11 +573,13 @@ def test_every_field_and_line_of_an_array_system(tmp_path, monkeypatch):
     assert {name: numbers[name] for name in numbers if not checks[name](numbers[name])} == {}
     lines = CliRunner().invoke(main, list(words)).stdout.splitlines()
     assert lines[0] == "ring: 6 coordinates, N = 6"
-    assert lines[2] == "60 steps of 0.25 from t = 0 to t = 15; 16 states kept"
+    assert lines[2] == "60 steps of 0.25 from t = 0 to t = 15; 16 states saved"
     speed = re.fullmatch(r"(\S+) s, .* a step and coordinate, (\S+) iterations a step; prepared in \S+ s", lines[3])
     assert speed[2] == f"{numbers['iterations'] / 60:.2f}"
     assert lines[4] == f"relative energy error: {off:.2e} at most"
     assert lines[5] == f"momentum of q: changed by {numbers['momentum_changes']['momentum of q']:.2e} at most"
-    assert lines[6].startswith(f"worst step: relative error estimated at {numbers['step_error']:.1e}, from t = ")
+    assert lines[6].startswith(
+        f"largest local error: {numbers['step_error']:.1e} (relative, estimated), step from t = "
+    )
     assert lines[8] == f"  q = {', '.join(f'{x:.9g}' for x in q[-1][:4])}, .."
     assert len(lines) == 9

@@ -54,7 +54,7 @@ def test_printed_equations_have_the_compiled_step_as_solution(model, method, q, 
     residuals = [each.subs({symbols[name]: x for name, x in known.items()}) for each in residuals]
     unknowns = [symbols[name] for name in numbers["unknowns"]]
     function = sympy.lambdify([unknowns], residuals)
-    guess = [value(numbers["first_guess"][name]) for name in numbers["unknowns"]]
+    guess = [value(numbers["initial_guess"][name]) for name in numbers["unknowns"]]
     assert np.abs(function(guess)).max() > 1e-6  # the guess is not the solution
     solution = fsolve(function, guess, xtol=1e-12)
     run = sc.compile_stepper(system, method).integrate(q, p, h=h, steps=1)

@@ -64,7 +64,7 @@ def test_run_by_steps_that_choose_their_length(ring: str) -> None:
     assert (found["h"], found["tolerance"], found["final"]["t"], found["failure"]) == (None, 1e-9, 7.0, None)
     assert found["step_error"] < 1e-9
     assert found["energy_error"] < 1e-7
-    assert "steps of their own lengths from t = 0 to t = 2;" in invoke("run", ring, "--tolerance", "1e-9").stdout
+    assert "steps of adaptive size from t = 0 to t = 2;" in invoke("run", ring, "--tolerance", "1e-9").stdout
     Path("own.toml").write_text(RING.replace("step = 0.1\nsteps = 20", "tolerance = 1e-9\nspan = 2.0"))
     for command in (("generate", "own.toml", "-o", "own_svi"), ("verify", "own.toml")):
         assert "give a step h (--step, [run] step)" in invoke(*command).output
@@ -75,7 +75,12 @@ def test_run(ring: str) -> None:
     """What is conserved and where it ends, in words, numbers and files, against normal modes."""
     result = invoke("run", ring, "-o", "ring.npz")
     assert result.exit_code == 0, result.output
-    for words in ("ring: 8 coordinates, N = 8", "relative energy error", "momentum of q: changed by", "worst step"):
+    for words in (
+        "ring: 8 coordinates, N = 8",
+        "relative energy error",
+        "momentum of q: changed by",
+        "largest local error",
+    ):
         assert words in result.stdout
     document = json.loads(invoke("run", ring, "--json").stdout)
     assert document["energy_error"] < 1e-14
@@ -103,16 +108,16 @@ def test_options(ring: str) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("run", "--advise", "1e-9"), "--advise is not for sums over indices"),
+        (("run", "--advise", "1e-9"), "--advise is not available for indexed models"),
         (("run", "--monitor", "frequency"), "monitor is not for sums over indices"),
         (("run", "-o", "ring.csv"), "saved as .npz"),
-        (("run", "--size", "N=1.5"), "is a whole number, not 1.5"),
+        (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),
         (("run", "--method", "scvi:4"), "no sweeps over positions"),
         (("run", "--solver", "explicit"), "is fixed-point or newton, not 'explicit'"),
         (("generate", "-o", "folder", "--method", "stoermer-verlet", *NEWTON), "leave out solver='newton'"),
-        (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not for sums over indices"),
-        (("derive", "--html", "page.html"), "--html is not for sums over indices"),
+        (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not available for indexed models"),
+        (("derive", "--html", "page.html"), "--html is not available for indexed models"),
     ],
 )
 def test_what_is_not_for_sums(ring: str, words: tuple[str, ...], message: str) -> None:

@@ -348,7 +348,7 @@ class TestCommand:
     def test_it_is_not_mixed_with_text(self, more, tmp_path):
         done = CliRunner().invoke(main, ["derive", "kepler", "--html", str(tmp_path / "page.html"), *more])
         assert done.exit_code == 2
-        assert "leave out --latex, --radicals and -o" in done.stderr
+        assert "--html excludes --latex, --radicals and -o" in done.stderr
         assert list(tmp_path.iterdir()) == []
 
     def test_a_folder_that_is_not_there_is_named(self):

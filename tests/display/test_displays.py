@@ -200,9 +200,9 @@ class TestSymmetry:
 class TestOutcomes:
     def test_a_certificate_shows_its_checks_and_what_is_broken(self):
         kept, broken = certificate()._repr_html_(), certificate(Outcome.BROKEN)._repr_html_()
-        assert "every promise measured is kept: 1 kept, 1 not measured" in kept
+        assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in kept
         assert "<strong>" not in kept
-        assert "<strong>BROKEN</strong>" in broken
+        assert "<strong>VIOLATED</strong>" in broken
         assert "it is &lt;4&gt;; from 4 steps" in kept
         assert kept.count("3.98") == kept.count("3.7<") == 1
 

@@ -136,7 +136,7 @@ def test_a_momentum_that_no_input_touches_stays_what_it_was():
 
 
 def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
-    with pytest.raises(ControlError, match=r"no optimal control was found: IPOPT says .* after") as raised:
+    with pytest.raises(ControlError, match=r"no optimal control was found: IPOPT ended with .* after") as raised:
         optimal_control(POINT, SVI(1), steps=4, duration=1.0, bounds={"u": (-0.1, 0.1)}, **REST)
     assert raised.value.motion.q.shape == (5, 1)
 
@@ -144,12 +144,12 @@ def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
 @pytest.mark.parametrize(
     ("changed", "error", "said"),
     [
-        ({"bounds": {"u": (1, -1)}}, StateError, "u has no number between 1 and -1"),
-        ({"bounds": {"u": (1, 2, 3)}}, StateError, "u is a number or two"),
-        ({"duration": (0.0, 1.0)}, StateError, "a duration is a positive number"),
+        ({"bounds": {"u": (1, -1)}}, StateError, "u: the lower bound 1 exceeds the upper bound -1"),
+        ({"bounds": {"u": (1, 2, 3)}}, StateError, "u must be a number, or two numbers"),
+        ({"duration": (0.0, 1.0)}, StateError, "duration must be a positive number"),
         ({"parameters": {"b": 1.0}}, StateError, "there is no parameter 'b'.* There are: a"),
         ({"guess": {"u_0": 1.0}}, StateError, "there is no coordinate or input 'u_0'"),
-        ({"guess": {"q": [0.0, np.nan]}}, StateError, "the guess of q is a finite number, or a list"),
+        ({"guess": {"q": [0.0, np.nan]}}, StateError, "the guess of q must be a finite number, or a list"),
         ({"degree": 2}, MethodError, "take degree 1 at most"),
         ({"method": RadauIIA(2)}, MethodError, "no quadrature"),
         ({"system": problem("kepler").system}, MethodError, "'Kepler problem' has no inputs"),
@@ -233,5 +233,5 @@ def test_a_constraint_that_an_input_moves_is_refused():
         forces={"y": "w"},
         inputs=["u", "w"],
     )
-    with pytest.raises(MethodError, match="a constraint has an input in it, and would jump"):
+    with pytest.raises(MethodError, match="a constraint depends on an input and would jump"):
         optimal_control(led, SVI(1, "gauss-lobatto:2"), steps=3, duration=1.0, start={}, end={})

@@ -98,7 +98,7 @@ def test_what_is_not_attraction_is_refused_by_name(simulation, oddity):
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "fput-chain", "henon-heiles", "driven-duffing"])
 def test_systems_that_are_not_of_bodies_are_refused(sample, name):
     system = sample(name).system
-    with pytest.raises(SystemDefinitionError, match="is not of bodies"):
+    with pytest.raises(SystemDefinitionError, match="is not a system of bodies"):
         sc.to_rebound(system, [0.0] * system.dimension, velocity=[0.0] * system.dimension)
 
 

@@ -117,7 +117,7 @@ def test_many_motions_have_shapes_that_fit():
 
 def test_what_there_is_not_is_refused():
     flow, q, p = torch_flow(kepler(), steps=5), numbers([0.5, 0.0]), numbers([0.0, 1.6])
-    with pytest.raises(MethodError, match="no second derivatives forward of forward"):
+    with pytest.raises(MethodError, match="no forward-over-forward second derivatives"):
         torch.func.jacfwd(torch.func.jacfwd(lambda q: flow(q, p, h=0.05)[0].sum()))(q)
     with pytest.raises(StateError, match=r"give torch\.float64"):
         flow(q.float(), p, h=0.05)

@@ -378,7 +378,7 @@ class TestPlatforms:
             generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("aarch64-windows",))
         words = ["generate", "kepler", "--platform", "x86_64-windows", "-o", str(tmp_path / "kepler")]
         refused = CliRunner().invoke(main, words)
-        assert (refused.exit_code, "--platform is for --fmu" in refused.output) == (2, True)
+        assert (refused.exit_code, "--platform requires --fmu" in refused.output) == (2, True)
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.full

@@ -132,8 +132,8 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
         invoke("--resume k.run --span 60"),
     )
     assert [done.exit_code for done in (plain, half, rest)] == [0, 0, 0], plain.output + half.output + rest.output
-    assert "of their own lengths" in plain.output
-    assert "worst step" in plain.output
+    assert "of adaptive size" in plain.output
+    assert "largest local error" in plain.output
     assert f"to t = {END:g}" in rest.output
     with np.load("k.npz") as file:
         run = kepler.integrate(file["q"][0], file["p"][0], t_end=END, tolerance=TOLERANCE)
@@ -150,5 +150,5 @@ def test_a_run_that_outgrows_the_memory_is_ended_with_advice(monkeypatch):
     monkeypatch.setattr(memory, "usable_memory", lambda: 8000.0)
     done = invoke("k.toml")
     assert done.exit_code != 0
-    assert "keep fewer (--save-every" in done.output
+    assert "save fewer (--save-every" in done.output
     assert "-o NAME.run" in done.output

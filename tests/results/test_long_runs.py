@@ -225,7 +225,7 @@ class TestCommandLine:
 
     def test_a_run_into_a_folder_and_further_and_out(self):
         text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --save-every 10 -o a.run")
-        assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states kept in 'a.run'" in text
+        assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states saved in 'a.run'" in text
         assert "relative energy error" in text
         assert "wrote a.run" in text
         assert "holds a run already" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
@@ -233,7 +233,7 @@ class TestCommandLine:
         assert "2000 steps (all)" in text
         self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --save-every 10 -o whole/")
         assert digests("a.run") == digests("whole")
-        assert "201 states kept in 'a.run'" in self.invoke("export a.run")
+        assert "201 states saved in 'a.run'" in self.invoke("export a.run")
         assert "wrote a.csv" in self.invoke("export a.run -o a.csv")
         assert len(Path("a.csv").read_text().splitlines()) == 202
 
@@ -242,10 +242,10 @@ class TestCommandLine:
         [
             ("run", "Missing argument 'MODEL', or --resume FOLDER", 2),
             ("run --resume none.run", "'none.run' holds no recorded run", 1),
-            ("run kepler --resume none.run", "MODEL does not go with --resume", 2),
-            ("run --resume none.run --step 0.1", "--step does not go with --resume", 2),
-            ("run kepler -o a.run --plot a.png", "--plot is for a trajectory in memory", 2),
-            ("run kepler -o a.npz --checkpoint 3", "--checkpoint is for a run that is written into a folder", 2),
+            ("run kepler --resume none.run", "MODEL is not allowed with --resume", 2),
+            ("run --resume none.run --step 0.1", "--step is not allowed with --resume", 2),
+            ("run kepler -o a.run --plot a.png", "--plot is not available for a run recorded in a folder", 2),
+            ("run kepler -o a.npz --checkpoint 3", "--checkpoint requires a run recorded in a folder", 2),
             ("run kepler -o a.run --certificate none.json", "the certificate 'none.json' cannot be read", 2),
             ("run kepler -o no/a.run", "'no/a.run' cannot be written", 1),
             ("export none.run", "holds no recorded run", 1),
@@ -266,5 +266,5 @@ class TestCommandLine:
             process.send_signal(signal.SIGINT)
             stdout, stderr = process.communicate(timeout=600)
         assert process.returncode == 130
-        assert "go on with: scvi-codegen run --resume a.run" in stderr
+        assert "continue with: scvi-codegen run --resume a.run" in stderr
         assert f"{load_run('a.run').steps} steps (of 1000000000000)" in stdout

@@ -454,7 +454,7 @@ class TestCommandLine:
             f"kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
         )
         assert result.exit_code == 0, result.output
-        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states kept of each" in result.stdout
+        assert "6 trajectories of 50 steps of 0.1 from t = 0; 6 states saved of each" in result.stdout
         assert "\n6 ok\n" in result.stdout
         assert float(re.search(r"relative energy error: (\S+) at most, of trajectory \d", result.stdout)[1]) < 1e-3  # type: ignore[index]
         assert f"wrote runs.{suffix}" in result.stdout
@@ -484,13 +484,13 @@ class TestCommandLine:
         ("words", "message"),
         [
             ("kepler --ensemble none.toml", "none.toml cannot be read"),
-            ("kepler --ensemble grid.toml --plot a.png", "--plot is for one trajectory"),
-            ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is for one trajectory"),
+            ("kepler --ensemble grid.toml --plot a.png", "--plot is not available with --ensemble"),
+            ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is not available with --ensemble"),
             ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
             ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
-                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: keep fewer (--save-every ",
+                "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: save fewer (--save-every ",
             ),
         ],
     )
@@ -510,7 +510,7 @@ class TestCommandLine:
         )
         assert result.exit_code == 130
         assert "0 ok, 6 interrupted" in result.stdout
-        assert "the states computed were kept: runs.npz" in result.stderr
+        assert "the computed states were written: runs.npz" in result.stderr
         with np.load("runs.npz") as file:
             assert set(file["status"]) == {"interrupted"}
             assert file["steps"].max() > 0

@@ -145,7 +145,7 @@ def test_the_command_line_runs_a_grid(tmp_path, monkeypatch):
     Path("grid.toml").write_text("[grid]\nq1 = [0.5, 0.7]\nmu = [1.0, 1.1]\n")
     done = CliRunner().invoke(main, ["run", "k.toml", "--ensemble", "grid.toml", "-o", "grid.npz"])
     assert done.exit_code == 0, done.output
-    assert "steps of their own lengths from t = 0 to t = 9" in done.output
+    assert "adaptive steps from t = 0 to t = 9" in done.output
     assert "4 ok" in done.output
     with np.load("grid.npz") as file:
         assert (np.nanmax(file["times"], axis=0) == 9.0).all()

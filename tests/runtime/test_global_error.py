@@ -483,7 +483,7 @@ class TestSolveMotion:
             motion = sc.solve_motion(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
         assert not motion.success
         assert motion.status == -2
-        assert "is confirmed until t = " in motion.message
+        assert "is confirmed only until t = " in motion.message
 
     def test_beside_another_choice_of_steps(self, kepler_stepper):
         with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
@@ -512,7 +512,7 @@ class TestCommandLine:
     def test_what_is_not_confirmed_ends_with_1(self):
         result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
         assert result.exit_code == 1
-        assert re.search(r"the global error 1e-09 is confirmed until t = [\d.]+ only", result.output)
+        assert re.search(r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+", result.output)
 
     @pytest.mark.parametrize("where", ["file", "option", "folder"])
     def test_the_run_is_the_confirmed_one_bit_by_bit(self, tmp_path, where):
@@ -535,7 +535,7 @@ class TestCommandLine:
         words = ["run", "double-pendulum", "--span", "40", "--error", "1e-9", "-o", str(tmp_path / "d.run")]
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 1
-        assert "the global error 1e-09 is confirmed until t = " in result.output
+        assert "the bound 1e-09 on the global error is confirmed only until t = " in result.output
         assert sc.load_run(tmp_path / "d.run").t[-1] == 40.0
 
     ARRAYS = (
@@ -559,7 +559,7 @@ class TestCommandLine:
         path.write_text(self.ARRAYS.format(span=200.0, q=[2.5, -1.0, 1.0]))
         result = CliRunner().invoke(main, ["run", str(path)])
         assert result.exit_code == 1
-        assert "the global error 1e-08 is confirmed until t = " in result.output
+        assert "the bound 1e-08 on the global error is confirmed only until t = " in result.output
 
     @pytest.mark.parametrize(
         ("run", "words", "message"),

@@ -16,9 +16,12 @@ from scvi_codegen.verification.pace import Pace, of_one_pace, pace_checks
 from scvi_codegen.verification.subject import State, Subject
 
 PACES = {
-    "transformed": (case("slowed/svi-3"), {"steps of tau", "time", "end", "time back"}),
-    "controlled": (CONTROLLED, {"lengths", "tolerance", "angular momentum at any pace"}),
-    "reversible": (REVERSIBLE, {"lengths", "pace", "way back", "angular momentum at any pace"}),
+    "transformed": (case("slowed/svi-3"), {"steps of tau", "time", "final time", "reversal in tau"}),
+    "controlled": (CONTROLLED, {"adaptive steps", "local error", "angular momentum, adaptive steps"}),
+    "reversible": (
+        REVERSIBLE,
+        {"adaptive steps", "step density", "reversal of adaptive steps", "angular momentum, adaptive steps"},
+    ),
 }
 
 

@@ -14,12 +14,12 @@ __all__ = ["bench"]
 
 @click.command()
 @click.argument("sections", nargs=-1, metavar="[SECTION ...]")
-@click.option("--peers", metavar="NAME,..", help="Only these of heyoka, rebound, cyrk, jitcode, scipy; none: ''.")
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="All measurements as JSON, into a file.")
+@click.option("--peers", metavar="NAME,..", help="Peers: some of heyoka, rebound, cyrk, jitcode, scipy; '' for none.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write all measurements as JSON.")
 @click.option("--plot", type=click.Path(), metavar="FILE", help="Work-precision plot, .png or .svg.")
 @click.option("--repeats", type=int, default=5, show_default=True, help="Timed rounds.")
-@click.option("--resume", is_flag=True, help="Keep what FILE of -o has, and add to it.")
-@click.option("--quick", is_flag=True, help="Short spans and few settings, to see that everything works.")
+@click.option("--resume", is_flag=True, help="Keep the sections of FILE (-o), add others.")
+@click.option("--quick", is_flag=True, help="Smoke test: short spans and few settings.")
 @reporting
 def bench(
     sections: tuple[str, ...],
@@ -30,22 +30,33 @@ def bench(
     resume: bool,
     quick: bool,
 ) -> None:
-    """Time this project and the installed peers in turn, and compare them at equal error.
+    """Compare this package with other installed integrators at equal error.
 
-    SECTION is a problem (planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system,
-    double-pendulum, relativistic-particle, fput-chain:8, :64, :256), one with friction and a drive (forced:duffing,
-    :cart-pole, :double-pendulum, :chain:5), rods as constraints beside their angles (constrained:pendulum,
-    :double-pendulum, :chain:5, :chain:20), 64 trajectories of one at once
-    (ensemble:planar-pendulum, ensemble:kepler:0.2, ensemble:outer-solar-system), adaptive (steps that choose their
-    length, beside fixed steps, transformed time, heyoka and IAS15: adaptive:kepler:0.9, ..), drift (the energy over ten
-    million steps), tables (6 and 7 of the paper), compositions (explicit ones), hand-written (C), start-up, compile
-    (larger systems, from text to first step), mechanisms (of SymPy, beside lambdify and PyDy), held (bodies held by
-    rods, beside MuJoCo), samples (of controllers), sums (over indices: lattices, fields, many bodies), growth (with
-    their number of coordinates), threads (that share their steps), energies (theirs, over a hundred thousand steps),
-    cluster (a thousand bodies beside REBOUND) or builds (other compilers and processors); by default all; kepler is
-    both of its kind.
-    Install the peers with 'scvi-codegen[bench]'. Sections are printed, and written to the JSON, as they are measured;
-    Ctrl-C ends it with these, and with --resume it goes on from there.
+    SECTION is one of the following; the default is all, and a prefix (kepler) selects all sections that begin with it.
+
+    \b
+      planar-pendulum, duffing, kepler:0.2, kepler:0.5, henon-heiles, outer-solar-system, double-pendulum,
+      relativistic-particle, fput-chain:8, fput-chain:64, fput-chain:256    single trajectories
+      forced:duffing, :cart-pole, :double-pendulum, :chain:5                friction and driving forces
+      constrained:pendulum, :double-pendulum, :chain:5, :chain:20           constraints; peers in angles
+      ensemble:planar-pendulum, :kepler:0.2, :outer-solar-system            64 trajectories at once
+      adaptive:kepler:0.9, ..   adaptive and fixed step size, time transformation; heyoka and IAS15
+      drift                     energy over ten million steps
+      tables                    Tables 6 and 7 of the paper
+      compositions              explicit composition methods
+      hand-written              hand-written C
+      start-up, compile         time from text to the first step; for larger systems
+      mechanisms                SymPy mechanisms; lambdify and PyDy
+      held                      constrained bodies; MuJoCo
+      samples                   cost of a control step
+      sums, growth              indexed systems (lattices, fields, bodies); scaling with size
+      threads                   steps with several threads
+      energies                  energy of indexed systems over 100,000 steps
+      cluster                   a thousand bodies; REBOUND
+      builds                    compilers and processors
+
+    Install the peers with 'scvi-codegen[bench]'. Each section is printed, and written to the JSON file, when it is
+    complete; after Ctrl-C, --resume continues.
 
     \b
     Examples:
@@ -53,7 +64,7 @@ def bench(
       scvi-codegen bench drift hand-written -o measured.json
     """
     if resume and output is None:
-        raise click.UsageError("--resume goes on from the FILE of -o: give it")
+        raise click.UsageError("--resume requires -o FILE, the report to continue")
     for path, hint in ((output, "'-o'"), (plot, "'--plot'")):
         if path is not None:
             check_writable(Path(path), hint)
@@ -62,4 +73,6 @@ def bench(
     report = benchmark(sections, plan, json_path=output, plot_path=plot, resume=resume, say=note, show=tell)
     tell(**report.data())
     if report.interrupted:
-        raise CommandFailure(f"interrupted in '{report.interrupted}'; what was measured before is above", INTERRUPTED)
+        raise CommandFailure(
+            f"interrupted in section '{report.interrupted}'; the results before are printed above", INTERRUPTED
+        )

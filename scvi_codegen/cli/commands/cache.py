@@ -16,10 +16,10 @@ __all__ = ["cache"]
 @click.argument("action", type=click.Choice(["info", "clear", "path"]), default="info")
 @reporting
 def cache(action: str) -> None:
-    """Show what is in the cache of compiled integrators (info), empty it (clear), or print where it is (path).
+    """Show the cache of compiled integrators (info), empty it (clear), or print its folder (path).
 
-    SCVI_CODEGEN_CACHE names another folder. When the entries are larger than SCVI_CODEGEN_CACHE_SIZE (as in 500M or 2G;
-    1G if it is not set; 0 for no limit), those used least recently are removed.
+    SCVI_CODEGEN_CACHE sets another folder. If the entries exceed SCVI_CODEGEN_CACHE_SIZE (as in 500M or 2G; default 1G;
+    0: no limit), the least recently used ones are removed.
 
     \b
     Example:

@@ -22,19 +22,19 @@ __all__ = ["derive"]
 @click.command()
 @model_arguments
 @click.option("--latex", is_flag=True, help="LaTeX instead of text.")
-@click.option("--radicals", is_flag=True, help="Table entries as rationals and radicals where they are short.")
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write here instead of to the screen.")
+@click.option("--radicals", is_flag=True, help="Print table entries as short rationals and radicals.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write to FILE instead of stdout.")
 @click.option(
-    "--html", type=click.Path(), metavar="FILE", help="Write a page: everything from L to the C, side by side."
+    "--html", type=click.Path(), metavar="FILE", help="Write an HTML page with the derivation from L to the C code."
 )
 @reporting
 def derive(model_name: str, latex: bool, radicals: bool, output: str | None, html: str | None, **choices: Any) -> None:
     """Print the equations of one step of MODEL: unknowns, stage equations, end state.
 
-    With --html everything between the Lagrangian and the C goes to a page that needs no network: equations of motion,
-    trial curve, tables, equations with the paper's numbers, Jacobian, operation counts, C beside its formulas.
+    --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
+    with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
 
-    Of a model of sums over indices: each kind of term with its derivatives by the entries in it, masses, and the step.
+    For an indexed model: each term group with its derivatives with respect to its entries, masses, and the step.
 
     \b
     Examples:
@@ -43,7 +43,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     """
     if html is not None:
         if latex or radicals or output is not None:
-            raise click.UsageError("--html writes a page of its own: leave out --latex, --radicals and -o")
+            raise click.UsageError("--html excludes --latex, --radicals and -o")
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, Choices(**choices))
     about = {"system": model.system.name, "method": model.method.name}
@@ -71,7 +71,7 @@ def _formulas(of: StepEquations) -> dict[str, Any]:
             "q": [str(each.residual) for each in of.end_position],
             "p": [str(each.residual) for each in of.end_momentum],
         },
-        "first_guess": {symbol.name: str(value) for symbol, value in of.initial_guess.items()},
+        "initial_guess": {symbol.name: str(value) for symbol, value in of.initial_guess.items()},
         "entries": {entry.symbol.name: float(entry.value) for entry in of.entries},
         "conserved": [str(symmetry) for symmetry in of.symmetries],
     }

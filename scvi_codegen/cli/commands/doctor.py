@@ -17,10 +17,10 @@ STATUS_WIDTH, NAME_WIDTH = 5, 17
 @click.command()
 @reporting
 def doctor() -> None:
-    """Say what this machine has and lacks for compiled integrators, and what to install.
+    """Check that integrators can be compiled and run on this machine, and report what to install.
 
-    A small integrator is compiled in a temporary folder and run. Exit status 1 if that fails; what is merely lacking
-    the rest does without.
+    A small integrator is compiled in a temporary folder and run. Exit status 1 if that fails; other missing items are
+    optional.
 
     \b
     Examples:
@@ -34,7 +34,7 @@ def doctor() -> None:
     failing = [finding.name for finding in findings if finding.status == FAILS]
     tell(ok=not failing, findings=[asdict(finding) for finding in findings])
     if failing:
-        raise CommandFailure(f"integrators cannot be compiled and run here: {', '.join(failing)}", FAILURE)
+        raise CommandFailure(f"integrators cannot be compiled and run on this machine: {', '.join(failing)}", FAILURE)
 
 
 def _lines(finding: Equipment) -> str:

@@ -19,10 +19,10 @@ __all__ = ["export"]
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Trajectory: .npz, .csv, .h5 (HDF5) or .zarr.")
 @reporting
 def export(folder: str, output: str | None) -> None:
-    """Write the states of the run in FOLDER to one file, or say what is in it.
+    """Write the states of the run in FOLDER to one file, or print its progress.
 
-    The run may be under way: what is in the folder is written. Memory does not depend on its length. HDF5 and Zarr need
-    'scvi-codegen[data]'; xarray.open_dataset and xarray.open_zarr read them.
+    The run may be in progress: the states recorded so far are written. Memory use does not depend on its length. HDF5
+    and Zarr need 'scvi-codegen[data]'; xarray.open_dataset and xarray.open_zarr read them.
 
     \b
     Example:

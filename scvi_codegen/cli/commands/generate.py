@@ -30,20 +30,20 @@ __all__ = ["generate"]
     help="Folder, or NAME.fmu; the name is the C prefix.",
 )
 @SOLVER_OPTION
-@click.option("--force", is_flag=True, help="Overwrite files of the same names that were edited or are not ours.")
+@click.option("--force", is_flag=True, help="Overwrite existing files that were edited or not generated.")
 @click.option(
     "--embedded",
     type=click.Choice(["double", "single"]),
     help="C for a microcontroller, in this precision, without a Python package.",
 )
-@click.option("--single-file", is_flag=True, help="One C file without support headers beside it, as for --embedded.")
-@click.option("--fmu", is_flag=True, help="An FMU 3.0 for co-simulation in the place of a folder: -o NAME.fmu.")
+@click.option("--single-file", is_flag=True, help="One C file that includes the support headers.")
+@click.option("--fmu", is_flag=True, help="Write an FMU 3.0 for co-simulation: -o NAME.fmu.")
 @click.option(
     "--platform",
     "platforms",
     type=click.Choice([*TARGETS]),
     multiple=True,
-    help="Of an FMU: a machine that it has a library for besides this one, repeatable (extra 'compiler').",
+    help="With --fmu: further platform to compile for; may be repeated (extra 'compiler').",
 )
 @reporting
 def generate(
@@ -57,15 +57,15 @@ def generate(
     platforms: tuple[str, ...],
     **choices: Any,
 ) -> None:
-    """Write MODEL as C with an example and a Makefile, in a folder that is also a Python package.
+    """Generate C code for MODEL, with an example and a Makefile, in a folder that is also a Python package.
 
-    With --embedded the C is small: Newton's iteration alone, or an explicit method, iterations bounded by a macro.
+    With --embedded the C code is small: Newton's method alone, or an explicit method; a macro bounds the iterations.
 
-    Of a model of sums over indices the folder has C for any number of coordinates, and the initial state as text beside
-    it; no Python package.
+    For an indexed model the folder has C code for any array sizes and the initial state as a text file, but no Python
+    package.
 
-    With --fmu the output is one file, which Modelica tools, Simulink and FMPy import: the compiled library, the C, and
-    what describes its variables.
+    With --fmu the output is one file for Modelica tools, Simulink and FMPy: the compiled library, the C code, and the
+    description of its variables.
 
     \b
     Example:
@@ -77,7 +77,7 @@ def generate(
     if fmu and (embedded or single_file):
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:
-        raise click.UsageError("--platform is for --fmu: the C of a folder is for any machine")
+        raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
     if isinstance(model, IndexedModel):
         refuse({"embedded": embedded, "single_file": single_file, "fmu": fmu})
         folder, python = generate_sums(solved_by(solver, model), output, force=force), ""

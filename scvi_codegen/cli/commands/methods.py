@@ -34,9 +34,9 @@ LONGEST_EXACT = 32
 @click.option("--tableau", metavar="NAME:S", help="Print a Butcher tableau instead, as in gauss:3.")
 @reporting
 def methods(tableau: str | None) -> None:
-    """List the methods with their arguments, and order, symplecticity and symmetry of an example of each.
+    """List the methods with their arguments, and order, symplecticity and symmetry of an example.
 
-    A degree, number of stages or order may follow the name: --method svi:6 is --method svi --degree 6.
+    A name may include the degree, number of stages or order: --method svi:6 is --method svi --degree 6.
     """
     if tableau is None:
         entries = [entry for name in METHODS for entry in _entries_of(name)]

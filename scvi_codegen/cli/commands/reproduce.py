@@ -30,21 +30,21 @@ SHOWN_NAMES = 40
 @click.command()
 @click.argument("names", nargs=-1, metavar="[WHAT ...]")
 @click.option(
-    "-o", "--output", default="reproduced", show_default=True, type=click.Path(), metavar="DIR", help="Folder of files."
+    "-o", "--output", default="reproduced", show_default=True, type=click.Path(), metavar="DIR", help="Output folder."
 )
-@click.option("--html", type=click.Path(), metavar="FILE", help="All results on one page that needs no network.")
-@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Experiments at a time [as many as processors].")
-@click.option("--list", "listing", is_flag=True, help="Print the names, and run nothing.")
+@click.option("--html", type=click.Path(), metavar="FILE", help="Write all results as one self-contained page.")
+@click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Parallel processes [number of processors].")
+@click.option("--list", "listing", is_flag=True, help="List the experiments without running them.")
 @reporting
 def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int | None, listing: bool) -> None:
-    """Run figures, tables and claims of the paper again, and judge them by what is measured (needs matplotlib).
+    """Reproduce figures, tables and claims of the paper, with verdicts from measurements (needs matplotlib).
 
-    WHAT is 'all' or names of experiments ('--list' prints them); what they need is run too. Each result is written to
-    the folder when it is there: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers, and
-    NAME.html where there are formulas.
+    WHAT is 'all' or names of experiments ('--list' prints them); their dependencies are run, too. Each result is
+    written when it is complete: NAME.txt with the verdicts, NAME.svg and NAME.png, NAME.csv with all numbers, and
+    NAME.html if there are formulas.
 
-    That a claim of the paper does not hold is a finding, not a failure: the exit status is 0 when everything ran, 1 if
-    an experiment failed to run, 130 after Ctrl-C, which leaves what was written.
+    Exit status: 0 if all experiments ran, whatever their verdicts; 1 if an experiment failed to run; 130 after Ctrl-C
+    (files written before remain).
 
     \b
     Examples:
@@ -57,7 +57,7 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
         tell(experiments_table(titles), experiments=titles)
         return
     if not names:
-        raise click.UsageError("say what to reproduce: 'all', or names that 'scvi-codegen reproduce --list' prints")
+        raise click.UsageError("give 'all' or names of experiments (see 'scvi-codegen reproduce --list')")
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise click.BadParameter(f"'{folder}' is not a folder", param_hint="'-o'")
@@ -66,7 +66,7 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
     done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs, say=tell)
     tell(f"\n{done.summary()}" if done.files else "", **done.numbers())
     if done.interrupted:
-        raise CommandFailure("interrupted; what was written before is kept", INTERRUPTED)
+        raise CommandFailure("interrupted; files written before remain", INTERRUPTED)
     if done.failures:
         raise CommandFailure(done.failed(), FAILURE)
 

@@ -30,30 +30,28 @@ __all__ = ["run"]
 
 
 ABOUT = """\
-Integrate MODEL and print what was conserved and where it ended.
+Integrate MODEL; report conserved quantities and the final state.
 
-A step that fails, or Ctrl-C, ends the run early: what was computed so far is summed up, and written to the files
-asked for.
+If a step fails, or after Ctrl-C, the states computed so far are summarised and written to the output files.
 
-With --tolerance each step has the length that its error allows. With --advise one step for all is chosen by short
-pilot runs, for the error wanted at the end; advice and evidence are printed, and a run that belies them ends with
-exit status 1.
+Step size: fixed with --step; adaptive with --tolerance, the relative local error. --error bounds the global error of
+the whole run: the local tolerance is reduced until runs with other step sizes confirm the bound; if they confirm it
+only in part, the exit status is 1 and the time until which they do is printed. --advise chooses one fixed step size
+for an error at the end, by short pilot runs; the recommendation is printed, and if the run does not meet it, the exit
+status is 1.
 
-With --error the global error of the whole run is bounded: the tolerance of the steps is chosen until runs with
-other steps confirm it. A run that they confirm in part ends with exit status 1 and the time until which they do.
+--monitor makes the step constant in a transformed time tau, dt = G dtau (smaller steps where the motion is fast); the
+map remains symplectic. --step is then the step of tau; without it one is chosen for --tolerance or round-off. --span
+and all times are of t. For systems with explicit time or forces use --controller reversible, a time-reversible
+step-size controller.
 
-With --monitor steps are of one length in a time tau that runs the slower the faster the motion is; the map stays
-symplectic. --step is of tau; without it one is chosen, as accurate as doubles allow or as --tolerance says. --span
-and all times are of t. Where the system depends on time or forces act, --controller reversible takes steps of tau
-that are the same backward.
+An indexed model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its trajectory is an .npz
+file, its plot an image over index and time.
 
-A model of sums over indices (coordinates that are arrays, q[N]) takes sizes from its arrays, [sizes] or --size; its
-trajectory is an .npz file, its picture one of places and time.
+A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
+--input: a table with columns t and value. Steps end at breakpoints of the inputs.
 
-A system with inputs, functions of time that are data, takes their values from the section [inputs] of its file or
-from --input: a table with columns t and value. Steps end where a piece of an input does.
-
-With --ensemble MODEL is run from many initial states. A grid has one section, every combination is run:
+With --ensemble MODEL is run from many initial states. A grid has one section; every combination is run:
 
 \b
   [grid]
@@ -62,12 +60,12 @@ With --ensemble MODEL is run from many initial states. A grid has one section, e
   mu = 2.0
 
 A table is a CSV file with the names in its first line. Names are those of coordinates, velocities (q1_dot) or
-momenta (p_q1), and parameters; MODEL gives the others. An .npz file has arrays q and p of shape (states,
-trajectories, coordinates); a .csv file has a line a state.
+momenta (p_q1), and parameters; the others are as in MODEL. An .npz file has arrays q and p of shape (states,
+trajectories, coordinates); a .csv file has one line per state.
 
-Into a folder (-o long.run) the states are written as they are computed, with all that the run needs to go on. It
-may be killed at any time; --resume continues it bit for bit, with --steps or --span further than it was meant to
-go. The memory in use does not grow. 'scvi-codegen export' makes one file of it.
+Checkpoint and restart: with a folder as output (-o long.run) states and checkpoints are written during the run, in
+constant memory. It may be killed at any time; --resume continues it bit for bit, optionally beyond its original end
+(--steps, --span). 'scvi-codegen export' writes its states to one file.
 
 \b
 Examples:
@@ -92,16 +90,16 @@ Examples:
     metavar="PATH",
     help="Trajectory: .npz, .csv, .h5 or .zarr; or a folder, NAME.run or NAME/, for a run of any length.",
 )
-@click.option("--resume", type=click.Path(), metavar="FOLDER", help="Go on with the run in a folder, without MODEL.")
+@click.option("--resume", type=click.Path(), metavar="FOLDER", help="Continue the run in a folder (without MODEL).")
 @click.option(
     "--checkpoint",
     type=float,
     metavar="SECONDS",
-    help="Into a folder what is computed is written at least so often [10].",
+    help="Longest time between checkpoints of a run in a folder [10].",
 )
-@click.option("--checkpoint-steps", type=int, metavar="N", help="And every so many steps.")
-@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to keep in the folder.")
-@click.option("--plot", type=click.Path(), metavar="FILE", help="Picture, .png or .svg (needs matplotlib).")
+@click.option("--checkpoint-steps", type=int, metavar="N", help="Most steps between checkpoints.")
+@click.option("--certificate", type=click.Path(), metavar="FILE", help="JSON file to store in the folder.")
+@click.option("--plot", type=click.Path(), metavar="FILE", help="Plot, .png or .svg (needs matplotlib).")
 @click.option(
     "--ensemble", type=click.Path(), metavar="FILE", help="Many initial states: a grid (.toml) or a table (.csv)."
 )
@@ -109,27 +107,30 @@ Examples:
     "--tolerance",
     type=float,
     metavar="X",
-    help="Steps choose their length: the relative error allowed to the end of each (1e-16: round-off). With --monitor "
-    "one step of tau is chosen for it.",
+    help="Adaptive step size with this relative local error (1e-16: round-off). With --monitor: a fixed step of tau is "
+    "chosen for it.",
 )
 @click.option(
     "--error",
     type=float,
     metavar="X",
-    help="Bound of the relative global error of all states, by adaptive steps and confirmed by runs of other steps.",
+    help="Adaptive step size with this bound on the relative global error, confirmed by runs with other step sizes.",
 )
 @click.option(
     "--advise",
     type=float,
     metavar="X",
-    help="Choose one step for all, for this error of the positions at the end, relative to their size.",
+    help="Choose a fixed step size for this relative error of the positions at the end.",
 )
 @SOLVER_OPTION
 @click.option(
-    "--solver-tolerance", type=float, metavar="X", help="Relative size of the last update of the stages [round-off]."
+    "--solver-tolerance",
+    type=float,
+    metavar="X",
+    help="Convergence criterion: relative update of the stages [round-off].",
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
-@click.option("--threads", type=int, metavar="N", help="That share each step of a model of sums over indices [1].")
+@click.option("--threads", type=int, metavar="N", help="Worker threads per step of an indexed model [1].")
 @reporting
 def run(
     model_name: str | None,
@@ -173,7 +174,7 @@ def run(
         _check_confirmed(confirmed)
         return
     if threads is not None:
-        raise click.UsageError("--threads are for models of sums over indices")
+        raise click.UsageError("--threads requires an indexed model (array coordinates)")
     if model.system.inputs:
         _check_driven(advise, recorded=recorded)
     if ensemble is not None:
@@ -190,7 +191,9 @@ def run(
 def _check_confirmed(found: GlobalError | None) -> None:
     """End with exit status 1 if a global error bound was requested and is not confirmed."""
     if found is not None and not found.confirmed:
-        unconfirmed = f"the global error {found.requested:g} is confirmed until t = {found.confirmed_until:g} only"
+        unconfirmed = (
+            f"the bound {found.requested:g} on the global error is confirmed only until t = {found.confirmed_until:g}"
+        )
         tell(broken=unconfirmed)
         raise CommandFailure(unconfirmed, FAILURE)
 
@@ -241,23 +244,25 @@ def _check_combination(
     folder: str | None,
 ) -> None:
     if folder is not None and plot is not None:
-        raise click.UsageError("--plot is for a trajectory in memory, not for a run in a folder")
+        raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
     given = [name for name, value in wanted.items() if value is not None]
     if len(given) > 1:
-        raise click.UsageError(f"--{given[0]} and --{given[1]} exclude each other: each chooses the steps; give one")
+        raise click.UsageError(
+            f"--{given[0]} and --{given[1]} exclude each other: each determines the step size; give one"
+        )
     for name in ("step", "steps") if given else ():
         if choices[name] is not None:
-            raise click.UsageError(f"--{given[0]} chooses the step: leave out --{name} (--span is the length)")
+            raise click.UsageError(f"--{given[0]} determines the step size: omit --{name} (--span is the duration)")
     for name, value in (("plot", plot), *wanted.items()):
         if ensemble is not None and value is not None:
-            raise click.UsageError(f"--{name} is for one trajectory, not for --ensemble")
+            raise click.UsageError(f"--{name} is not available with --ensemble")
 
 
 def _check_driven(advise: float | None, *, recorded: bool) -> None:
     if advise is not None:
-        raise click.UsageError("--advise finds steps for motions without inputs: give --tolerance in its place")
+        raise click.UsageError("--advise is not available for systems with inputs: use --tolerance")
     if recorded:
-        raise click.UsageError("a run with inputs is kept in memory and written to a file (-o NAME.npz), no folder")
+        raise click.UsageError("a run with inputs cannot be recorded in a folder: write it to a file (-o NAME.npz)")
 
 
 def _run_one(
@@ -302,17 +307,17 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
     if model.error is not None:
-        raise click.UsageError(
-            f"[run] error = {model.error:g} is for one trajectory, not for --ensemble: set tolerance in its place"
-        )
+        raise click.UsageError(f"[run] error = {model.error:g} is not available with --ensemble: set tolerance instead")
     if model.paced:
-        raise click.UsageError("with a monitor every trajectory has its own times: --ensemble does not go with it")
+        raise click.UsageError(
+            "--ensemble is not available with a time transformation: each trajectory has its own times"
+        )
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
-    kept = "the states computed were not written to a file (-o)"
+    kept = "the computed states were not written to a file (-o)"
     if output is not None:
         outcome.result.save(output)
-        kept = f"the states computed were kept: {output}"
+        kept = f"the computed states were written: {output}"
     if outcome.interrupted:
         raise CommandFailure(
             f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{kept}", INTERRUPTED
@@ -333,5 +338,5 @@ def _write_outputs(outcome: RunOutcome, output: str | None, plot: str | None) ->
 
 def _kept(outcome: RunOutcome, written: list[str]) -> str:
     count = len(outcome.trajectory)
-    states = "the initial state was" if count == 1 else f"the {count} states up to there were"
-    return f"{states} kept: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"
+    states = "the initial state was" if count == 1 else f"the {count} states computed before were"
+    return f"{states} written: {' and '.join(written)}" if written else f"{states} not written to a file (-o, --plot)"

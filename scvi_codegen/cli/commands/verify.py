@@ -30,17 +30,17 @@ MODEL_FILE = "model.toml"
 
 @click.command()
 @model_arguments
-@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="The certificate as JSON.")
+@click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write the certificate as JSON.")
 @SOLVER_OPTION
 @reporting
 def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> None:
-    """Build the integrator of MODEL and measure what it promises; exit status 1 if a promise is broken.
+    """Measure the guaranteed properties of the integrator of MODEL; exit status 1 if one is violated.
 
-    MODEL may also be a folder written by 'generate': then the C code in it is what is measured. A step is held against
-    the paper's equations in 60 digits and these against the exact motion; order, symplecticity, reversal, momenta,
-    Newton's matrix and identities between methods are measured; with a tolerance or a monitor of the model also what
-    runs make of such steps. Sums over indices are measured at a few places, where they are written out, and at the
-    sizes given. The JSON goes into the folder or beside the model file.
+    MODEL may also be a folder written by 'generate': then its C code is measured. A step is compared with the paper's
+    equations solved in 60 digits, and these with the exact motion. Order, symplecticity, reversibility, momentum maps,
+    Newton's matrix and identities between methods are measured; if the model has a tolerance or a time transformation,
+    also runs with these steps. Indexed models are measured on a few indices, compared with the unrolled system, and at
+    full size. The JSON is written into the folder or next to the model file.
 
     \b
     Examples:
@@ -59,7 +59,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
         certificate.save(path)
         note(f"wrote {path}")
     if not certificate.passed:
-        raise CommandFailure(f"broken: {', '.join(check.name for check in certificate.broken)}", FAILURE)
+        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.broken)}", FAILURE)
 
 
 def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
@@ -79,7 +79,9 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
-        raise PackageError(f"{folder} has no {MODEL_FILE} to say what its C code promises: generate it from a model")
+        raise PackageError(
+            f"{folder} has no {MODEL_FILE}, which defines its guaranteed properties: generate it from a model"
+        )
     model = read_model_file(folder / MODEL_FILE, choices.sections())
     if isinstance(model, IndexedModel):
         return _certificate_of_sums(model, load_sums(folder, model))

@@ -81,7 +81,7 @@ def verify_indexed(
     chosen = as_method(method, one_coordinate(system))
     if system.constraints:
         raise MethodError(
-            "sums over indices with constraints have no certificate: verify a small one written out (unroll_sums) by "
+            "indexed systems with constraints have no certificate: verify a small unrolled system (unroll_sums) by "
             "SVI(1, 'gauss-lobatto:2')"
         )
     stepper = stepper or compile_indexed(system, chosen, flags=tuple(flags))
@@ -91,7 +91,9 @@ def verify_indexed(
     subject = _subject(start)
     checks = (
         *checked(
-            "written out", f"{SMALL_STEPS} steps are those of the system written out", partial(_beside, start, subject)
+            "unrolled system",
+            f"{SMALL_STEPS} steps equal those of the unrolled system",
+            partial(_beside, start, subject),
         ),
         *step_checks(subject),
         *structure_checks(subject),

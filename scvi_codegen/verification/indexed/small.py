@@ -54,7 +54,7 @@ def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, N
             return start
         found = found or start
     if found is None:
-        raise StateError("no small sizes were found at which every index stays within its array")
+        raise StateError("no small array sizes were found at which all indices are in range")
     return found
 
 

@@ -80,11 +80,11 @@ class WholeStart:
 def whole_checks(start: WholeStart) -> Iterator[Check]:
     """Yield all checks of this module; they share one long run."""
     sizes = ", ".join(f"{name} = {size}" for name, size in start.arrays.sizes.items()) or "its size"
-    yield from checked("rates", f"at {sizes} loops give the rates that NumPy adds up", partial(_rates, start))
-    yield from checked("energies", f"at {sizes} kinetic and potential energy are NumPy's", partial(_energies, start))
+    yield from checked("rates", f"at {sizes} the loops give the rates of NumPy", partial(_rates, start))
+    yield from checked("energies", f"at {sizes} kinetic and potential energy equal NumPy's", partial(_energies, start))
     if start.method.symmetric:
         promise = f"at {sizes} a step with -h undoes the step with h"
-        yield from checked("way back", promise, partial(_reversal, start))
+        yield from checked("reversal at full size", promise, partial(_reversal, start))
     yield from _long_run(start, sizes)
 
 
@@ -192,14 +192,14 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
     change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
     if not start.system.changes_energy:
         if start.method.symplectic and run.step_error < RESOLVED:
-            promise = f"at {sizes} nothing but rounding changes it"
+            promise = f"at {sizes} conserved up to round-off"
             yield from checked("energy", promise, partial(Finding, float(change), walk, f"relative, {where}"))
         else:
-            yield information("energy", f"at {sizes} its change, relative", float(change), where)
+            yield information("energy", f"at {sizes} relative change", float(change), where)
     if start.method.symplectic:
         for k, name in enumerate(start.stepper.momentum_map_names):
             off = float(abs(run.momentum_maps[k] - maps[k])) / (terms or 1.0)
-            promise = f"at {sizes} a symmetry conserves it to round-off"
+            promise = f"at {sizes} conserved to round-off (symmetry)"
             yield from checked(name, promise, partial(Finding, off, walk, f"relative to its terms, {where}"))
 
 
