@@ -137,7 +137,7 @@ def solve_motion(
         checked_error(error, others)
     wish = _Wish(h, rtol, tolerance, error)
     stepper, uncompiled = _stepper(system, method, (monitor, controller), wish)
-    p = stepper.momenta_given(q, given, velocity, start, parameters)
+    p = stepper._initial_momenta(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, wish, (q, p, end - start), along)
     told = {**_steps(stepper, start, end, plan), **along, "events": events, "t_eval": None if dense_output else asked}
@@ -245,7 +245,7 @@ def _paced(stepper: Stepper) -> bool:
 def _chooses(stepper: Stepper) -> bool:
     """Return True if the stepper has adaptive steps."""
     try:
-        stepper.controlled()
+        stepper._adaptive()
     except MethodError:
         return False
     return True

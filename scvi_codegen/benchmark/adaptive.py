@@ -115,7 +115,7 @@ def _to_its_end(stepper: Stepper, arguments: dict[str, Any], q: Array, p: Array)
 
     def integrate() -> Array:
         """Integrate and return the final state alone, as heyoka's propagate_until."""
-        run.run_to_goal()
+        run._run_to_target()
         return run.q
 
     return integrate

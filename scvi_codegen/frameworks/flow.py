@@ -38,7 +38,7 @@ class Flow:
             MethodError: for a stepper without derivatives or without fixed steps.
             StateError: for invalid numbers of steps.
         """
-        stepper.check_steps_of_h("a flow")
+        stepper._check_fixed_steps("a flow")
         steps = checked_count(steps, "steps", least=1)
         save_every = 0 if save_every is None else checked_count(save_every, "save_every", least=1)
         if save_every and steps % save_every:
@@ -73,7 +73,7 @@ class Flow:
     @property
     def second_derivatives(self) -> Source:
         """C source with first and second derivatives; raises MethodError if there are none."""
-        self.stepper.curvature  # noqa: B018
+        self.stepper._second_derivatives  # noqa: B018
         source = self.stepper.second_derivatives
         assert source is not None
         return source

@@ -180,7 +180,7 @@ def _lost_energies(
     apart = max(1, len(t) - 1)
     t, q, p = (np.ascontiguousarray(states[::apart]) for states in (t, q, p))
     try:
-        energies = stepper.energies_of(t, q, p, parameters)
+        energies = stepper._energies_of(t, q, p, parameters)
         first, last = float(energies[0]), float(energies[-1])
         if not lost_part(first, last, 0.0) > TOLERABLE_ERROR:
             return None

@@ -107,7 +107,7 @@ class CompiledMethod:
         self._second = self._curvature()
         return self._second
 
-    def changes(self, count: int) -> Source | None:
+    def _variational_source(self, count: int) -> Source | None:
         """Return the C source of ensembles with ``count`` tangent vectors per trajectory, derived on first use.
 
         ``None`` if tangent vectors can only be propagated by the derivatives of steps.
@@ -139,7 +139,7 @@ class CompiledMethod:
         for each in (self,) if events is None else (self, self.with_events(events)):
             each.binding.borrow_fallback()
             if adaptive and each._controlled() is not None:
-                each.controlled().binding.borrow_fallback()
+                each._adaptive().binding.borrow_fallback()
         wanted = ((tangent, self._tangent), (second, self._curvature), (ensemble, self._ensemble))
         for source in [text() for is_wanted, text in wanted if is_wanted]:
             if source is not None:
@@ -153,7 +153,7 @@ class CompiledMethod:
         return self._with_tangent
 
     @property
-    def curvature(self) -> Binding:
+    def _second_derivatives(self) -> Binding:
         """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
         if self._with_curvature is None:
             self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
@@ -242,12 +242,12 @@ class CompiledMethod:
             fallback=self._fallback,
             tangent=self._tangent,
             curvature=self._curvature,
-            changes=self.changes,
+            changes=self._variational_source,
             flags=self.flags,
             events=wanted,
         )
 
-    def controlled(self) -> Self:
+    def _adaptive(self) -> Self:
         """Return the integrator with adaptive steps, loaded once; raise ``MethodError`` if the method has none."""
         if self._with_control is None:
             self._with_control = self._loaded_with_control()
@@ -271,7 +271,7 @@ class CompiledMethod:
             fallback=self._fallback,
             tangent=self._tangent,
             curvature=self._curvature,
-            changes=self.changes,
+            changes=self._variational_source,
             flags=self.flags,
             events=self.events,
         )

@@ -32,7 +32,7 @@ class ConstrainedStates(Integrator):
             MethodError: if the system has no constraints.
             StateError: if the iteration fails, or if the constraints are linearly dependent there.
         """
-        momenta = self.momenta_given(
+        momenta = self._initial_momenta(
             q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
         )
         q1, p1, _ = projected(self, q, momenta, t, parameters)

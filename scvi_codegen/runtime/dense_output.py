@@ -86,7 +86,7 @@ def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal:
             parameters=states.parameters,
             options=states.options,
         )
-        memory.run_to_goal()
+        memory._run_to_target()
         q[k], p[k] = memory.q, memory.p
     return q, p
 

@@ -58,7 +58,7 @@ class DeviationsEnsemble:
         parameters: EnsembleParameters,
         options: SolverOptions | None,
     ) -> None:
-        stepper.check_steps_of_h("a motion of an ensemble")
+        stepper._check_fixed_steps("a motion of an ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
@@ -111,7 +111,7 @@ class DeviationsEnsemble:
         """Return the compiled ensemble library with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints:
             return None
-        source = self.stepper.changes(self.found.shape[-1])
+        source = self.stepper._variational_source(self.found.shape[-1])
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     def _all_in_lanes(self, binding: Binding, told: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:

@@ -209,7 +209,7 @@ def record_pieces(
         pieces.append(piece if ended else with_end(piece, run))
         if ended:
             break
-    if run.leaving and pieces:
+    if run._leaving and pieces:
         warn_of_long_steps(pieces[-1])
     return DrivenTrajectory(tuple(pieces or [run.record(0)]))
 

@@ -155,7 +155,7 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
         found = [
-            self.stepper.momentum_maps_and_sizes(piece.q, piece.p, piece.t, piece.parameters) for piece in self.pieces
+            self.stepper._momentum_maps_and_sizes(piece.q, piece.p, piece.t, piece.parameters) for piece in self.pieces
         ]
         values, sizes = (_after_another(part) for part in zip(*found, strict=True))
         return relative_changes(values, sizes)

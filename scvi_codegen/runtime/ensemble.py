@@ -88,7 +88,7 @@ class Ensemble:
         self.save_every = checked_count(save_every, "save_every", least=1)
         start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.count = len(start_q)
-        if not stepper.has_energy(parameters):
+        if not stepper._has_energy(parameters):
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
                 self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
@@ -353,7 +353,7 @@ class _Alone:
             work.status[j] = "not finite"
         else:
             if carries is not None:
-                run.resume_at(step, time, carries)
+                run._resume_at(step, time, carries)
             self.run = run
 
     def update(self, h: float, parameters: Array) -> None:

@@ -76,7 +76,7 @@ class EnsembleToEnds:
     ) -> None:
         if stepper.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h and steps")
-        self.stepper, self.options = stepper.controlled(), checked_options(options)
+        self.stepper, self.options = stepper._adaptive(), checked_options(options)
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.goals = self._goals(t_end, tolerance)

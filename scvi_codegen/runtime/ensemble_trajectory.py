@@ -118,7 +118,7 @@ class EnsembleTrajectory:
         values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
         for j, good, parameters in self._with_parameters():
             try:
-                values[good, j], sizes[good, j] = self.stepper.momentum_maps_and_sizes(
+                values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
                     self.q[good, j], self.p[good, j], self._times()[good, j], parameters
                 )
             except StateError:

@@ -236,7 +236,7 @@ class _Model:
                 f"find go to unknown={list(parameters)}"
             )
         values = checked_parameters(stepper.interface, parameters)
-        momenta = stepper.momenta_given(q, p, velocity, measurements.start, values)
+        momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
         places = [2 * m + stepper.parameters.index(name) for name in wanted]
         names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
         places += range(2 * m) if fit_initial_state else ()

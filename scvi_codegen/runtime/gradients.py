@@ -84,7 +84,7 @@ def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
     Raises:
         StateError: if the directions have another shape.
     """
-    size, given = 2 * stepper.dimension, stepper.given
+    size, given = 2 * stepper.dimension, stepper._input_size
     if directions.ndim not in (1, 2) or len(directions) not in (size, given):
         raise StateError(
             f"directions have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
@@ -97,7 +97,7 @@ def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
 
 def sensitivity(states: KeptStates) -> Sensitivity:
     """Return the derivatives of all states with respect to all inputs of the run."""
-    columns, _ = forward(states, np.eye(states.stepper.given))
+    columns, _ = forward(states, np.eye(states.stepper._input_size))
     return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
 
 
@@ -106,14 +106,14 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
     slopes = checked_slopes(states.stepper, len(states), cotangents)
     seeds = seeds_of(states.stepper, slopes)
     found = backward(states, seeds, np.zeros_like(seeds[0]))
-    return gradient_of(states, found.T.reshape(states.stepper.given, *slopes.shape[2:]))
+    return gradient_of(states, found.T.reshape(states.stepper._input_size, *slopes.shape[2:]))
 
 
 def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
     """Return (n, c, given) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
     size = slopes.shape[1]
-    seeds = np.zeros((len(slopes), slopes[0].size // size, stepper.given))
-    seeds[:, :, stepper.told[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
+    seeds = np.zeros((len(slopes), slopes[0].size // size, stepper._input_size))
+    seeds[:, :, stepper._output_indices[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
     return seeds
 
 
@@ -139,7 +139,7 @@ def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike)
         StateError: if the shape does not match the number of states.
     """
     size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
-    sizes = {size, len(stepper.told)}
+    sizes = {size, len(stepper._output_indices)}
     if slopes.ndim not in (2, 3) or slopes.shape[0] != count or slopes.shape[1] not in sizes:
         shape = f"({count}, {size})" + f", or ({count}, {size + 1}) with those by t," * (len(sizes) - 1)
         raise StateError(
@@ -170,7 +170,7 @@ def finite(given: ArrayLike, name: str) -> Array:
 
 def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
     """Return (n, told, count) tangent vectors at the states, and (count, given) at the end, from (count, given)."""
-    time, told = time_of(states), states.stepper.told
+    time, told = time_of(states), states.stepper._output_indices
     states, now = time.states, time.begun(changes)
     found = np.empty((len(states), len(told), len(now)))
     found[0] = now[:, told].T
@@ -187,7 +187,7 @@ def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
 
 def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
-    ends = states.stepper.linearise(starts, vectors, states.parameters, states.options, back=back)
+    ends = states.stepper._propagate(starts, vectors, states.parameters, states.options, transpose=back)
     known = np.concatenate([starts.q, starts.p], axis=1)
     refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 

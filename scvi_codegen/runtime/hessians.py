@@ -38,10 +38,10 @@ def hessian_product(
     """
     slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
-    states.stepper.curvature  # noqa: B018  (where there is none, it says why)
+    states.stepper._second_derivatives  # noqa: B018  (where there is none, it says why)
     changes = changes_of(states.stepper, given)
     found = bent_back(states, slopes, bends, changes, np.zeros((2, *changes.shape)))
-    return gradient_of(states, found[1].T.reshape(states.stepper.given, *given.shape[1:]))
+    return gradient_of(states, found[1].T.reshape(states.stepper._input_size, *given.shape[1:]))
 
 
 def checked_function(
@@ -77,7 +77,7 @@ def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, n
         kept = np.flatnonzero(numbers[1:] > 0) + 1
         vectors[kept] = _seeds(slopes[numbers[kept]], bends[numbers[kept]], moved[kept])
         vectors[-1] += now
-        states.stepper.bend(starts, moved, vectors, states.parameters, states.options)
+        states.stepper._second_order_adjoint(starts, moved, vectors, states.parameters, states.options)
         now = vectors[0]
     first_slopes: Array = now + _seeds(slopes[:1], bends[:1], changes[np.newaxis])[0]
     return first_slopes

@@ -245,7 +245,7 @@ class IndexedRun(OneThread):
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
 
     @property
-    def carries(self) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
+    def _compensation(self) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
         """Compensation terms (compensated summation) of positions and momenta, as ``q`` and ``p``."""
         return self._arrays(self._numbers["carry_q"]), self._arrays(self._numbers["carry_p"])
 

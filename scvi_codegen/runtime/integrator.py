@@ -65,7 +65,7 @@ class Integrator(LinearisedMethod):
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
         check_inputs_given(self.interface, parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
-        given = (q0, p0, self.parameters_at(q0, p0, parameters))
+        given = (q0, p0, self._parameters_at(q0, p0, parameters))
         self._solve(self.binding, "step", t, h, given, options, (q1, p1))
         return q1, p1
 
@@ -93,14 +93,14 @@ class Integrator(LinearisedMethod):
         if status:
             raise step_failure(status, report, step=0, h=h)
 
-    def parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
+    def _parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
         """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
         values = self._parameters(parameters)
-        if not self.has_energy(parameters):
+        if not self._has_energy(parameters):
             values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
         return values
 
-    def has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
+    def _has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
         """Return whether the parameters contain the energy required by transformed time, or none is required."""
         name = self.interface.energy_parameter
         return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
@@ -129,7 +129,7 @@ class Integrator(LinearisedMethod):
         """
         return self._transform("velocity", q, p, t, parameters, "p")
 
-    def momenta_given(
+    def _initial_momenta(
         self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
     ) -> ArrayLike:
         """Return the momenta of a state specified by p or by velocity.
@@ -180,10 +180,10 @@ class Integrator(LinearisedMethod):
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
         times, positions, momenta = checked_states(self.interface, q, p, t)
-        result = self.energies_of(times, positions, momenta, self._parameters(parameters))
+        result = self._energies_of(times, positions, momenta, self._parameters(parameters))
         return float(result[0]) if np.ndim(q) == 1 else result
 
-    def energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+    def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
         """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
 
         Raises:
@@ -214,10 +214,10 @@ class Integrator(LinearisedMethod):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
-        values = self.momentum_maps_and_sizes(q, p, t, parameters)[0]
+        values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
         return values[0] if np.ndim(q) == 1 else values
 
-    def momentum_maps_and_sizes(
+    def _momentum_maps_and_sizes(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
     ) -> tuple[Array, Array]:
         """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""

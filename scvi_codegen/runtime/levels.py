@@ -74,33 +74,33 @@ class TransformedTime(OwnTime):
     def level(self) -> Array:
         """(given,) gradient of the energy with respect to the initial data."""
         states = self.states
-        return states.stepper.level(states.q[0], states.p[0], states.parameters)
+        return states.stepper._energy_gradient(states.q[0], states.p[0], states.parameters)
 
     @cached_property
     def last_step(self) -> Array:
         """(given,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
-        states, given = self.states, self.states.stepper.given
+        states, given = self.states, self.states.stepper._input_size
         if not self.ends_at_a_time or len(states) < 2:
             return np.zeros(given)
         span = states.stepped[-1:] - states.stepped[-2:-1]
         vectors = np.zeros((2, 1, given))
         vectors[0, 0, -1] = 1.0
         starts = Starts(states.t[-2:-1].copy(), span, states.q[-2:].copy(), states.p[-2:].copy())
-        states.stepper.linearise(starts, vectors, states.parameters, states.options)
+        states.stepper._propagate(starts, vectors, states.parameters, states.options)
         slopes: Array = vectors[1, 0] / vectors[1, 0, T]
         return slopes
 
     def begun(self, changes: Array) -> Array:
         """Add the variation of the energy; see :meth:`OwnTime.begun`."""
         found = changes.copy()
-        found[:, self.states.stepper.energy_place] += changes @ self.level
+        found[:, self.states.stepper._energy_index] += changes @ self.level
         found[:, T] = 0.0
         return found
 
     def ended(self, found: Array, now: Array, changes: Array) -> tuple[Array, Array]:
         """Project the variation of the end onto the fixed final time; see :meth:`OwnTime.ended`."""
         now = now - now[:, T, np.newaxis] * self.last_step
-        last = now[:, self.states.stepper.told].T[np.newaxis]
+        last = now[:, self.states.stepper._output_indices].T[np.newaxis]
         found = np.concatenate([found if self.repeated else found[:-1], last])
         found[:, -1] += changes[:, T]
         return found, now
@@ -115,7 +115,7 @@ class TransformedTime(OwnTime):
 
     def pulled(self, slopes: Array, seeds: Array) -> Array:
         """Apply the transpose of :meth:`begun`; see :meth:`OwnTime.pulled`."""
-        found = slopes + slopes[:, self.states.stepper.energy_place, np.newaxis] * self.level
+        found = slopes + slopes[:, self.states.stepper._energy_index, np.newaxis] * self.level
         found[:, T] = seeds[:, :, T].sum(axis=0)
         return found
 

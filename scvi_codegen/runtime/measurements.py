@@ -60,7 +60,7 @@ class Measurements:
         inputs: Mapping[str, Input],
     ) -> Measurements:
         """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
-        stepper.check_steps_of_h("a motion that is fitted")
+        stepper._check_fixed_steps("a motion that is fitted")
         if stepper.constraints:
             raise MethodError("motions with constraints are not fitted: an initial state does not vary freely on them")
         times, values = checked_times(t, "t"), real_array(measured, "measured")
@@ -128,7 +128,7 @@ class Measurements:
             starts = Starts.chain(state[:m], state[m:], t, h)
             vectors = np.zeros((len(h) + 1, *changes.shape))
             vectors[0] = changes
-            self.stepper.linearise(starts, vectors, at, None, chained=True)
+            self.stepper._propagate(starts, vectors, at, None)
             states = np.concatenate([starts.q, starts.p], axis=1)
             here = np.flatnonzero((self.places >= done) & (self.places <= done + len(h)))
             rows = self.places[here] - done

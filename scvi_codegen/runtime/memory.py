@@ -94,7 +94,7 @@ class Memory(OneThread):
             binding.pointer(p0),
         )
         goal = h if isinstance(h, Goal) else None
-        values, awaited = stepper.parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
+        values, awaited = stepper._parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
         return cls(stepper, memory, values, checked_options(options), goal, awaited)
 
     @classmethod
@@ -122,7 +122,7 @@ class Memory(OneThread):
                 if goal is None
                 else "these bytes are not a saved run whose steps choose their length: one of fixed steps has no t_end"
             )
-        if not stepper.has_energy(parameters):
+        if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
         values, awaited = (
             checked_parameters(stepper.interface, parameters),
@@ -228,12 +228,12 @@ class Memory(OneThread):
         return self._p.copy()
 
     @property
-    def carries(self) -> tuple[Array, Array]:
+    def _compensation(self) -> tuple[Array, Array]:
         """(m,) compensation terms of :attr:`q` and of :attr:`p`, added in the following steps."""
         return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
 
     @alone
-    def resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
+    def _resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
         """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p."""
         self._memory.step = steps
         self._memory.t, self._memory.t_low = time
@@ -272,7 +272,7 @@ class Memory(OneThread):
         finally:
             self._lock.release()
 
-    def run_to_goal(self) -> None:
+    def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""
         while not self.arrived:
             self.advance(UNHEARD_STEPS)
@@ -312,7 +312,7 @@ class Memory(OneThread):
         return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
 
     @property
-    def leaving(self) -> bool:
+    def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
         return bool(getattr(self._memory, "leaving", 0))
 

@@ -70,7 +70,7 @@ class NearbyMotions(KeptStates):
         """Return the Hessian of a function F of the states, with respect to the initial data, times directions.
 
         This is the derivative of :meth:`pullback` along the directions, exact to round-off, computed in one forward
-        and one backward pass for all of them; with ``np.eye(stepper.given)`` it is the whole Hessian.
+        and one backward pass for all of them; with the identity of size 2m + k + 2 it is the whole Hessian.
 
         Args:
             cotangents: (n, 2m) gradient of F with respect to (q, p) of each state.

@@ -148,7 +148,7 @@ class NearbyDrivenMotions:
         stepper, m = self._stepper, self._stepper.dimension
         found = by_pieces[0].T.copy()
         found[self._columns] = np.nan
-        found = found.reshape(stepper.given, *shape)
+        found = found.reshape(stepper._input_size, *shape)
         inputs = {}
         for name in stepper.interface.inputs:
             first = stepper.parameters.index(f"{name}_0")

@@ -109,7 +109,7 @@ def periodic_orbit(
         parameters=parameters,
         options=options,
     )
-    momenta = stepper.momenta_given(q, p, velocity, search.t, search.parameters)
+    momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
     start = np.concatenate([checked_vector(stepper.interface, each, name) for each, name in ((q, "q"), (momenta, "p"))])
     return search.orbit(np.append(start, search.period))
 
@@ -150,7 +150,7 @@ class _OrbitSearch:
     ) -> _OrbitSearch:
         """Construct from validated arguments of :func:`periodic_orbit`."""
         interface, names = stepper.interface, state_names(stepper)
-        stepper.check_steps_of_h("a periodic orbit")
+        stepper._check_fixed_steps("a periodic orbit")
         check_inputs_given(interface, parameters)
         if interface.constraints:
             raise MethodError("periodic orbits are found without constraints: take coordinates that need none")
@@ -319,11 +319,11 @@ class _OrbitSearch:
         h = period / self.steps
         times = times_after(self.t, h, np.arange(first, last))[0]
         starts = Starts.chain(start[: size // 2], start[size // 2 :], times, np.full(steps, h))
-        vectors = np.zeros((steps + 1, size + 2, stepper.given))
+        vectors = np.zeros((steps + 1, size + 2, stepper._input_size))
         vectors[0, :size, :size] = np.eye(size)
         vectors[0, size, -2:] = first / self.steps, 1.0 / self.steps
         vectors[0, size + 1, -2] = 1.0
-        q, p = stepper.linearise(starts, vectors, self.parameters, self.options, chained=True)
+        q, p = stepper._propagate(starts, vectors, self.parameters, self.options)
         slopes = vectors[-1, :, :size].T.copy()
         return _Segment(
             states=np.column_stack([q, p]),

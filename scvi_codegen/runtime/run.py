@@ -49,12 +49,12 @@ class Run(Memory):
             StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
             EventError: if an event function is not finite.
         """
-        before = 0.0 if self.leaving else self.step_error[0]
+        before = 0.0 if self._leaving else self.step_error[0]
         if self.stepper.events:
             trajectory = Observation(self, save_every=save_every).advance(steps, progress)
         else:
             trajectory = record(self, steps, save_every=save_every, progress=progress)
-        if not self.leaving:
+        if not self._leaving:
             warn_of_long_steps(trajectory, before=before)
         warn_of_lost_energy(trajectory)
         return trajectory

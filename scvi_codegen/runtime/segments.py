@@ -141,7 +141,7 @@ class Chain:
     def _part(self, j: int, x: Array) -> tuple[Array, Array, Array, Array]:
         """Return the computed measurements and the end of segment j, each with derivatives by all unknowns."""
         part, values, size = self.parts[j], self.values(x), self.state
-        changes = np.zeros((len(x), part.stepper.given))
+        changes = np.zeros((len(x), part.stepper._input_size))
         changes[np.arange(len(self.places)), self.places] = 1.0
         start = values[:size]
         if j > 0:
@@ -177,7 +177,7 @@ def _states_moved(parts: Sequence[Measurements], known: Array) -> Array:
     size = 2 * parts[0].stepper.dimension
     state, found = known[:size], []
     for part in parts[:-1]:
-        state = part.motion(state, np.zeros((0, part.stepper.given)), known[size:])[2]
+        state = part.motion(state, np.zeros((0, part.stepper._input_size)), known[size:])[2]
         found.append(state)
     return np.array(found).reshape(-1, size)
 
@@ -205,7 +205,7 @@ def _sizes(parts: Sequence[Measurements], known: Array, nodes: Array) -> Array:
     size = nodes.shape[1]
     states = np.concatenate([known[np.newaxis, :size], nodes])
     if len(states) == 1:
-        end = parts[0].motion(known[:size], np.zeros((0, parts[0].stepper.given)), known[size:])[2]
+        end = parts[0].motion(known[:size], np.zeros((0, parts[0].stepper._input_size)), known[size:])[2]
         states = np.stack([states[0], end])
     kinds = np.ptp(states, axis=0).reshape(2, -1)
     largest = kinds.max(axis=1, keepdims=True)

@@ -105,9 +105,9 @@ def along(states: KeptStates, changes: Changes) -> ChaosIndicators:
     def carried(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
         carry(states, steps, numbers, vectors, back=False)
 
-    states.stepper.check_own_time("what nearby motions do")
+    states.stepper._check_physical_time("what nearby motions do")
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
-    spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper.given, states.t)
+    spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper._input_size, states.t)
     spreading.follow((starts_of(states, first, last) for first, last in pieces(states)), carried)
     return ChaosIndicators.of(states.t, spreading.growth.found)
 
@@ -136,7 +136,7 @@ def ahead(
 
     def carried(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
         heed(int(numbers[-1]))
-        stepper.linearise(part, vectors, parameters, options, chained=True)
+        stepper._propagate(part, vectors, parameters, options)
 
     def stretches() -> Iterator[Stretch]:
         now = q, p
@@ -149,7 +149,9 @@ def ahead(
 
     spreading = None
     try:
-        spreading = _Spreading(changes.at(q, p, h, float(t[0]), parameters, options), stepper.given, t[::save_every])
+        spreading = _Spreading(
+            changes.at(q, p, h, float(t[0]), parameters, options), stepper._input_size, t[::save_every]
+        )
         spreading.follow(stretches(), carried)
     except StepFailedError as failure:
         return spreading.growth.found if spreading else None, failure

@@ -192,17 +192,17 @@ class Stepper(Ensembles):
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
-        p = self.momenta_given(q, p, velocity, t, parameters)
+        p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
         if self.interface.monitor:
             goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
-            return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
+            return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
             raise StateError("in transformed time steps of tau have one length: give h")
         if t_end is not None and h is None:
             goal = Goal.checked(t_end, tolerance)
-            return Run.started(self.controlled(), q, p, h=goal, t=t, parameters=parameters, options=options)
+            return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if t_end is not None or h is None:
             raise StateError(
                 "the step h, for steps of one length, or t_end, for steps that choose theirs: give one of them"
@@ -227,13 +227,13 @@ class Stepper(Ensembles):
         """
         if self.interface.monitor:
             goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
-            return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+            return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, goal=goal)
         if h is not None:
             raise StateError("the bytes of a run hold its h: leave it out")
         if t_end is None:
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
-        return Run.restored(self.controlled(), saved, parameters=parameters, options=options, goal=goal)
+        return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, goal=goal)
 
 
 def _recorded(
@@ -257,7 +257,7 @@ def _recorded(
     _check_number(run, steps)
     if t_eval is None:
         found = run.record(steps, save_every=save_every, progress=progress)
-        if run.leaving:
+        if run._leaving:
             warn_of_long_steps(found)
         return found
     if clocked:

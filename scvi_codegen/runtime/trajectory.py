@@ -125,7 +125,7 @@ class Trajectory(NearbyMotions, Confirmed):
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
-        values, sizes = self.stepper.momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        values, sizes = self.stepper._momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
         return relative_changes(values, sizes)
 
     def work(self) -> Array:

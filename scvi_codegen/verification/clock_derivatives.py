@@ -41,7 +41,7 @@ def clock_derivative_checks(pace: Pace) -> Iterator[Check]:
 def _derivative(pace: Pace) -> Finding:
     """Compare the directional derivative of the end state and of its time with differences of the exact step."""
     state, direction = _first(pace), _direction(pace)
-    told, scales = pace.stepper.told, np.append(pace.subject.scales(state), state.h)
+    told, scales = pace.stepper._output_indices, np.append(pace.subject.scales(state), state.h)
     found = _carried(pace, direction, back=False)[told]
     ends = [_end(pace, direction * (sign * WIDTH)) for sign in (1, -1)]
     exact = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
@@ -53,7 +53,7 @@ def _level(pace: Pace) -> Finding:
     """Compare the directional derivative of the energy of the state with differences; relative to its largest term."""
     state, direction, m = _first(pace), _direction(pace), len(_first(pace).q)
     values = np.array(list(pace.at_level(state).values()))
-    terms = pace.stepper.level(state.q, state.p, values) * direction
+    terms = pace.stepper._energy_gradient(state.q, state.p, values) * direction
     motion, own = exact_motion(pace.system), len(pace.system.parameters)
     energies = []
     for sign in (1, -1):
@@ -105,7 +105,7 @@ def _carried(pace: Pace, vector: Array, *, back: bool) -> Array:
     vectors = np.zeros((2, 1, len(vector)))
     vectors[int(back)] = vector
     values = np.array(list(pace.at_level(state).values()))
-    pace.stepper.linearise(starts, vectors, values, None, back=back)
+    pace.stepper._propagate(starts, vectors, values, None, transpose=back)
     carried: Array = vectors[int(not back), 0]
     return carried
 

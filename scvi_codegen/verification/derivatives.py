@@ -77,7 +77,7 @@ def _steppers(subject: Subject) -> list[Stepper]:
 def _differentiable(subject: Subject) -> bool:
     """Return True if the stepper has derivatives; those of generated folders have none."""
     try:
-        return subject.stepper.given > 0
+        return subject.stepper._input_size > 0
     except MethodError:
         return False
 
@@ -109,7 +109,7 @@ def _bends(subject: Subject) -> bool:
     if not _differentiable(subject) or subject.system.dimension > MOST_BENT:
         return False
     try:
-        subject.stepper.curvature  # noqa: B018
+        subject.stepper._second_derivatives  # noqa: B018
     except MethodError:
         return False
     return True
@@ -126,11 +126,11 @@ def _hessian(subject: Subject, state: State) -> Array:
     """Return the compiled Hessian (n, n) of the weighted sum of the end state, n the number of arguments."""
     stepper, parameters = subject.stepper, np.array(list(subject.parameters.values()))
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
-    size = stepper.given
+    size = stepper._input_size
     changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
     changes[0], vectors[1, 0, :, : 2 * len(state.q)] = np.eye(size), _weights(subject, state)
-    stepper.linearise(starts, changes, parameters, None, chained=True)
-    stepper.bend(starts, changes, vectors, parameters, None)
+    stepper._propagate(starts, changes, parameters, None)
+    stepper._second_order_adjoint(starts, changes, vectors, parameters, None)
     bent: Array = vectors[0, 1]
     return bent
 
@@ -157,7 +157,7 @@ def _carried(subject: Subject, stepper: Stepper, state: State, vector: Array, *,
     starts = Starts.chain(state.q, state.p, np.array([state.t]), np.array([state.h]))
     vectors = np.zeros((2, 1, len(vector)))
     vectors[int(back)] = vector
-    stepper.linearise(starts, vectors, np.array(list(subject.parameters.values())), None, back=back)
+    stepper._propagate(starts, vectors, np.array(list(subject.parameters.values())), None, transpose=back)
     carried: Array = vectors[int(not back), 0]
     return carried
 

@@ -96,9 +96,9 @@ def _advanced(
     """Return (2m,) the final state of a run started with compensation terms, and (2m,) its compensation terms."""
     run = stepper.start(state.q, state.p, h=state.h, t=state.t, parameters=subject.parameters)
     if carry is not None:
-        run.resume_at(0, (state.t, 0.0), (carry[: len(state.q)], carry[len(state.q) :]))
+        run._resume_at(0, (state.t, 0.0), (carry[: len(state.q)], carry[len(state.q) :]))
     run.advance(steps)
-    return np.concatenate([run.q, run.p]), np.concatenate(run.carries)
+    return np.concatenate([run.q, run.p]), np.concatenate(run._compensation)
 
 
 def _sums(subject: Subject) -> Finding:
@@ -203,7 +203,7 @@ def _invariants(subject: Subject) -> list[_Invariant]:
         return []
 
     def map_values(k: int, q: Array, p: Array, t: float) -> tuple[Array, Array]:
-        values, sizes = stepper.momentum_maps_and_sizes(q, p, t, parameters)
+        values, sizes = stepper._momentum_maps_and_sizes(q, p, t, parameters)
         return values[:, k], sizes[:, k]
 
     def energies(q: Array, p: Array, t: float) -> tuple[Array, Array]:

@@ -165,7 +165,7 @@ def test_texts_that_are_compiled_here_alone_have_no_warning(name, solver, compil
     q = system.coordinates[0].name
     monitor = f"1/(1 + {q}**2)"
     stepper = compile_stepper(system, SVI(3), solver=solver, monitor=monitor, prefix="own", flags=QUICK_FLAGS)
-    texts = [stepper.source, stepper.controlled().source, *([stepper.fallback] if stepper.fallback else [])]
+    texts = [stepper.source, stepper._adaptive().source, *([stepper.fallback] if stepper.fallback else [])]
     assert len(texts) == (3 if solver == "auto" else 2)
     for number, text in enumerate(texts):
         folder = tmp_path / str(number)

@@ -283,7 +283,7 @@ def test_the_part_of_a_step_is_that_which_ends_at_the_time(h: float) -> None:
     """Along an orbit on which the rate changes a hundredfold: the step of that part, taken alone, ends there."""
     made = stepper("L", "newton")
     run = made.integrate(*START, h=h, steps=40)
-    values = made.parameters_at(*map(np.asarray, START))
+    values = made._parameters_at(*map(np.asarray, START))
     for k in range(0, 40, 3):
         for share in (1e-12, 0.02, 0.5, 0.98, 1.0):
             end = run.t[k] + share * (run.t[k + 1] - run.t[k])

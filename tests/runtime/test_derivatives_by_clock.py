@@ -119,6 +119,8 @@ def test_of_a_step_by_all_it_starts_from(form):
     found = columns_of(made.sensitivity(Q, P, H, T0))
     assert np.abs(found - exact).max() < EXACT * np.abs(exact).max()
     assert_allclose(made.jacobian(Q, P, H, T0), found[:4, :4], rtol=0, atol=1e-15)
+    assert_allclose(made.jvp(Q, P, H, T0, tangents=np.eye(4)).T, found[:4, :4], rtol=0, atol=1e-15)
+    assert_allclose(made.vjp(Q, P, H, T0, cotangents=np.eye(4)), found[:4, :4], rtol=0, atol=1e-14)
     held = made.jacobian(Q, P, H, T0, {"E": made.energy(Q, P)})
     if is_symplectic(FORMS[form][1], FORMS[form][0]):
         omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
@@ -146,7 +148,7 @@ def test_steps_are_symplectic_with_time_and_its_momentum(form):
     """(q, t, p, -E): what moves the energy of the start moves the time, and nothing else is lost."""
     made = stepper(form)
     run = made.integrate(Q, P, h=H, steps=10)
-    level = made.level(Q, P, run.parameters)
+    level = made._energy_gradient(Q, P, run.parameters)
     found = run.sensitivity()
     held = found.state[-1] - np.outer(found.parameters[-1, :, -1], level[:4])
     times = found.times.state[-1] - found.times.parameters[-1, -1] * level[:4]
@@ -221,11 +223,11 @@ def test_a_rod_in_transformed_time():
     )
     made = compile_stepper(reparametrise(rod, "1/(3 + y)"), SVI(2, "gauss-lobatto:3"), flags=QUICK_FLAGS)
     q, p = made.project([0.6, -0.8], [0.8, 0.6])
-    starts, size = Starts.chain(q, p, np.array([0.0]), np.array([0.3])), made.given
-    values, (forward, back) = made.parameters_at(q, p), np.zeros((2, 2, size, size))
+    starts, size = Starts.chain(q, p, np.array([0.0]), np.array([0.3])), made._input_size
+    values, (forward, back) = made._parameters_at(q, p), np.zeros((2, 2, size, size))
     forward[0] = back[1] = np.eye(size)
-    made.linearise(starts, forward, values, None, chained=True)
-    made.linearise(starts, back, values, None, back=True)
+    made._propagate(starts, forward, values, None)
+    made._propagate(starts, back, values, None, transpose=True)
     assert np.abs(forward[1].T - back[0]).max() < 1e-13 * np.abs(forward[1]).max()
     ends = [made.integrate(q, p, h=0.3 + by, steps=1, parameters=values).t[-1] for by in (1e-4, -1e-4)]
     assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
@@ -249,4 +251,6 @@ def test_a_hamiltonian_that_is_linear_in_momenta_has_a_level():
         name="turn", coordinates=["q"], momenta=["p"], hamiltonian="w*(q**2 + p**2)/2", parameters={"w": 1.5}
     )
     made = compile_stepper(reparametrise(vortex, "1/(1 + q**2)"), Gauss(2), flags=QUICK_FLAGS)
-    assert_allclose(made.level(np.array([0.6]), np.array([0.3]), made.defaults), [0.9, 0.45, 0.225, 0.0, 0.0, 0.0])
+    assert_allclose(
+        made._energy_gradient(np.array([0.6]), np.array([0.3]), made.defaults), [0.9, 0.45, 0.225, 0.0, 0.0, 0.0]
+    )

@@ -223,7 +223,7 @@ def test_ensembles_are_the_same_as_runs(galaxy):
 def by_derivatives(stepper):
     """The same, without a text for lanes: a copy knows none that nobody asked for. Each motion is followed alone."""
     alone = pickle.loads(pickle.dumps(stepper))
-    assert alone.changes(1) is None
+    assert alone._variational_source(1) is None
     return alone
 
 
@@ -263,7 +263,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     alone = by_derivatives(stepper)
     options = {"h": 0.1, "steps": 120, "save_every": 40} | options
     found = stepper.chaos_indicators_ensemble(*start, **options)
-    assert stepper.changes(found.lengths.shape[-1]) is not None
+    assert stepper._variational_source(found.lengths.shape[-1]) is not None
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 

@@ -75,7 +75,7 @@ def test_tangents_go_from_piece_to_piece(stepper):
     run = run_from(stepper, START)
     expected = slope(lambda x: states_of(run_from(stepper, x)), START)
     assert_allclose(run.tangent(), expected[:2].transpose(1, 2, 0), atol=1e-9)
-    direction = np.zeros(stepper.given)
+    direction = np.zeros(stepper._input_size)
     direction[2 + stepper.parameters.index("l")] = 1.0
     assert_allclose(run.tangent(direction), expected[3], atol=1e-9)
 
@@ -90,7 +90,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
         other = run_from(stepper, x)
         return by_start(other.pullback(weights + np.einsum("nij,nj->ni", bends, states_of(other))), stepper)
 
-    directions = np.zeros((stepper.given, 4))
+    directions = np.zeros((stepper._input_size, 4))
     directions[[0, 1, *(2 + stepper.parameters.index(name) for name in ("c", "l"))], range(4)] = 1.0
     slopes = weights + np.einsum("nij,nj->ni", bends, states_of(run))
     product = run.hessian_product(slopes, directions, bends)
@@ -103,6 +103,6 @@ def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
 def test_data_have_no_directions(stepper):
     run = run_from(stepper, START)
     with pytest.raises(StateError, match="inputs and the lengths of steps are data"):
-        run.tangent(np.ones(stepper.given))
+        run.tangent(np.ones(stepper._input_size))
     with pytest.raises(StateError, match="cotangents, slopes by"):
         run.pullback(np.zeros((3, 2)))

@@ -160,7 +160,7 @@ def test_prepare_compiles_all_that_later_calls_need(tmp_path, monkeypatch):
         stepper.integrate(*state, t_end=0.3, tolerance=1e-6, events=events)
     stepper.binding.borrow_fallback()
     stepper.jacobian(*state, h=0.1)
-    assert stepper.curvature
+    assert stepper._second_derivatives
     stepper.integrate_ensemble([[1.0], [0.5]], [[0.0], [0.0]], h=0.1, steps=3)
     chain.integrate([1.0, 0.5], [0.0, 0.0], h=0.1, steps=3)
     chain.integrate([1.0, 0.5], [0.0, 0.0], t_end=0.3, tolerance=1e-6)

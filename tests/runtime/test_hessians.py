@@ -64,7 +64,7 @@ def test_the_hessian_of_a_function_of_all_states(stepper, save_every):
         ]
         columns.append((8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4)
     expected = np.array(columns).T
-    product = run.hessian_product(slopes(run), np.eye(stepper.given), bends)
+    product = run.hessian_product(slopes(run), np.eye(stepper._input_size), bends)
     found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
     assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     assert_allclose(found, found.T, atol=1e-13 * np.abs(found).max())
@@ -79,7 +79,7 @@ def test_it_is_the_derivative_of_the_gradient_of_any_run_of_steps(stepper, optio
     """As a symmetric form: v . H w = w . H v, and as the change of all states along two directions."""
     run = run_from(stepper, START, **options)
     weights, bends = square(len(run), 1)
-    v, w = np.random.default_rng(2).normal(size=(2, stepper.given))
+    v, w = np.random.default_rng(2).normal(size=(2, stepper._input_size))
     v[-1] = w[-1] = 0.0  # the lengths are held
     both = run.hessian_product(weights, np.stack([v, w], axis=1), bends)
     found = np.concatenate([both.q, both.p, both.parameters, both.t[np.newaxis]])
@@ -90,7 +90,7 @@ def test_many_directions_are_as_good_as_each_alone(stepper):
     """More of them than are taken through a step at once."""
     run = run_from(stepper, START)
     weights, bends = square(len(run), 3)
-    directions = np.random.default_rng(4).normal(size=(stepper.given, 19))
+    directions = np.random.default_rng(4).normal(size=(stepper._input_size, 19))
     many = run.hessian_product(weights, directions, bends)
     names = ("q", "p", "parameters", "t", "h")
     for k in range(directions.shape[1]):
@@ -125,7 +125,7 @@ def test_the_energy_of_a_motion_at_its_end_bends_as_at_its_start():
 
 def test_directions_of_all_that_is_given_go_forward_alone_too(stepper):
     run = run_from(stepper, START)
-    found, whole = run.tangent(np.eye(stepper.given)), run.sensitivity()
+    found, whole = run.tangent(np.eye(stepper._input_size)), run.sensitivity()
     assert_allclose(found[:, :, 2:-2], whole.parameters, rtol=1e-13, atol=1e-13)
     assert_allclose(found[:, :, -1], whole.h, rtol=1e-13, atol=1e-13)
 

@@ -111,13 +111,13 @@ class Begun:
         carries = self.words()[2:]
         carries[0][:3], carries[1][:3] = low_q, low_p
         if not self.array:
-            self.run.resume_at(0, (self.run.t, 0.0), carries)
+            self.run._resume_at(0, (self.run.t, 0.0), carries)
 
     def words(self) -> tuple[Any, ...]:
         """q, p and their low words; of an array those of the run itself."""
         if self.array:
             return tuple(self.run._numbers[name].ravel() for name in ("q", "p", "carry_q", "carry_p"))
-        return self.run.q, self.run.p, *self.run.carries
+        return self.run.q, self.run.p, *self.run._compensation
 
     def time(self) -> Fraction:
         memory = self.run._run if self.array else self.run._memory
@@ -175,7 +175,7 @@ def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
     """A thousandth of the state as its low word: that sum, and not the high word, meets the constraint after a step."""
     own = Begun(name)
     long = tuple(np.cos(np.arange(4)) / 1024 for _ in range(2))
-    own.run.resume_at(0, (own.run.t, 0.0), long)
+    own.run._resume_at(0, (own.run.t, 0.0), long)
     own.run.advance(1)
     q, _, low, _ = own.words()
     x, y, _, w = q + low
@@ -281,7 +281,7 @@ def test_low_words_count_wherever_the_state_does(name: str) -> None:
             for kept, part in zip(own.words()[2:], long, strict=True):
                 kept[:] = 0.0 if whole else part
         elif not whole:
-            own.run.resume_at(0, (0.0, 0.0), tuple(long))
+            own.run._resume_at(0, (0.0, 0.0), tuple(long))
         own.run.advance(1)
         q, p, low_q, low_p = own.words()
         ends.append(np.concatenate([q + low_q, p + low_p]))

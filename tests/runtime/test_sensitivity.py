@@ -101,11 +101,11 @@ def test_derivatives_by_all_that_a_step_starts_from(name):
 
 def bent(stepper, q, p, h, t, weights):
     """(given, given) second derivatives of weights . (q1, p1) of a step."""
-    size, starts = stepper.given, Starts.chain(q, p, np.array([t]), np.array([h]))
+    size, starts = stepper._input_size, Starts.chain(q, p, np.array([t]), np.array([h]))
     changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
     changes[0], vectors[1, 0, :, : 2 * len(q)] = np.eye(size), weights
-    stepper.linearise(starts, changes, stepper.defaults, None, chained=True)
-    stepper.bend(starts, changes, vectors, stepper.defaults, None)
+    stepper._propagate(starts, changes, stepper.defaults, None)
+    stepper._second_order_adjoint(starts, changes, vectors, stepper.defaults, None)
     return vectors[0, 1]
 
 
@@ -139,15 +139,28 @@ def test_second_derivatives_by_all_that_a_step_starts_from(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_products_are_those_of_the_jacobian(name):
+    _, stepper, q, p, h = given(name)
+    at, size = (q, p, h, T, stepper.defaults), 2 * len(q)
+    found, vectors = stepper.jacobian(*at), np.random.default_rng(6).normal(size=(3, size))
+    pushed, pulled = stepper.jvp(*at, tangents=vectors), stepper.vjp(*at, cotangents=vectors)
+    assert_allclose(pushed, vectors @ found.T, atol=1e-12 * np.abs(found).max())
+    assert_allclose(pulled, vectors @ found, atol=1e-12 * np.abs(found).max())
+    assert np.array_equal(stepper.vjp(*at, cotangents=vectors[0]), stepper.vjp(*at, cotangents=vectors[:1])[0])
+    with pytest.raises(StateError, match=rf"tangents must have the shape \({size},\) or \(k, {size}\), not \(2, 1\)"):
+        stepper.jvp(*at, tangents=np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_adjoint_is_the_transpose(name):
     """Of vectors of all that is given, and what they become: (J v, w) = (v, J^T w), for all v and w of a basis."""
     _, stepper, q, p, h = given(name)
-    size = stepper.given
+    size = stepper._input_size
     starts = Starts.chain(q, p, np.array([T, T + h, T + 2 * h]), np.array([h, h, 0.5 * h]))
     forward, back = np.zeros((2, 4, size, size))
     forward[0] = back[-1] = np.eye(size)
-    stepper.linearise(starts, forward, stepper.defaults, None, chained=True)
-    stepper.linearise(starts, back, stepper.defaults, None, back=True)
+    stepper._propagate(starts, forward, stepper.defaults, None)
+    stepper._propagate(starts, back, stepper.defaults, None, transpose=True)
     assert np.abs(forward[-1]).max() > 1.0
     assert np.abs(forward[-1].T - back[0]).max() < 1e-13 * np.abs(forward[-1]).max()
 

@@ -411,7 +411,7 @@ def low_words(run: Any) -> tuple[Any, ...]:
     """Time and state of a run with what rounding cut off them."""
     flat = lambda x: next(iter(x.values())).ravel().tolist() if isinstance(x, dict) else np.asarray(x).tolist()  # noqa: E731
     inner = run._run if hasattr(run, "_run") else run._memory
-    return run.steps, run.t, inner.t_low, flat(run.q), [y for x in run.carries for y in flat(x)], flat(run.p)
+    return run.steps, run.t, inner.t_low, flat(run.q), [y for x in run._compensation for y in flat(x)], flat(run.p)
 
 
 def changes(case: Case) -> None:

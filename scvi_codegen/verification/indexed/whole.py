@@ -94,7 +94,7 @@ def _rates(start: WholeStart) -> Finding:
     run.advance(1)
     expected, nudged = _numpy_rates(start), _numpy_rates(_nudged(start))
     ends = ((start.arrays.state, run.q), (start.p, run.p))
-    for (before, after), low, slopes, others in zip(ends, run.carries, expected, nudged, strict=True):
+    for (before, after), low, slopes, others in zip(ends, run._compensation, expected, nudged, strict=True):
         size = max((float(np.abs(each).max(initial=0.0)) for each in slopes.values()), default=0.0)
         noise = max((float(np.abs(each - others[name]).max(initial=0.0)) for name, each in slopes.items()), default=0.0)
         unit = EPSILON * (size + noise / NUDGE) or 1.0
