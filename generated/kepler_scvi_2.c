@@ -105,7 +105,7 @@ static void quadrature_value(const double *u, double t, const double *parameters
   value[1] = -(w0 * u[1]);
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
+/* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
  * inverse_root_5, 4 neg. */
 static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
 {
@@ -151,7 +151,7 @@ static void node_value(const double *u, double t, const double *parameters, doub
   value[1] = w3 * u[7] - w4 * w1 * w5 * u[7] - w6 * u[6] * u[0] * u[1];
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1
+/* The same, and the nonzero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1
  * inverse_root_3, 1 inverse_root_5, 1 inverse_root_7, 1 neg. */
 static void node_slope(const double *u, double t, const double *parameters, double *value, double *slope)
 {
@@ -220,7 +220,7 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
   value[0] = 0.5 * (u[2] * u[2] + u[3] * u[3] + 2.0 * parameters[0] * inverse_root_1(u[0] * u[0] + u[1] * u[1]));
 }
 
-/* What is conserved at u = (q, p), then the sums of the squares of the terms. Operations: 8 *, 1 +, 1 -. */
+/* Momentum maps at u = (q, p), then the sums of the squares of their terms. Operations: 8 *, 1 +, 1 -. */
 static void momentum_maps(const double *u, double t, const double *parameters, double *value)
 {
   (void)t, (void)parameters;

@@ -54,7 +54,7 @@ static void quadrature_value(const double *u, double t, const double *parameters
   value[1] = parameters[0] * (parameters[1] * parameters[1]) * u[1];
 }
 
-/* The same, and the non-zero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
+/* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
 static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
 {
   (void)t;

@@ -104,7 +104,9 @@ class StepEquations:
             MethodError: for other methods.
         """
         if not isinstance(self.method, SpectralCollocation):
-            raise MethodError(f"the matrix form (18), (21) is one of spectral collocation, not of {self.method.name}")
+            raise MethodError(
+                f"{self.method.name} has no matrix form (18), (21): it is available for spectral collocation"
+            )
         return matrix_form(self.system, self.method, self.unknowns, self.state, self.time, self.step)
 
     def to_text(self) -> str:

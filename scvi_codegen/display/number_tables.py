@@ -48,7 +48,7 @@ class NumberTable:
 @singledispatch
 def number_table(part: Part) -> NumberTable:
     """Return all numbers of a part of a method."""
-    raise TypeError(f"{part!r} has no numbers to show")
+    raise TypeError(f"{part!r} must be Nodes, a Quadrature or a Tableau")
 
 
 @number_table.register

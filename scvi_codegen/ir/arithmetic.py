@@ -108,7 +108,10 @@ class _Graph:
             return self._power(*expression.as_base_exp())
         name = FUNCTIONS.get(expression.func)
         if name is None:
-            raise SystemDefinitionError(f"the function in '{expression}' has no C counterpart")
+            raise SystemDefinitionError(
+                f"the function in '{expression}' is not supported in C: use "
+                f"{', '.join(FUNCTIONS.values())}, powers or roots"
+            )
         return self.node((name, tuple(self.read(argument) for argument in expression.args)))
 
     def _sum(self, expression: sympy.Add) -> int:

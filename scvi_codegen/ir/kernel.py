@@ -173,13 +173,15 @@ class IndexedSum:
         """Raise ``ValueError`` for a term or tables that do not fit a kernel."""
         term, slots = self.term, self.term.arguments - len(self.given)
         if term.sums or term.values != len(term.results) or not (self.targets or slots == term.values):
-            raise ValueError(f"the term '{term.name}' has not as many values as targets, or has slopes or loops")
+            raise ValueError(f"the term '{term.name}' must have one value per target, no derivatives and no loops")
         for rows, width, most in ((self.table, slots, kernel.arguments), (self.aims, term.values, kernel.values)):
             for row in rows:
                 if len(row) != width or not all(0 <= place < most for place in row):
-                    raise ValueError(f"'{term.name}' takes {width} places below {most}, not {row}")
+                    raise ValueError(
+                        f"a row of '{term.name}' must have {width} indices from 0 to {most - 1}; got {row}"
+                    )
         if len({len(self.table), len(self.aims), *map(len, self.given)}) > 1:
-            raise ValueError(f"the tables of '{term.name}' are not of equal length")
+            raise ValueError(f"the tables of '{term.name}' must have the same number of rows")
 
     def __str__(self) -> str:
         """Return the loop as one line."""

@@ -50,5 +50,7 @@ def exact_number(constant: sympy.Expr) -> Number:
     except OverflowError:
         beyond = True
     if beyond:
-        raise SystemDefinitionError(f"the constant {constant} does not fit a double")
+        raise SystemDefinitionError(
+            f"the constant {constant} is outside the range of double precision: choose other units"
+        )
     return value

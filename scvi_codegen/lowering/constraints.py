@@ -24,7 +24,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
             positions_held(system),
             of=system.coordinates,
             slopes=slopes.values(),
-            purpose="The constraints g of positions, and the slopes G that are not 0, at u = q.",
+            purpose="The constraints g of positions, and their nonzero derivatives G, at u = q.",
         ),
         entries=tuple(slopes),
         motion=system_kernel(
@@ -32,6 +32,6 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
             "constrained_motion",
             (*forms_of(system).applied_force, *rates, *along_motion(system, rates)),
             of=(*system.coordinates, *system.velocities),
-            purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and what they grow by where v stays, at u = (q, v).",
+            purpose="L_q - L_vq v - L_vt + f, then rates G v + .., and their derivatives in time at constant v.",
         ),
     )

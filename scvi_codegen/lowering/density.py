@@ -43,6 +43,6 @@ def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
         "density",
         (1 / g, -change / g),
         of=forms.legendre_arguments,
-        purpose=f"1/g and -d(log g)/dt of the monitor g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",
+        purpose=f"1/g and -d(log g)/dt of the time rescaling g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",
     )
     return Control(density=kernel)

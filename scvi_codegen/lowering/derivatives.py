@@ -49,7 +49,7 @@ def _given_slopes(
         f"{name}_by_given",
         entries.values(),
         of=arguments,
-        purpose="The non-zero derivatives with respect to parameters and time.",
+        purpose="Nonzero derivatives with respect to parameters and time.",
     )
     return GivenSlopes(entries=tuple(entries), kernel=kernel)
 
@@ -66,7 +66,7 @@ def _linear_clock(system: MechanicalSystem, arguments: Sequence[Symbol]) -> Line
             (rate,),
             of=arguments,
             slopes=slopes.values(),
-            purpose="The rate of time and its non-zero slopes by arguments and parameters.",
+            purpose="The rate of time and its nonzero derivatives with respect to arguments and parameters.",
         ),
         level=_level_slopes(system),
     )
@@ -86,7 +86,7 @@ def _level_slopes(system: MechanicalSystem) -> Kernel:
         "level_slopes",
         [slope / system.clock.rate for slope in (*by_others[:m], *by_p, *by_others[m:])],
         of=forms_of(system).legendre_arguments,
-        purpose="Slopes of the energy by q, p and parameters, at u on its level: "
+        purpose="Gradient of the energy with respect to q, p and parameters at "
         f"u = (q, {'p' if system.auxiliaries else 'v'}).",
     )
 
@@ -106,5 +106,5 @@ def _curvature(system: MechanicalSystem, family: PointFamily) -> Kernel | None:
         f"{family.name}_curvature",
         [slopes.get(j, S.Zero) for j in range(len(depends))],
         of=(*family.arguments, *multipliers, *changes),
-        purpose="Slopes of all results times multipliers, as they change along a change of all they depend on.",
+        purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )

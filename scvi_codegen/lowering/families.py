@@ -62,7 +62,7 @@ def lowered_family(system: MechanicalSystem, family: PointFamily, sites: Sites) 
             family.results,
             of=family.arguments,
             slopes=slopes,
-            purpose=f"The same, and the non-zero derivatives with respect to {u}.",
+            purpose=f"The same, and the nonzero derivatives with respect to {u}.",
         ),
         blocks=blocks,
         integrand=_integrand(system, family, u) if family.in_action else None,
@@ -87,7 +87,7 @@ def _results(family: PointFamily, names: tuple[str, ...]) -> str:
 def _integrand(system: MechanicalSystem, family: PointFamily, u: str) -> Kernel | None:
     """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
     if given := exchanges(system):
-        rates, purpose = [each.rate for each in given], f"What forces give per unit of time, at {u}."
+        rates, purpose = [each.rate for each in given], f"Power and impulse rates of the forces at {u}."
         return system_kernel(system, "exchanges", rates, of=family.arguments, purpose=purpose)
     if not has_action(system):
         return None
@@ -160,9 +160,10 @@ def _check_symmetry(family: PointFamily, entries: Mapping[tuple[int, int], sympy
         if abs(one - other) > UNLIKE * size:  # the terms may cancel
             u = family.arguments
             raise MethodError(
-                f"the results of the family '{family.name}' are not the gradient of its scalar: the derivative of that "
+                f"the results of the stage group '{family.name}' are not the gradient of its scalar: the "
+                "derivative of that "
                 f"for {u[i]} by {u[j]} is {pair[0]}, of that for {u[j]} by {u[i]} {pair[1]}. They must be equal: check "
-                "the signs and the order of the results in its scatters, or give the family no scalar"
+                "the signs and the order of the results in its scatters, or give the stage group no scalar"
             )
 
 

@@ -43,7 +43,7 @@ SOLVERS = ("fixed-point", "newton")
 def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) -> None:
     """Raise an error unless the solver is one of :data:`SOLVERS`."""
     if solver not in SOLVERS:
-        raise error(f"the solver of sums over indices is {' or '.join(SOLVERS)}, not {solver!r}")
+        raise error(f"unknown solver {solver!r} of an indexed system: use {' or '.join(map(repr, SOLVERS))}")
 
 
 def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
@@ -65,7 +65,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
     splitting = None if held else splitting_of(one, method)
     if splitting and system.velocities:
         raise MethodError(
-            f"{method.name} is explicit for forces of positions and time: for those of velocities take an SVI or a "
+            f"{method.name} does not support velocity-dependent forces of indexed systems: use an SVI or a "
             "Runge-Kutta method"
         )
     kernels = [_force(system, term, number) for number, term in enumerate(system.potentials)]
@@ -74,8 +74,8 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
     products, diagonals = curvature(system) if newton else ((), ())
     if newton and (splitting or held or system.momenta or system.velocities or not products):
         raise MethodError(
-            "Newton's iteration is there for Lagrangians of sums over indices with curved potentials, forces of "
-            "positions and time, and methods that are not explicit: leave out solver='newton'"
+            "Newton's method for indexed systems requires a Lagrangian with a potential that is not linear, forces of "
+            "positions and time, no constraints, and an implicit method: leave out solver='newton'"
         )
     sweep = None if splitting or held else _sweep(one, method, velocities=bool(system.velocities))
     return IndexedProgram(
@@ -117,7 +117,7 @@ def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> Separa
         return found
     explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
     raise MethodError(
-        f"{method.name} has no sweeps over positions: for sums over indices take an SVI, a Runge-Kutta method of at "
+        f"{method.name} is not supported for indexed systems: use an SVI, a Runge-Kutta method of at "
         f"most 32 points{explicit}"
     )
 
@@ -134,7 +134,9 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
         slots=tuple(arrays[slot] for slot in u),
         targets=tuple(arrays[slot] for slot in u),
         given=given_of(term.slots, u),
-        kernel=kernel_of(system, f"force_{number}", values, term.slots, u, "Derivatives by its coordinates."),
+        kernel=kernel_of(
+            system, f"force_{number}", values, term.slots, u, "Derivatives with respect to its coordinates."
+        ),
     )
     scalar = kernel_of(system, f"term_{number}", [term.formula], term.slots, u, "The term.")
     return replace(looped, scalar=scalar)
@@ -193,7 +195,9 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         slots=(*accesses, *accesses),
         targets=targets,
         given=given,
-        kernel=kernel_of(system, f"product_{number}", along, both, [*u, *w], "Forces along a direction."),
+        kernel=kernel_of(
+            system, f"product_{number}", along, both, [*u, *w], "Jacobian of the forces times a direction."
+        ),
         along=len(accesses),
     )
     diagonal = LoopedKernel(
@@ -202,7 +206,7 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         slots=accesses,
         targets=targets,
         given=given,
-        kernel=kernel_of(system, f"diagonal_{number}", own, force.slots, u, "By the coordinate itself."),
+        kernel=kernel_of(system, f"diagonal_{number}", own, force.slots, u, "Diagonal of the Jacobian of the forces."),
     )
     return product, diagonal
 

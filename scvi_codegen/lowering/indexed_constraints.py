@@ -43,7 +43,10 @@ def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> He
         MethodError: for other methods, and for velocity-dependent forces.
     """
     if system.velocities:
-        raise MethodError("with constraints, sums over indices have forces of positions and time alone")
+        raise MethodError(
+            "velocity-dependent forces are not supported for indexed systems with constraints: remove "
+            "the forces or the constraints"
+        )
     pairs = list(_kernels(system))
     conditions, bends = (tuple(kernels) for kernels in zip(*pairs, strict=True))
     return HeldSteps(conditions=conditions, bends=bends, parts=lower_vector(_parts(stages, method)))
@@ -57,7 +60,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
     if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
         return (mp.one,)
     raise MethodError(
-        f"{method.name} does not keep the constraints of sums over indices: take 'stoermer-verlet', which is "
+        f"{method.name} does not support constraints of indexed systems: use 'stoermer-verlet', which is "
         "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
     )
 
@@ -76,7 +79,7 @@ def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel
             slots=accesses,
             targets=accesses,
             given=given_of(term.slots, u),
-            kernel=kernel_of(system, f"condition_{number}", values, term.slots, u, "g, g_t, and the slopes of g."),
+            kernel=kernel_of(system, f"condition_{number}", values, term.slots, u, "g, g_t, and the derivatives of g."),
         )
         both = [*term.slots, *zip(v, accesses, strict=True)]
         second = [bend_of(term, system.coordinates, system.time, v)]

@@ -18,7 +18,9 @@ def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) 
     """Return the kernel of the functions that a run integrates along its curve; ``None`` if there are none."""
     if not system.integrands:
         return None
-    return system_kernel(system, name, system.integrands, of=of, purpose="What is integrated along the curve.")
+    return system_kernel(
+        system, name, system.integrands, of=of, purpose="Functions that are integrated along the curve."
+    )
 
 
 def damping_kernel(system: MechanicalSystem) -> Kernel | None:

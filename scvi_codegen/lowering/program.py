@@ -184,7 +184,7 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
         return None
     if not isinstance(stages.shape, Velocities):
         raise MethodError(
-            f"{method.name} keeps no curve at the end of a step whose points give the time of '{system.name}': take "
+            f"{method.name} does not support the time transformation of '{system.name}': use "
             "an SVI, or a Runge-Kutta method in phase space"
         )
     return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
@@ -228,7 +228,7 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
         "momentum_maps",
         (*maps, *squares),
         of=(*symmetries[0].coordinates, *symmetries[0].momenta),
-        purpose="What is conserved at u = (q, p), then the sums of the squares of the terms.",
+        purpose="Momentum maps at u = (q, p), then the sums of the squares of their terms.",
     )
 
 

@@ -39,7 +39,10 @@ def sites_of(stages: StageSystem, dimension: int) -> Sites:
     columns, lines = ({size: _places(size, each) for size in sizes} for each in (blocks, rows))
     if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
         counts = ", ".join(f"{len(columns[size])} blocks and {len(lines[size])} rows of {size}" for size in sizes)
-        raise MethodError(f"stage equations are compiled with as many blocks as rows of every size, not {counts}")
+        raise MethodError(
+            "stage equations must have as many blocks as rows of every size, and equally many of all "
+            f"sizes; got {counts}"
+        )
     first = {size: sum(sizes[:k]) for k, size in enumerate(sizes)}
     return Sites(first, columns, lines, sum(sizes))
 

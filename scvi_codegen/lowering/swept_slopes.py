@@ -37,10 +37,12 @@ def _separable(system: LagrangianSystem) -> SweptSlopes:
     slopes = jacobian(forms.force, q) or NOTHING
     different = tuple(dict.fromkeys(slopes.values()))
     masses = jacobian(tuple(forms.mass.values()), system.parameters)
-    purpose = "Slopes of the constant masses by parameters."
+    purpose = "Derivatives of the constant masses with respect to parameters."
     kernel = system_kernel(system, "mass_by_given", masses.values(), of=(), purpose=purpose)
     return SweptSlopes(
-        slopes=system_kernel(system, "point_slopes", different, of=q, purpose="L_qq at all points, each value once."),
+        slopes=system_kernel(
+            system, "point_slopes", different, of=q, purpose="The distinct entries of L_qq at all points."
+        ),
         beside=0,
         products=_products(system, slopes, different, size=len(q)),
         given=_by_given(system, forms.force, q),
@@ -63,7 +65,7 @@ def _coupled(system: LagrangianSystem) -> SweptSlopes:
         (*forms.momentum, *different),
         of=of,
         slopes=forms.lower_mass.values(),
-        purpose="L_v, what L_qq, L_qv and -L_vq have, each value once, and the lower triangle of L_vv at all points.",
+        purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and the lower triangle of L_vv at all points.",
     )
     return SweptSlopes(
         slopes=at_points,
@@ -81,7 +83,7 @@ MAKERS: dict[str, Callable[[LagrangianSystem], SweptSlopes]] = {
 
 def _by_given(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> GivenSlopes:
     entries = jacobian(results, (*system.parameters, system.time)) or NOTHING
-    purpose = "What these have by parameters and time, at all points."
+    purpose = "Their derivatives with respect to parameters and time, at all points."
     kernel = system_kernel(system, "given_slopes", entries.values(), of=of, purpose=purpose)
     return GivenSlopes(entries=tuple(entries), kernel=kernel)
 
@@ -101,6 +103,6 @@ def _products(
             rows[i].append(Mul(values[number[value]], x[j]))
         return system_kernel(system, name, [Add(*row) for row in rows], of=(*x, *values), purpose=purpose)
 
-    forward = product("by_slopes", slopes, "The matrix of slopes times x, u = (x, its values).")
+    forward = product("by_slopes", slopes, "The matrix of derivatives times x, u = (x, its entries).")
     turned = product("by_slopes_back", back, "Its transpose times x.") if back != slopes else forward
     return forward, turned

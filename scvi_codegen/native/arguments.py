@@ -26,14 +26,12 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     for word in ("unit", "units"):  # of astropy, of pint; not the label of a row or a column
         unit = getattr(value, word) if hasattr(type(value), word) else None
         if unit is not None and str(unit) not in ("", "dimensionless"):
-            raise StateError(
-                f"{name} has the unit {unit}, which L does not know: give numbers in those of its parameters"
-            )
+            raise StateError(f"{name} has the unit {unit}: give plain numbers in the units of the parameters")
     try:
         given = np.asanyarray(value)
         rows = value if isinstance(value, list | tuple) else ()
         if np.ma.is_masked(given) or any(map(np.ma.is_masked, rows)):
-            raise StateError(f"{name} has masked entries: fill them, or leave them out")
+            raise StateError(f"{name} has masked entries: fill or remove them")
         if given.dtype.kind == "O" and any(entry is None for entry in given.flat):
             raise StateError(f"{name} must be real numbers, not None")
         if given.dtype.kind not in REAL_KINDS and given.size:
@@ -69,13 +67,13 @@ def checked_number(value: Any, name: str) -> float:
         raise StateError(f"{name} must be a real number, not {value!r}")
     number = value if array is None else float(array)
     if not math.isfinite(number):
-        raise StateError(f"{name} is {number}: a finite number is wanted")
+        raise StateError(f"{name} is {number}: it must be finite")
     return float(number)
 
 
 def checked_step(h: float) -> float:
     """Return a finite step size other than 0."""
-    number = checked_number(h, "the step h")
+    number = checked_number(h, "the step size h")
     if number == 0.0:
-        raise StateError("the step h is 0: it must be positive, or negative to go back")
+        raise StateError("the step size h is 0: it must be positive, or negative to integrate backward")
     return number

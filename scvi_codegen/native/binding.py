@@ -49,7 +49,7 @@ class Binding:
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._origin is None:
-            raise TypeError("a binding is pickled with the stepper that it is of")
+            raise TypeError("a binding cannot be pickled by itself: pickle its stepper")
         return getattr, self._origin
 
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
@@ -64,7 +64,7 @@ class Binding:
             return self
         if self._fallback is None:
             raise MethodError(
-                f"the function {name} needs Newton's iteration, which this integrator was compiled without: compile it "
+                f"the function {name} requires Newton's method, which this integrator does not include: compile it "
                 "with solver='auto' or solver='newton'"
             )
         if self._lender is None:

@@ -131,7 +131,10 @@ def _load_or_build(source: Source, compiler: tuple[str, ...], flags: tuple[str, 
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         return _load_from(temporary, source, compiler, flags, name)
     except OSError as error:
-        raise BuildError("neither the cache folder nor the temporary folder can be written") from error
+        raise BuildError(
+            f"neither the cache folder nor the temporary folder can be written: set {CACHE_VARIABLE} to a "
+            "folder that can"
+        ) from error
 
 
 def _load_from(folder: Path, source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], name: str) -> Library:
@@ -151,9 +154,9 @@ def _load_from(folder: Path, source: Source, compiler: tuple[str, ...], flags: t
             return _open(entry)
         except ImportError as error:
             if _is_intact(entry):
-                made = f"what the compiler {' '.join(compiler)!r} made cannot be loaded here"
+                made = f"the library made by the compiler {' '.join(compiler)!r} cannot be loaded on this machine"
                 raise BuildError(f"{made}: {error}") from error
-    raise OSError(f"{entry} is removed as soon as it is made")
+    raise OSError(f"{entry} was removed by another process {ATTEMPTS} times while it was loaded")
 
 
 def _library(entry: Path) -> Path:
@@ -242,8 +245,8 @@ def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
                 raise
     if not _library(folder).is_file():
         raise BuildError(
-            f"{' '.join(compiler)!r} made no library, and reported no error: it is no C compiler. Set the environment "
-            "variable CC to one, as in CC=gcc"
+            f"{' '.join(compiler)!r} created no library and reported no error: it is not a C compiler. Set the "
+            "environment variable CC to one, as in CC=gcc"
         )
     for name in parts:
         (folder / f"{name}.o").unlink(missing_ok=True)
@@ -318,9 +321,9 @@ def _finished(command: list[str], folder: Path) -> Iterator[None]:
         try:
             _, errors = process.communicate(timeout=COMPILE_SECONDS)
         except subprocess.TimeoutExpired as error:
-            raise BuildError(f"the compiler took longer than {COMPILE_SECONDS} s: {' '.join(command)}") from error
+            raise BuildError(f"the compiler was stopped after {COMPILE_SECONDS} s: {' '.join(command)}") from error
     if process.returncode in NOT_RUN:
         raise BuildError(f"the compiler {command[0]!r} does not run: {errors.strip()}{another_compiler(command)}")
     if process.returncode:
         shown = "\n".join(errors.splitlines()[:30])
-        raise BuildError(f"the C compiler refused the text\n{' '.join(command)}\n{shown}{another_compiler(command)}")
+        raise BuildError(f"the C compiler rejected the source\n{' '.join(command)}\n{shown}{another_compiler(command)}")

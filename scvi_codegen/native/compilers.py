@@ -30,7 +30,9 @@ def find_compiler() -> tuple[str, ...]:
     if chosen:
         command = words_of("CC")
         if not command or shutil.which(command[0]) is None:
-            raise BuildError(f"the compiler named by the environment variable CC ({chosen!r}) was not found")
+            raise BuildError(
+                f"the compiler in the environment variable CC ({chosen!r}) was not found: correct or unset CC"
+            )
         return command
     for name in ("cc", "gcc", "clang"):
         if shutil.which(name):
@@ -98,4 +100,4 @@ def another_compiler(command: list[str]) -> str:
     """Return advice for an incomplete compiler, e.g. without headers or linker."""
     if from_wheel(tuple(command)):
         return ""
-    return f"\nif this compiler is not whole, {WHEEL}, and set CC='python -m ziglang cc'"
+    return f"\nif this compiler is incomplete, {WHEEL}, and set CC='python -m ziglang cc'"

@@ -32,12 +32,14 @@ def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> byt
         BuildError: without the extra ``compiler``, or if it rejects the source.
     """
     if importlib.util.find_spec("ziglang") is None:
-        raise BuildError(f"for {platform} it takes a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)")
+        raise BuildError(
+            f"compiling for {platform} requires a cross compiler: pip install 'scvi-codegen[compiler]' (ziglang)"
+        )
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-") as name:
         folder, made = Path(name), "library"
         source.write(folder)
         texts = [f"{each.prefix}.c" for each in source.sources]
         command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
-        with waiting_for(f"compiling for {platform}, which takes longest when it is done first"):
+        with waiting_for(f"compiling for {platform}, slowest the first time"):
             run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", made], folder)
         return (folder / made).read_bytes()

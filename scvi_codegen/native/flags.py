@@ -28,7 +28,8 @@ def check_flags(flags: Sequence[str], error: type[ValueError] = ValueError) -> N
     for flag in flags:
         if not isinstance(flag, str) or not ALLOWED.fullmatch(flag):
             raise error(
-                f"the compiler flag {flag!r} is not one that a recorded run may name: flags of optimisation (-O2), "
+                f"the compiler flag {flag!r} is not allowed in a recorded run: allowed are flags of "
+                "optimisation (-O2), "
                 "floating point (-ffp-contract=off), processor (-march=native), definitions (-DNAME=1). Leave it out, "
-                "or give it in the environment variable SCVI_CODEGEN_CFLAGS"
+                "or set it in the environment variable SCVI_CODEGEN_CFLAGS"
             )

@@ -11,7 +11,7 @@ from scvi_codegen.rendering.printer import print_number
 
 __all__ = ["ladder_text"]
 
-HEAD = "/* From what is kept of former steps to a guess of the next: by changes of rung. Before it: points.h. */\n"
+HEAD = "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
 
 
 def ladder_text(ladder: Ladder) -> str:

@@ -99,7 +99,7 @@ def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
     elif isinstance(function, Expr):
         found = _translated(function)
     else:
-        raise EventError(f"the function of an event is text or a SymPy expression, not {function!r}")
+        raise EventError(f"the function of an event must be text or a SymPy expression; got {function!r}")
     problem = unsupported_part(found)
     if problem:
         raise EventError(f"in the event function '{function}': {problem}")
@@ -110,7 +110,10 @@ def _expression(function: str | Expr, names: Mapping[str, Symbol]) -> Expr:
             f"an input nor a parameter{closest(unknown[0], names)} Known here: {', '.join(names)}"
         )
     if not found.free_symbols:
-        raise EventError(f"the event function '{function}' is constant: it never crosses zero")
+        raise EventError(
+            f"the event function '{function}' is constant and never crosses zero: use a function of the "
+            "state or of time"
+        )
     return found
 
 
@@ -121,7 +124,10 @@ def _translated(function: Expr) -> Expr:
         rules[moving] = symbol(identifier(moving.func.__name__))
     for rate in function.atoms(sympy.Derivative):
         if not isinstance(rate.expr, AppliedUndef) or rate.derivative_count != 1:
-            raise EventError(f"'{rate}' in the event function '{function}' is not the velocity of a coordinate")
+            raise EventError(
+                f"'{rate}' in the event function '{function}' is not the velocity of a coordinate: use first "
+                "derivatives of coordinates"
+            )
         rules[rate] = symbol(identifier(rate.expr.func.__name__) + DOT)
     try:
         return evaluated(function, rules)

@@ -171,7 +171,7 @@ def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     known = [*sizes_text(program, how), *(f"(void){name};" for name in ("run", "given", "n"))]
     head = f"static sharing share_{looped.kernel.name}(const run_memory *run, const problem *given, long long n)"
     lines = "\n".join(f"  {line}" for line in [*known, f"return {how};"])
-    return f"/* Its rounds. */\n{head}\n{{\n{lines}\n}}"
+    return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
 
 
 def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) -> str:

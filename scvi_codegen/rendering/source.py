@@ -97,7 +97,9 @@ class Source:
         names = record["prefix"], *record.get("support", {})
         for name, pattern in zip(names, (PREFIX, *[SUPPORT] * len(names)), strict=False):
             if not (isinstance(name, str) and pattern.fullmatch(name)):
-                raise ValueError(f"{name!r} is not the name of a file of an integrator")
+                raise ValueError(
+                    f"{name!r} is not the name of a file of an integrator: it must be a C identifier, or support/NAME.h"
+                )
         beside = record.get("beside")
         return cls(
             prefix=record["prefix"],
@@ -141,15 +143,17 @@ def check_interface(source: Source, interface: Interface) -> None:
     lengths["map_formulas"] = (len(interface.map_formulas), len(interface.map_names))
     for name, (found, wanted) in lengths.items():
         if found != wanted:
-            raise ValueError(f"{name}: {found} where {wanted} is wanted")
+            raise ValueError(f"{name}: the interface has {found}; {wanted} is required")
     if not set(interface.inputs) <= {name[:-2] for name in interface.parameters if name.endswith("_0")}:
-        raise ValueError(f"inputs {interface.inputs} are no parameters")
+        raise ValueError(
+            f"the inputs {interface.inputs} must be among the parameters, each with its first parameter NAME_0"
+        )
 
 
 def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
     wanted = int(found[1]) if found else 0
     if size != wanted:
-        raise ValueError(f"{name} is {size}, and {wanted} in the C text")
+        raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
 
 
 def included(code: str) -> tuple[str, ...]:
@@ -238,5 +242,5 @@ class Interface:
         arguments: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
         for each in fields(cls):
             if each.name in arguments and not KINDS[str(each.type)](arguments[each.name]):
-                raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}, which is no {each.type}")
+                raise ValueError(f"{each.name} is {arguments[each.name]!r:.60}: it must be of type {each.type}")
         return cls(**arguments)

@@ -69,7 +69,8 @@ class Target:
         for value in values:
             if value != 0.0 and not self.smallest <= abs(value) <= self.largest:
                 raise MethodError(
-                    f"{self.name} precision cannot hold the number {float(value)!r}: choose other units, or 'double'"
+                    f"the number {float(value)!r} is outside the range of {self.name} precision: choose "
+                    "other units, or 'double'"
                 )
 
 

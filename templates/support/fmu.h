@@ -130,7 +130,7 @@ FMI_EXPORT fmi3Instance FMI(InstantiateCoSimulation)(fmi3String name, fmi3String
   one->logs_discards = logging;
   set_start(&one->now);
   if (!token || strcmp(token, TOKEN) != 0)
-    wrong = "the instantiation token is that of another FMU";
+    wrong = "the instantiation token belongs to another FMU: use the token of this modelDescription.xml";
   else if (events || count > 0)
     wrong = "this FMU has no event mode and no intermediate variables";
   if (!wrong)
@@ -153,7 +153,7 @@ FMI_EXPORT fmi3Status FMI(SetDebugLogging)(fmi3Instance instance, fmi3Boolean lo
   for (size_t k = 0; k < count; k++) {
     const bool discards = strcmp(categories[k], "logStatusDiscard") == 0;
     if (!discards && strcmp(categories[k], "logStatusError") != 0)
-      return failed(one, fmi3Error, "there is no log category %.80s", categories[k]);
+      return failed(one, fmi3Error, "unknown log category %.80s: use logStatusDiscard or logStatusError", categories[k]);
     named = named || discards;
   }
   one->logs_discards = named ? logging : one->logs_discards;
@@ -168,7 +168,7 @@ FMI_EXPORT fmi3Status FMI(EnterInitializationMode)(fmi3Instance instance, fmi3Bo
   if (one->now.mode != INSTANTIATED)
     return not_now(one, "fmi3EnterInitializationMode");
   if (0 * start != 0)
-    return failed(one, fmi3Error, "the start time is not finite");
+    return failed(one, fmi3Error, "the start time must be finite");
   one->now.values[TIME] = start;
   one->now.behind = true;
   one->now.mode = INITIALIZATION_MODE;

@@ -5,15 +5,15 @@
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #endif
 
-#define ABSENT(word, ...)                                             \
-  FMI_EXPORT fmi3Status FMI(word)(fmi3Instance instance, __VA_ARGS__) \
-  {                                                                   \
-    return failed(instance, fmi3Error, "this FMU has no fmi3" #word); \
+#define ABSENT(word, ...)                                                       \
+  FMI_EXPORT fmi3Status FMI(word)(fmi3Instance instance, __VA_ARGS__)           \
+  {                                                                             \
+    return failed(instance, fmi3Error, "this FMU does not support fmi3" #word); \
   }
-#define NO_MODE(word)                                                 \
-  FMI_EXPORT fmi3Status FMI(word)(fmi3Instance instance)              \
-  {                                                                   \
-    return failed(instance, fmi3Error, "this FMU has no fmi3" #word); \
+#define NO_MODE(word)                                                           \
+  FMI_EXPORT fmi3Status FMI(word)(fmi3Instance instance)                        \
+  {                                                                             \
+    return failed(instance, fmi3Error, "this FMU does not support fmi3" #word); \
   }
 #define NO_VARIABLES(type)                                                                                        \
   FMI_EXPORT fmi3Status FMI(Get##type)(fmi3Instance instance, const fmi3ValueReference *references, size_t count, \
@@ -90,7 +90,7 @@ FMI_EXPORT fmi3Instance FMI(InstantiateModelExchange)(fmi3String name, fmi3Strin
     fmi3Boolean visible, fmi3Boolean logging, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
 {
   if (log)
-    log(environment, fmi3Error, "logStatusError", "this FMU is for co-simulation alone");
+    log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");
   return NULL;
 }
 
@@ -99,6 +99,6 @@ FMI_EXPORT fmi3Instance FMI(InstantiateScheduledExecution)(fmi3String name, fmi3
     fmi3Callback clock_update, fmi3Callback lock, fmi3Callback unlock)
 {
   if (log)
-    log(environment, fmi3Error, "logStatusError", "this FMU is for co-simulation alone");
+    log(environment, fmi3Error, "logStatusError", "this FMU supports only co-simulation");
   return NULL;
 }

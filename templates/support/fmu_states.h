@@ -5,7 +5,7 @@ static fmi3Status keep_state(const fmu *one, const void *state, fmi3FMUState *ke
 {
   *kept = *kept ? *kept : malloc(sizeof(fmu_state));
   if (!*kept)
-    return failed(one, fmi3Error, "there is no memory for a state");
+    return failed(one, fmi3Error, "there is not enough memory for a state");
   memcpy(*kept, state, sizeof(fmu_state));
   return fmi3OK;
 }
@@ -20,7 +20,7 @@ FMI_EXPORT fmi3Status FMI(SetFMUState)(fmi3Instance instance, fmi3FMUState state
 {
   fmu *one = instance;
   if (!state)
-    return failed(one, fmi3Error, "no state is given");
+    return failed(one, fmi3Error, "the state to set is NULL");
   memcpy(&one->now, state, sizeof one->now);
   return fmi3OK;
 }
@@ -45,7 +45,7 @@ FMI_EXPORT fmi3Status FMI(SerializedFMUStateSize)(fmi3Instance instance, fmi3FMU
 FMI_EXPORT fmi3Status FMI(SerializeFMUState)(fmi3Instance instance, fmi3FMUState state, fmi3Byte *bytes, size_t size)
 {
   if (!state || size != sizeof(fmu_state))
-    return failed(instance, fmi3Error, "a state has %lu bytes", (unsigned long)sizeof(fmu_state));
+    return failed(instance, fmi3Error, "the buffer of a serialized state must have %lu bytes", (unsigned long)sizeof(fmu_state));
   memcpy(bytes, state, size);
   return fmi3OK;
 }
@@ -54,6 +54,6 @@ FMI_EXPORT fmi3Status FMI(DeserializeFMUState)(fmi3Instance instance, const fmi3
     fmi3FMUState *state)
 {
   if (size != sizeof(fmu_state) || memcmp(bytes, TOKEN, sizeof TOKEN) != 0)
-    return failed(instance, fmi3Error, "these bytes are no state of this FMU");
+    return failed(instance, fmi3Error, "these bytes are not a serialized state of this FMU");
   return keep_state(instance, bytes, state);
 }

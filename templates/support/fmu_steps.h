@@ -23,13 +23,13 @@ static fmi3Status put_on_constraints(fmu *one)
   double *x = one->now.values, q[M], p[M], size = 0, moved = 0;
   const int status = PROJECT(x[TIME], x + POSITIONS, x + MOMENTA, x + FIRST_PARAMETER, q, p, one->workspace);
   if (status != STATUS(OK))
-    return failed(one, fmi3Error, "no state near the initial one meets the constraints: %s", reason(status));
+    return failed(one, fmi3Error, "the projection of the initial state onto the constraints failed: %s", reason(status));
   for (int i = 0; i < M; i++) {
     size = fmax(size, fabs(q[i]));
     moved = fmax(moved, fabs(q[i] - x[POSITIONS + i]));
   }
   if (moved > FAR_OFF * size)
-    return failed(one, fmi3Error, "the initial positions are off the constraints by %.1e of their size", moved / size);
+    return failed(one, fmi3Error, "the initial positions violate the constraints by %.1e of their size: correct them", moved / size);
   memcpy(x + POSITIONS, q, sizeof q);
   memcpy(x + MOMENTA, p, sizeof p);
   return fmi3OK;
@@ -87,9 +87,9 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   if (one->now.mode != STEP_MODE)
     return not_now(one, "fmi3DoStep");
   if (!(fabs(point - run->t) <= MISTAKEN * slack_at(point)))
-    return failed(one, fmi3Error, "a step from t = %.17g, where this FMU is at %.17g", point, run->t);
+    return failed(one, fmi3Error, "the communication point is t = %.17g, but the FMU is at t = %.17g", point, run->t);
   if (!(size > 0 && size / STEP < 1 / DBL_EPSILON))
-    return failed(one, fmi3Error, "a communication step of %g: it is positive, and less than 2^52 steps", size);
+    return failed(one, fmi3Error, "the communication step size %g must be positive, and less than 2^52 steps", size);
   one->before = *run;
   status = NAME(advance)(run, plan(run, point + size), LLONG_MAX, x + FIRST_PARAMETER, NULL, &t, q, p, &iterations,
       &report, one->workspace);

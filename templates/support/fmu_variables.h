@@ -30,7 +30,7 @@ static fmi3Status checked(const fmu *one, const fmi3ValueReference *references, 
     return failed(one, fmi3Error, "%lu values for %lu variables", (unsigned long)size, (unsigned long)count);
   for (size_t k = 0; k < count; k++)
     if (!is_known(references[k]))
-      return failed(one, fmi3Error, "there is no variable of reference %lu", (unsigned long)references[k]);
+      return failed(one, fmi3Error, "unknown value reference %lu", (unsigned long)references[k]);
   return fmi3OK;
 }
 
@@ -56,7 +56,7 @@ FMI_EXPORT fmi3Status FMI(SetFloat64)(fmi3Instance instance, const fmi3ValueRefe
     return status;
   for (size_t k = 0; k < count; k++)
     if (!is_settable(references[k], one->now.mode))
-      return failed(one, fmi3Error, "the variable of reference %lu cannot be set now", (unsigned long)references[k]);
+      return failed(one, fmi3Error, "the variable with value reference %lu cannot be set in this mode", (unsigned long)references[k]);
   for (size_t k = 0; k < count; k++)
     one->now.values[references[k]] = values[k];
   one->now.behind = true;

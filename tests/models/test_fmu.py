@@ -234,7 +234,7 @@ def test_initial_states_far_off_their_constraints_are_refused(tmp_path):
     assert near.start(0.0, x=1.001) == OK
     assert_allclose(np.hypot(*near.get("x", "y")), 1.0, rtol=1e-15)
     assert far.start(0.0, x=1.5) == ERROR
-    assert "off the constraints" in far.said[-1][2]
+    assert "violate the constraints" in far.said[-1][2]
 
 
 def test_the_description_has_what_the_standard_asks_for(fmu):

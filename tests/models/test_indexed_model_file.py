@@ -213,4 +213,4 @@ def test_the_example_frees_its_memory_and_refuses_places_outside(net: Path, monk
         Path("net_svi/table_bonds.txt").write_text(f"0 1 1 {wrong}")
         ended = subprocess.run(["./main"], cwd="net_svi", capture_output=True, text=True, check=False)
         assert ended.returncode == 1
-        assert "no place from 0 to 2" in ended.stderr
+        assert "an index from 0 to 2" in ended.stderr

@@ -48,7 +48,7 @@ def test_the_example_goes_to_the_end_by_them(model, tmp_path, solver):
 
 def test_the_example_of_a_step_compares_them_with_it(model, tmp_path):
     lines = output(generate_package(replace(model, h=0.01, tolerance=None), tmp_path / "fixed"))
-    assert "steps of their own lengths" in lines[-1]
+    assert "adaptive steps" in lines[-1]
     assert max(abs(float(word)) for word in lines[-1].split()[-2:]) < 1e-5
 
 

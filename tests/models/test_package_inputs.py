@@ -56,7 +56,7 @@ def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
     assert states[-1, 0] == run.t[-1]
     assert_allclose(states[:, 2][0], stepper.momentum(model.q, model.velocity, t, model.parameters_at_start(stepper)))
     assert_allclose(states[:, 3], (run.energy() - run.energy()[0])[rows], atol=2e-3)
-    (apart,) = re.findall(r"end away from there by (\S+)", printed) or ["0"]
+    (apart,) = re.findall(r"difference of the end (\S+)", printed) or ["0"]
     assert abs(float(apart)) < 1e-2
 
 

@@ -360,7 +360,7 @@ class TestWhatIsRefused:
             ({"h": 0.1, "steps": 10}, "error=1e-06 and h=0.1 both determine the step size"),
             ({"t_end": 1.0, "tolerance": 1e-9}, "and tolerance=1e-09 both determine the step size"),
             ({"t_end": 1.0, "error": 0.0}, "error=0 is no bound .* give a number between 0 and 1"),
-            ({"t_end": 1.0, "error": math.nan}, "a finite number is wanted"),
+            ({"t_end": 1.0, "error": math.nan}, "it must be finite"),
             ({}, "t_end"),
             ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "needs adaptive steps"),
         ],

@@ -358,7 +358,7 @@ def test_failures() -> None:
     )
     with pytest.raises(sc.StateError, match="coordinate 2 of 3 has no positive mass"):
         sc.compile_indexed(bare, "svi:2").start(np.ones(3), h=0.1)
-    with pytest.raises(sc.MethodError, match="no sweeps over positions"):
+    with pytest.raises(sc.MethodError, match="not supported for indexed systems"):
         sc.compile_indexed(bare, "scvi:4")
     with pytest.warns(sc.AccuracyWarning):
         sc.compile_indexed(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)

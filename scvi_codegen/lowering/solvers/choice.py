@@ -48,11 +48,11 @@ def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
 def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
     """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
     if solver not in names:
-        raise MethodError(f"there is no solver {solver!r}; there are {', '.join(names)}")
+        raise MethodError(f"unknown solver {solver!r}: use one of {', '.join(names)}")
     if solver == "explicit" and found is None:
-        raise MethodError(f"{method.name} is not explicit for this system; use solver='auto'")
+        raise MethodError(f"{method.name} is not explicit for this system: use solver='auto'")
     if solver == "fixed-point" and found is None:
         raise MethodError(
-            f"{method.name} has no fixed-point iteration for this system; use solver='auto' or 'newton', "
-            "or at most 32 points, for an SVI at least as many as its degree, for a variational SCVI 8 coordinates"
+            f"{method.name} has no fixed-point iteration for this system: use solver='auto' or 'newton', "
+            "or at most 32 points (an SVI: at least as many as its degree; a variational SCVI: at most 8 coordinates)"
         )
