@@ -153,7 +153,7 @@ FMI_EXPORT fmi3Status FMI(SetDebugLogging)(fmi3Instance instance, fmi3Boolean lo
   for (size_t k = 0; k < count; k++) {
     const bool discards = strcmp(categories[k], "logStatusDiscard") == 0;
     if (!discards && strcmp(categories[k], "logStatusError") != 0)
-      return failed(one, fmi3Error, "unknown log category %.80s: use logStatusDiscard or logStatusError", categories[k]);
+      return failed(one, fmi3Error, "log category %.80s: use logStatusDiscard or logStatusError", categories[k]);
     named = named || discards;
   }
   one->logs_discards = named ? logging : one->logs_discards;

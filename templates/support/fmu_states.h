@@ -45,7 +45,7 @@ FMI_EXPORT fmi3Status FMI(SerializedFMUStateSize)(fmi3Instance instance, fmi3FMU
 FMI_EXPORT fmi3Status FMI(SerializeFMUState)(fmi3Instance instance, fmi3FMUState state, fmi3Byte *bytes, size_t size)
 {
   if (!state || size != sizeof(fmu_state))
-    return failed(instance, fmi3Error, "the buffer of a serialized state must have %lu bytes", (unsigned long)sizeof(fmu_state));
+    return failed(instance, fmi3Error, "the buffer of a state must have %lu bytes", (unsigned long)sizeof(fmu_state));
   memcpy(bytes, state, size);
   return fmi3OK;
 }

@@ -23,13 +23,13 @@ static fmi3Status put_on_constraints(fmu *one)
   double *x = one->now.values, q[M], p[M], size = 0, moved = 0;
   const int status = PROJECT(x[TIME], x + POSITIONS, x + MOMENTA, x + FIRST_PARAMETER, q, p, one->workspace);
   if (status != STATUS(OK))
-    return failed(one, fmi3Error, "the projection of the initial state onto the constraints failed: %s", reason(status));
+    return failed(one, fmi3Error, "projecting the initial state onto the constraints failed: %s", reason(status));
   for (int i = 0; i < M; i++) {
     size = fmax(size, fabs(q[i]));
     moved = fmax(moved, fabs(q[i] - x[POSITIONS + i]));
   }
   if (moved > FAR_OFF * size)
-    return failed(one, fmi3Error, "the initial positions violate the constraints by %.1e of their size: correct them", moved / size);
+    return failed(one, fmi3Error, "the initial positions violate the constraints by %.1e (relative)", moved / size);
   memcpy(x + POSITIONS, q, sizeof q);
   memcpy(x + MOMENTA, p, sizeof p);
   return fmi3OK;

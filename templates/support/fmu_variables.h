@@ -56,7 +56,7 @@ FMI_EXPORT fmi3Status FMI(SetFloat64)(fmi3Instance instance, const fmi3ValueRefe
     return status;
   for (size_t k = 0; k < count; k++)
     if (!is_settable(references[k], one->now.mode))
-      return failed(one, fmi3Error, "the variable with value reference %lu cannot be set in this mode", (unsigned long)references[k]);
+      return failed(one, fmi3Error, "value reference %lu cannot be set in this mode", (unsigned long)references[k]);
   for (size_t k = 0; k < count; k++)
     one->now.values[references[k]] = values[k];
   one->now.behind = true;

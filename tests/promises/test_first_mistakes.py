@@ -46,7 +46,7 @@ def stepper():
         ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: a finite number is wanted"),
         ({"q": [1.0], "p": [0.0], "h": 0.0}, "the step size h is 0: it must be positive, or negative to integrate backward"),
         ({"q": [1.0], "p": [0.0], "h": math.nan}, "the step size h is nan: it must be finite"),
-        ({"q": [1.0], "p": [0.0], "h": "0.1"}, "the step h must be real numbers, not text: '0.1', write it without"),
+        ({"q": [1.0], "p": [0.0], "h": "0.1"}, "the step size h must be real numbers, not text: '0.1', write it without"),
         ({"q": [1.0], "p": [0.0], "steps": -3}, "steps must be at least 0, not -3"),
         ({"q": [1.0], "p": [0.0], "parameters": {"g": 9.8}}, "no parameter 'g': swing has none; its definition"),
     ],

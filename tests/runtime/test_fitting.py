@@ -189,7 +189,7 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"unknown": ["alpha", "alpha"]}, "unknown names 'alpha' twice"),
         ({"observed": ["x", "x"]}, "observed names 'x' twice"),
         ({"deviations": np.inf}, "deviations are a positive number"),
-        ({"h": 0.0}, "the step h is 0"),
+        ({"h": 0.0}, "the step size h is 0"),
     ],
 )
 def test_what_is_wrong_is_named(options, message):

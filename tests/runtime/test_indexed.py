@@ -330,7 +330,7 @@ def test_energies_are_drawn() -> None:
             {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [[1.0]]}},
             r"'k' has the shape \(1, 1\)",
         ),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step h is 0"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step size h is 0"),
         ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' among positions"),
     ],
 )

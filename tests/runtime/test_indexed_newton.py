@@ -114,5 +114,5 @@ def test_what_has_no_newton():
     for system, method in ((field(1.0), "stoermer-verlet"), (damped, "svi:4")):
         with pytest.raises(MethodError, match="leave out solver"):
             sc.compile_indexed(system, method, solver="newton").integrate(np.zeros(3), h=0.1, steps=1)
-    with pytest.raises(MethodError, match="fixed-point or newton"):
+    with pytest.raises(MethodError, match="use 'fixed-point' or 'newton'"):
         sc.compile_indexed(field(1.0), "svi:4", solver="krylov")
