@@ -32,7 +32,7 @@ __all__ = ["Memory", "fill"]
 
 UNHEARD_STEPS = 10**5
 """Largest number of steps per call into C, between checks for Ctrl-C."""
-RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction"), 2**16
+RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction", "failed", "avoiding"), 2**16
 """Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
 NEVER = LARGEST_COUNT
 """Output stride that saves no state."""

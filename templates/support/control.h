@@ -50,7 +50,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, const solver_options
     }
     run->doubted = DOUBTED;
     now->error = INFINITY;
-    if (!shorten(run, now))
+    if (!shorten(run, now, MOST_DOWN))
       return STATUS(VANISHED);
     run->error_before = now->limits.most;
     status = find_step(run, now, options, report);

@@ -38,11 +38,11 @@ static void try_first_step(run_memory *run, trial *now, const solver_options *op
   }
 }
 
-/* Reduces the step size after a failed or rejected trial; returns 0 on step size underflow. */
-static int shorten(run_memory *run, const trial *now)
+/* Reduces the step size after a failed or rejected trial, by 2 to `most` levels; returns 0 on step size underflow. */
+static int shorten(run_memory *run, const trial *now, int most)
 {
   int down = 2;
-  while (down < MOST_DOWN && !(error_at(now->error, -down) <= now->limits.most))
+  while (down < most && !(error_at(now->error, -down) <= now->limits.most))
     down++;
   run->rung -= down;
   run->error_before = error_at(run->error_before, -down);
@@ -61,7 +61,12 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   else
     try_first_step(run, now, options, report);
   while (!(now->error <= now->limits.most * GROWTH)) {
-    if (!shorten(run, now))
+    const int failed = run->error_before > 0 && !(now->error < INFINITY);
+    if (failed) {
+      run->failed = run->rung;
+      run->avoiding = AVOIDED;
+    }
+    if (!shorten(run, now, failed ? DOWN_FAILED : MOST_DOWN))
       return STATUS(VANISHED);
     try_step(run, now, least, options, report);
   }
@@ -70,10 +75,13 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   return OK;
 }
 
-/* Chooses the size of the next step. */
+/* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the
+ * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
 static inline void choose_length(run_memory *run, const trial *now)
 {
-  const int change = next_change(now->error, run->error_before, &now->limits);
+  int change = next_change(now->error, run->error_before, &now->limits);
+  if (run->avoiding > 0 && run->avoiding-- && run->rung + change >= run->failed)
+    change = (int)(run->failed - 1 - run->rung);
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;

@@ -541,3 +541,21 @@ def test_states_at_times_are_kept_up_to_an_end_that_h_does_not_divide(oscillator
 def test_ends_that_steps_of_h_do_not_lead_to_are_refused(oscillators, name, given, message):
     with pytest.raises(StateError, match=message):
         oscillators[name].integrate([1.0], [0.0], **given)
+
+
+def test_a_looser_tolerance_takes_no_more_steps_where_the_iteration_limits_them():
+    """At 1e-3 the error of a charge in a field that depends on z allows sizes at which the iteration diverges."""
+    system = sc.LagrangianSystem.from_text(
+        name="charge",
+        coordinates=["x", "y", "z"],
+        lagrangian="(x_dot**2 + y_dot**2 + z_dot**2)/2 + (5 + 5*z**2/2)*(x*y_dot - y*x_dot)",
+    )
+    stepper = sc.compile_stepper(system, sc.SCVI(5))
+    start = {"q": [0.3, 0.0, 0.2], "velocity": [0.0, 1.0, 0.3], "t_end": 50.0}
+    exact = stepper.integrate(**start)
+    loose, middle, tight = (stepper.integrate(**start, tolerance=tolerance) for tolerance in (1e-3, 1e-5, 1e-6))
+    assert loose.rejected_steps > 10 > tight.rejected_steps
+    assert loose.steps < middle.steps < tight.steps
+    errors = [np.abs(run.q[-1] - exact.q[-1]).max() for run in (loose, middle, tight)]
+    assert errors[0] > errors[2]
+    assert errors[0] < 0.1
