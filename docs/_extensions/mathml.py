@@ -1,5 +1,6 @@
-"""Formulas as MathML, which browsers set by themselves: LaTeX is translated by docutils, without script and network."""
+"""Formulas as MathML, rendered by the browser: docutils translates LaTeX, without script and network."""
 
+import re
 from typing import Any
 
 from docutils import nodes
@@ -7,6 +8,11 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 
 __all__ = ["setup"]
+
+DOTTED = re.compile(
+    r"<munderover>\s*<mi>(\w)</mi>\s*(.*?)\s*(<mo stretchy=\"false\">˙</mo>)\s*</munderover>", re.DOTALL
+)
+"""A velocity with an index, whose index docutils puts below the letter."""
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -16,11 +22,17 @@ def setup(app: Sphinx) -> dict[str, Any]:
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
+def _mathml(latex: str, *, as_block: bool) -> str:
+    """Return MathML in which the index of a dotted letter is a subscript."""
+    translated = tex2mathml(latex, as_block=as_block)
+    return DOTTED.sub(r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>', translated)
+
+
 def _inline(writer: Any, node: nodes.math) -> None:
-    writer.body.append(tex2mathml(node.astext(), as_block=False))
+    writer.body.append(_mathml(node.astext(), as_block=False))
     raise nodes.SkipNode
 
 
 def _display(writer: Any, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="formula">{tex2mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(f'<div class="formula">{_mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode

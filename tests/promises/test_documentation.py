@@ -85,7 +85,7 @@ def test_numbers_that_do_not_are_found(said, printed):
         agree(said, printed)
 
 
-def test_pages_of_the_gallery_have_a_light_picture_what_they_print_and_a_source():
+def test_gallery_pages_have_a_light_picture_a_formula_output_and_a_source():
     gallery = {name: page for name, page in PAGES.items() if Path(name).parent.name == "gallery"}
     index = gallery.pop("gallery/index.md")
     for name, page in gallery.items():
@@ -94,6 +94,11 @@ def test_pages_of_the_gallery_have_a_light_picture_what_they_print_and_a_source(
         assert re.search(r"^Source: ", page, re.MULTILINE), name
         [picture] = PICTURE.findall(page)
         assert (DOCS / "gallery" / picture).stat().st_size < 150_000, name
+        before = page[: page.index("```python")]
+        assert PICTURE.search(before), name
+        assert "$$" in before, name
+        lines = [line for part in runnable(page) if part.kind == "python" for line in part.text.splitlines()]
+        assert [line for line in lines if len(line) > 88] == [], name
 
 
 CODE = re.compile(r"^```.*?^```$|`[^`\n]*`", re.MULTILINE | re.DOTALL)
