@@ -95,7 +95,7 @@ _HOMES = {
     "models.model": ("Model",),
     "models.indexed_model": ("IndexedModel",),
     "models.model_file": ("load_indexed_model", "load_model", "save_model"),
-    "advice.motion": ("Motion", "solve_motion"),
+    "advice.solve_ivp": ("OdeResult", "solve_ivp"),
     "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
     "models.package": ("generate_package", "load_package"),
     "pictures.animation": ("Film", "animate"),

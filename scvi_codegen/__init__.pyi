@@ -2,8 +2,8 @@
 
 from scvi_codegen.advice.advice import Advice as Advice
 from scvi_codegen.advice.advice import advise as advise
-from scvi_codegen.advice.motion import Motion as Motion
-from scvi_codegen.advice.motion import solve_motion as solve_motion
+from scvi_codegen.advice.solve_ivp import OdeResult as OdeResult
+from scvi_codegen.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.compiler import compile_stepper as compile_stepper
 from scvi_codegen.compiler import generate_source as generate_source
 from scvi_codegen.derivation.equations import StepEquations as StepEquations

@@ -229,7 +229,7 @@ class TestPromises:
 
     def test_by_default_steps_choose_their_length(self):
         system = sc.problem("kepler").system
-        motion = sc.solve_motion(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
+        motion = sc.solve_ivp(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
         assert motion.success
         assert motion.y[0, -1] == pytest.approx(1.999, abs=1e-6)
         assert motion.trajectory.goal is not None
@@ -283,12 +283,12 @@ class TestPromises:
         assert "energy" in broken_promise(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
 
     def test_it_is_withdrawn_aloud(self, monkeypatch):
-        for module in ("cli.commands.run", "advice.motion"):
+        for module in ("cli.commands.run", "advice.solve_ivp"):
             monkeypatch.setattr(f"scvi_codegen.{module}.broken_promise", lambda *_: "the tolerance is not kept")
         result = run("kepler --span 5 --advise 1e-6")
         assert result.exit_code == 1
         assert "the tolerance is not kept" in result.stderr
-        motion = sc.solve_motion(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6)
+        motion = sc.solve_ivp(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6)
         assert (motion.success, motion.message) == (False, "the tolerance is not kept")
 
     def test_a_tolerance_that_doubles_do_not_allow_is_said_before(self):
@@ -382,4 +382,4 @@ def _said_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.
 @pytest.mark.parametrize("other", [{"h": 0.1}, {"rtol": 1e-9}, {"monitor": "frequency"}])
 def test_a_promise_of_the_end_goes_with_no_other_steps(other):
     with pytest.raises(sc.StateError, match="give one"):
-        sc.solve_motion(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6, **other)
+        sc.solve_ivp(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6, **other)

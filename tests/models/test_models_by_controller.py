@@ -1,4 +1,4 @@
-"""Models whose steps the reversible controller chooses: files, the command line, ``solve_motion`` and inputs."""
+"""Models whose steps the reversible controller chooses: files, the command line, ``solve_ivp`` and inputs."""
 
 from __future__ import annotations
 
@@ -131,17 +131,17 @@ def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
     exact = plain(model).integrate(model.q, model.p, t_end=12.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of pilot runs, too
-        found = sc.solve_motion(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
+        found = sc.solve_ivp(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
     assert found.success
     assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
-    compiled = sc.solve_motion(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
+    compiled = sc.solve_ivp(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
     earlier = plain(model).integrate(model.q, model.p, t_eval=[-1.5, -3.0], t_end=-3.0)
     assert np.abs(compiled.y[:2, 1:].T - earlier.q).max() < 1e-9
     for wrong in ({"controller": "reversible"}, {"monitor": "frequency", "controller": "pi"}):
         with pytest.raises(SystemDefinitionError, match="controller"):
-            sc.solve_motion(model.system, (0.0, 1.0), state, **wrong)
+            sc.solve_ivp(model.system, (0.0, 1.0), state, **wrong)
     with pytest.raises(StateError, match="need a system, not a compiled stepper"):
-        sc.solve_motion(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
+        sc.solve_ivp(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
 
 
 def test_inputs_are_met_at_their_breakpoints() -> None:

@@ -357,13 +357,13 @@ def test_stiff_systems_take_steps_as_long_as_their_motion_by_newtons_iteration()
 
 def test_solve_motion_takes_the_tolerance_of_steps(kepler):
     q, p = orbit(0.9)
-    motion = sc.solve_motion(kepler, (0.0, 20.0), [*q, *p], rtol=1e-12, t_eval=[5.0, 20.0])
+    motion = sc.solve_ivp(kepler, (0.0, 20.0), [*q, *p], rtol=1e-12, t_eval=[5.0, 20.0])
     assert motion.success
     assert motion.y.shape == (4, 2)
     assert np.abs(motion.y[:2, 1] - exact_position(q, p, 20.0)).max() < 1e-9
     with pytest.raises(StateError, match="t_end"):
-        sc.solve_motion(kepler, (0.0, 20.0), [*q, *p], h=0.1, rtol=1e-12)
-    assert not sc.solve_motion(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
+        sc.solve_ivp(kepler, (0.0, 20.0), [*q, *p], h=0.1, rtol=1e-12)
+    assert not sc.solve_ivp(kepler, (0.0, 2.0), [1.0, 0.0, 0.0, 0.0], rtol=1e-12).success
 
 
 @pytest.mark.parametrize("method", ["svi:5", "svi:8", "gauss:4"])

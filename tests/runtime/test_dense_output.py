@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import solve_ivp as scipy_solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from scvi_codegen.advice.motion import solve_motion
+from scvi_codegen.advice.solve_ivp import solve_ivp
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -172,7 +172,7 @@ def test_a_motion_agrees_with_solve_ivp():
     """The same arguments, attributes and shapes; the pendulum from rest at 2, four turning points."""
     asked = np.linspace(0, 10, 33)
     system = problem("planar-pendulum").system
-    ours = solve_motion(
+    ours = solve_ivp(
         system,
         (0, 10),
         [2.0, 0.0],
@@ -190,7 +190,7 @@ def test_a_motion_agrees_with_solve_ivp():
         return y[1]
 
     turning.direction = 1
-    theirs = solve_ivp(
+    theirs = scipy_solve_ivp(
         lambda t, y: [y[1], -math.sin(y[0])],
         (0, 10),
         [2.0, 0.0],
@@ -214,13 +214,13 @@ def test_a_motion_agrees_with_solve_ivp():
 
 
 def test_a_motion_ends_at_a_terminal_event(kepler):
-    half = solve_motion(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=Event("q2", -1, terminal=True))
+    half = solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=Event("q2", -1, terminal=True))
     assert (half.status, half.success) == (1, True)
     assert "'q2'" in half.message
     assert half.t[-1] == pytest.approx(math.pi, abs=1e-8)
     assert half.t_events[0].tolist() == [half.t[-1]]
     assert np.array_equal(half.y[:, -1], half.y_events[0][0])
-    chosen = solve_motion(
+    chosen = solve_ivp(
         kepler,
         (0, 100),
         [*START["q"], *START["p"]],
@@ -234,7 +234,7 @@ def test_a_motion_ends_at_a_terminal_event(kepler):
 
 
 def test_a_motion_runs_backward_and_its_last_step_ends_the_span(kepler):
-    back = solve_motion(kepler, (1.0, -2.0), [*START["q"], *START["p"]], h=0.07, dense_output=True)
+    back = solve_ivp(kepler, (1.0, -2.0), [*START["q"], *START["p"]], h=0.07, dense_output=True)
     assert back.t[0] == 1.0
     assert back.t[-1] == pytest.approx(-2.0, abs=1e-15)
     assert np.abs(back.sol(-0.5)[:2] - ellipse(np.array([-1.5]))[0]).max() < 1e-6
@@ -242,7 +242,7 @@ def test_a_motion_runs_backward_and_its_last_step_ends_the_span(kepler):
 
 def test_a_motion_says_that_a_step_failed():
     runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
-    failed = solve_motion(compile_stepper(runaway, SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
+    failed = solve_ivp(compile_stepper(runaway, SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
     assert (failed.status, failed.success) == (-1, False)
     assert "smaller step" in failed.message
     assert failed.y.shape == (2, len(failed.t))
@@ -250,7 +250,7 @@ def test_a_motion_says_that_a_step_failed():
 
 def test_a_motion_chooses_its_step_for_a_tolerance():
     y0 = [*START["q"], *START["p"]]
-    motion = solve_motion(problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=SVI(4))
+    motion = solve_ivp(problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=SVI(4))
     error = np.abs(motion.y[:2, -1] - ellipse(motion.t[-1:])[0]).max()
     assert 1e-11 < error < 1e-7
 
@@ -269,4 +269,4 @@ def test_a_motion_chooses_its_step_for_a_tolerance():
 def test_arguments_of_a_motion_are_checked(kepler, arguments, words):
     usual = {"t_span": (0, 1), "y0": [*START["q"], *START["p"]], "h": 0.1}
     with pytest.raises(StateError, match=words):
-        solve_motion(kepler, **(usual | arguments))
+        solve_ivp(kepler, **(usual | arguments))

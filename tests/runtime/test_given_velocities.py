@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from samples import QUICK_FLAGS
 
-from scvi_codegen.advice.motion import solve_motion
+from scvi_codegen.advice.solve_ivp import solve_ivp
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -98,17 +98,17 @@ def test_motions_take_velocities_and_the_arguments_of_solve_ivp():
     stepper = pendulum_on_cart()
     values = [2.0 * value for value in stepper.defaults]
     given = {"t_span": (0.0, 1.0), "h": 0.1}
-    motion = solve_motion(stepper, y0=Q, velocity=V, args=values, **given)
+    motion = solve_ivp(stepper, y0=Q, velocity=V, args=values, **given)
     p = stepper.momentum(Q, V, 0.0, values)
-    other = solve_motion(stepper, y0=[*Q, *p], parameters=values, **given)
+    other = solve_ivp(stepper, y0=[*Q, *p], parameters=values, **given)
     assert np.array_equal(motion.y, other.y)
     for name in ("atol", "max_step", "first_step"):
-        with pytest.raises(StateError, match=f"solve_motion has no {name}=0.1: .*give"):
-            solve_motion(stepper, y0=Q, velocity=V, **given, **{name: 0.1})
+        with pytest.raises(StateError, match=f"solve_ivp has no {name}=0.1: .*give"):
+            solve_ivp(stepper, y0=Q, velocity=V, **given, **{name: 0.1})
     with pytest.raises(StateError, match="give args or parameters, not both"):
-        solve_motion(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
+        solve_ivp(stepper, y0=Q, velocity=V, args=values, parameters=values, **given)
     with pytest.raises(MethodError, match="RK45"):
-        solve_motion(problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
+        solve_ivp(problem("kepler").system, (0.0, 1.0), [1.0, 0.0, 0.0, 1.0], method="RK45")
 
 
 def test_velocities_and_momenta_of_many_states():

@@ -472,7 +472,7 @@ class TestOtherRuns:
 
 class TestSolveMotion:
     def test_error(self, kepler_stepper):
-        motion = sc.solve_motion(kepler_stepper, (3.0, 23.0), [1.6, 0.0, 0.0, 0.5], error=1e-8)
+        motion = sc.solve_ivp(kepler_stepper, (3.0, 23.0), [1.6, 0.0, 0.0, 0.5], error=1e-8)
         exact = on_an_ellipse([1.6, 0.0], [0.0, 0.5], motion.t)
         assert motion.success
         assert np.abs(motion.y[:2].T - exact[:, :2]).max() <= 1.6 * motion.trajectory.global_error
@@ -480,14 +480,14 @@ class TestSolveMotion:
 
     def test_what_is_not_confirmed_is_no_success(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
-            motion = sc.solve_motion(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
+            motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
         assert not motion.success
         assert motion.status == -2
         assert "is confirmed only until t = " in motion.message
 
     def test_beside_another_choice_of_steps(self, kepler_stepper):
         with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
-            sc.solve_motion(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
+            sc.solve_ivp(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
 
 
 def loaded(path):

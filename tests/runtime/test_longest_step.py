@@ -41,21 +41,21 @@ def test_steps_of_it_are_right_to_round_off_after_many_orbits() -> None:
 
 def test_one_call_integrates_in_transformed_time() -> None:
     times = np.array([0.0, np.pi, 2 * np.pi, 8 * np.pi])
-    found = sc.solve_motion(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", t_eval=times)
+    found = sc.solve_ivp(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", t_eval=times)
     assert found.success
     assert np.abs(found.y[:2, ::2].T - START[0]).max() < 1e-12
     assert found.y[:2, 1] == pytest.approx([-0.1, 0.0], abs=1e-12)
-    rough = sc.solve_motion(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", rtol=1e-6)
+    rough = sc.solve_ivp(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", rtol=1e-6)
     assert rough.success
     assert 2.0**-53 < rough.trajectory.step_error < 1e-6 * ALLOWED
     with pytest.raises(StateError, match="has its method and monitor"):
-        sc.solve_motion(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, monitor="frequency")
+        sc.solve_ivp(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, monitor="frequency")
 
 
 def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
     """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
     far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]
-    found = sc.solve_motion(
+    found = sc.solve_ivp(
         KEPLER, (0.0, 6.0), far, monitor="1e-3*(1 + (q1**2 + q2**2)/1000)", rtol=1e-10, method=sc.SVI(8)
     )
     assert not found.success

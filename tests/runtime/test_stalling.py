@@ -31,7 +31,7 @@ def test_nor_under_the_reversible_controller(events):
 
 
 def test_solve_motion_says_so():
-    motion = sc.solve_motion(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
+    motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
     assert not motion.success
     assert "reaches 0" in motion.message
 

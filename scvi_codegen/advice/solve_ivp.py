@@ -1,4 +1,4 @@
-"""Integration in one call, with arguments and result like ``scipy.integrate.solve_ivp``."""
+"""Solution of initial value problems by one call, with the arguments and the result of SciPy's ``solve_ivp``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from scvi_codegen.runtime.longest_step import longest_step, too_wrong
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Motion", "solve_motion"]
+__all__ = ["OdeResult", "solve_ivp"]
 
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
@@ -38,8 +38,8 @@ ADVISED = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """Result of :func:`solve_motion`; y is (q, p), positions and then momenta.
+class OdeResult:
+    """Result of :func:`solve_ivp`; y is (q, p), positions and then momenta.
 
     Attributes:
         t: (n,) times.
@@ -50,7 +50,8 @@ class Motion:
         y_events: (k, 2 m) states at these times.
         status: 0 end of the span, 1 terminal event, -1 a step failed, -2 the tolerance was missed.
         message: description of the status.
-        trajectory: states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies.
+        trajectory: states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies; its ``steps``,
+            ``rejected_steps`` and ``iterations`` take the place of SciPy's ``nfev``, ``njev`` and ``nlu``.
     """
 
     t: Array
@@ -69,7 +70,7 @@ class Motion:
 
 
 @takes(system=of("a system or its stepper", MechanicalSystem, Stepper), dense_output=SWITCH)
-def solve_motion(
+def solve_ivp(
     system: MechanicalSystem | Stepper,
     t_span: Sequence[float],
     y0: ArrayLike,
@@ -91,8 +92,10 @@ def solve_motion(
     atol: float | None = None,
     max_step: float | None = None,
     first_step: float | None = None,
-) -> Motion:
-    """Integrate from ``t_span[0]`` to ``t_span[1]`` (earlier, to integrate backward).
+) -> OdeResult:
+    """Solve the initial value problem of a mechanical system, with the arguments of ``scipy.integrate.solve_ivp``.
+
+    The run leads from ``t_span[0]`` to ``t_span[1]``, which may be earlier. The system replaces the right-hand side.
 
     The step size is adaptive by default; it is fixed with ``h`` or ``tolerance`` and for methods without adaptive
     steps.
@@ -106,7 +109,7 @@ def solve_motion(
         h: upper bound of a fixed step size, reduced so that whole steps fill the span.
         tolerance: instead of ``h``: error ``|q - q_exact| / |q|`` at the end, for which :func:`advise` chooses ``h``.
             ``success`` is False if the run misses it.
-        rtol: relative local error of adaptive steps; by default round-off.
+        rtol: relative local error of adaptive steps, relative to the state as a whole; by default round-off.
         error: bound on the relative global error of the whole run with adaptive steps, as of :meth:`Stepper.integrate`;
             ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
             is not confirmed.
@@ -234,7 +237,7 @@ INSTEAD = {
 def _refuse(given: Mapping[str, float | None]) -> None:
     for name, value in given.items():
         if value is not None:
-            raise StateError(f"solve_motion has no {name}={value!r}: {INSTEAD[name]}")
+            raise StateError(f"solve_ivp has no {name}={value!r}: {INSTEAD[name]}")
 
 
 def _paced(stepper: Stepper) -> bool:
@@ -273,13 +276,13 @@ def _outcome(trajectory: Trajectory, plan: _Chosen) -> tuple[int, str]:
     return REACHED, "The end of the span was reached."
 
 
-def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> Motion:
+def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> OdeResult:
     t, y = trajectory.t, np.hstack([trajectory.q, trajectory.p]).T
     if asked is not None:
         t = asked[(asked - trajectory.t[-1]) * trajectory.h <= 0.0]
         y = _states(trajectory, t)
     found = trajectory.events
-    return Motion(
+    return OdeResult(
         t=t,
         y=y,
         sol=(lambda times: _states(trajectory, times)) if dense_output else None,
