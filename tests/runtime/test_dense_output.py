@@ -262,7 +262,7 @@ def test_a_motion_chooses_its_step_for_a_tolerance():
         ({"t_span": (0,)}, "two times"),
         ({"y0": [1.0, 2.0, 3.0]}, "positions and then momenta"),
         ({"y0": [1.0, 2.0]}, "shape"),
-        ({"method": SVI(3)}, "has its method"),
+        ({"method": SVI(3)}, "need a system, not a compiled stepper"),
         ({"h": math.inf}, "inf"),
     ],
 )
