@@ -179,9 +179,7 @@ def _sections(name: str) -> tuple[str, ...]:
     """Return the section of that name, or all whose names begin with it and a colon."""
     found = (name,) if name in SECTIONS else tuple(each for each in SECTIONS if each.startswith(f"{name}:"))
     if not found:
-        raise StateError(
-            f"there is nothing called '{name}' to measure{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}"
-        )
+        raise StateError(f"there is no section '{name}'{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}")
     return found
 
 
@@ -201,7 +199,7 @@ def _known(json_path: str) -> dict[str, Result]:
             *(ResultTable.from_data(each) for each in data["tables"] if not each["title"].startswith(FAILED)),
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StateError(f"{json_path} is no report that could be resumed: {type(error).__name__}: {error}") from None
+        raise StateError(f"{json_path} is not a report that can be resumed: {type(error).__name__}: {error}") from None
     return {each.name: each for each in found}
 
 

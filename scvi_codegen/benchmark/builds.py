@@ -50,10 +50,10 @@ def run_builds(plan: Plan, say: Say) -> ResultTable:
     columns = [key for key in next(iter(rows.values()), {}) if key != "build"]
     return ResultTable(
         name="builds",
-        title="microseconds a step, by compiler and flags",
+        title="microseconds per step, by compiler and flags",
         columns={"build": ""} | dict.fromkeys(columns, ".2f"),
         rows=tuple(rows.values()),
-        remarks=("minima of processor time, builds in turn; compilers and levels that are not there are left out",),
+        remarks=("minima of processor time, builds in turn; compilers and levels that are not available are omitted",),
     )
 
 

@@ -35,7 +35,7 @@ def run_cluster(plan: Plan, say: Say) -> ResultTable:
     before = energy((each.q, each.v))
     rows = []
     for name, steps, settle in _contenders(each, plan):
-        say(f"cluster: {name}, {steps or 'its own'} steps")
+        say(f"cluster: {name}, {steps or 'adaptive'} steps")
         seconds, end = _timed(settle)
         errors = {"error": rms(end[0], reference), "energy_error": abs(energy(end) / before - 1.0)}
         rows.append({"by": name, "steps": steps, "ms": 1e3 * seconds, **errors})
@@ -46,7 +46,7 @@ def run_cluster(plan: Plan, say: Say) -> ResultTable:
         rows=tuple(rows),
         remarks=(
             f"error: root mean square of positions over that of the positions, known to {doubt:.0e}; energy error:",
-            "relative. Processor time, the quicker of two runs. IAS15 chooses its steps, by its default accuracy.",
+            "relative. Processor time, the faster of two runs. IAS15 has adaptive step size at its default accuracy.",
         ),
     )
 

@@ -84,8 +84,8 @@ def run_compile_times(plan: Plan, say: Say) -> ResultTable:
         columns=formats | {"read_s": ".2f", "symmetries_s": ".2f", "python_cpu_s": ".2f", "compiler_cpu_s": ".2f"},
         rows=tuple(rows),
         remarks=(
-            "first step: of the clock, from the import on, with reading and checking the text and with the search for",
-            "symmetries; cpu: processor seconds of Python and of the C compiler, which other work disturbs less.",
+            "first step: wall time from the import on, including parsing and checking the text and the search for",
+            "symmetries; cpu: processor seconds of Python and of the C compiler, less sensitive to other processes.",
         ),
     )
 

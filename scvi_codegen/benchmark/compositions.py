@@ -63,7 +63,7 @@ def run_compositions(plan: Plan, say: Say) -> ResultTable:
         columns={"case": "", "span": "g", "error": ".0e"} | {method.name: "" for method in METHODS} | {"fastest": ""},
         rows=tuple(rows),
         remarks=(
-            "~: out of reach here (round-off, or more than half a second), extrapolated by the order of the method",
+            "~: not reached here (round-off, or more than half a second); extrapolated by the order of the method",
         ),
     )
 

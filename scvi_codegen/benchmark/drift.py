@@ -45,7 +45,7 @@ def run_drift(plan: Plan, say: Say) -> ResultTable:
         rows=tuple(rows),
         remarks=(
             "drift: slope of the fitted line times the length of the run. uncertainty: its standard error, from the",
-            f"scatter of the gains over {BLOCKS} blocks, since round-off makes the energy walk at random.",
+            f"variance of the gains over {BLOCKS} blocks, since round-off makes the energy a random walk.",
         ),
     )
 

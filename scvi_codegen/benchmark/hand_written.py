@@ -46,12 +46,12 @@ def run_hand_written(plan: Plan, say: Say) -> ResultTable:
         rows.append(_compare(case(name), h, repeats=3 * plan.repeats, steps=STEPS // 20 if plan.quick else STEPS))
     return ResultTable(
         name="hand-written",
-        title="generated C against hand-written C of the same method",
+        title="generated C and hand-written C of the same method",
         columns={"case": "", "h": "g", "generated_ns": ".0f", "by_hand_ns": ".0f", "ratio": ".2f", "apart": ".1e"}
-        | {"generated_sweeps": ".2f", "by_hand_sweeps": ".2f"},
+        | {"generated_iterations": ".2f", "by_hand_iterations": ".2f"},
         rows=tuple(rows),
         remarks=(
-            "ratio: time of the generated code over that of the other, medians of a step; above 1 the hand wins;",
+            "ratio: time of the generated over that of the hand-written code, medians; above 1 the latter is faster;",
             f"apart: largest difference of positions over {COMPARED} steps, relative.",
         ),
     )
@@ -127,8 +127,8 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
         "by_hand_ns": 1e9 * middle["by_hand"] / steps,
         "ratio": middle["generated"] / middle["by_hand"],
         "apart": float(np.abs(one - other).max() / np.abs(other).max()),
-        "generated_sweeps": sweeps["generated"] / steps,
-        "by_hand_sweeps": sweeps["by_hand"] / steps,
+        "generated_iterations": sweeps["generated"] / steps,
+        "by_hand_iterations": sweeps["by_hand"] / steps,
     }
 
 

@@ -51,7 +51,7 @@ def run_held(plan: Plan, say: Say) -> ResultTable:
         rows += [{"bodies": name} | row for row in (*own, *angles, *found)]
     return ResultTable(
         name="held",
-        title="bodies held by rods: energy and lengths over ten seconds",
+        title="constrained bodies: errors of energy and rod lengths over ten seconds",
         columns={
             "bodies": "",
             "by": "",
@@ -66,7 +66,7 @@ def run_held(plan: Plan, say: Say) -> ResultTable:
         },
         rows=tuple(rows),
         remarks=(
-            "second: microseconds of the processor for a second of motion; energy: its largest change, in units of",
+            "second: processor microseconds per second of simulated time; energy: its largest change, in units of",
             "all weights times 1; stretch: of a rod, as a part of its length; ours then: that energy by constraints of",
             "this project at equal time, between its settings; ratio: theirs over ours; in angles: ours in those.",
         ),
@@ -102,7 +102,7 @@ def _rows(held: Held, by: str, move: Move, counts: Sequence[int], plan: Plan) ->
             continue
         energy = runs[0].energy / held.weight
         seconds = float(np.median([run.seconds for run in runs]))
-        lost = {} if energy < LOST else {"why_not": "too long a step: the energy is lost"}
+        lost = {} if energy < LOST else {"why_not": "step too large: the energy error exceeds the weight"}
         yield {"by": by, "h": h, "second_us": 1e6 * seconds / span, "energy": energy, "stretch": runs[0].stretch} | lost
 
 

@@ -55,8 +55,8 @@ def run_energies(plan: Plan, say: Say) -> ResultTable:
         columns=columns | errors,
         rows=tuple(rows),
         remarks=(
-            "first tenth, largest: of what there is in the first tenth of the run, and in all of it; drift: slope of",
-            "the fitted line times the length of the run, with its standard error. A walk of roundings grows by a",
+            "first tenth, largest: largest error in the first tenth of the run, and in all of it; drift: slope of",
+            "the fitted line times the length of the run, with its standard error. A random walk grows by a",
             "factor of about 3 from the first tenth to the end.",
         ),
     )

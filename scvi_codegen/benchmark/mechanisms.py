@@ -50,7 +50,7 @@ def run_mechanisms(plan: Plan, say: Say) -> ResultTable:
         rows=tuple(rows),
         remarks=(
             "first step: processor seconds from the model to the first step or right-hand side, C compilers included;",
-            f"second: milliseconds of the processor for a second of motion at an error of {ERROR:g};",
+            f"second: processor milliseconds per second of simulated time at an error of {ERROR:g};",
             "errors of this project are against lambdify's most accurate result, all others against this project's.",
         ),
     )
@@ -75,7 +75,7 @@ def _row(name: str, found: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the times of a contender, with errors relative to another contender's most accurate run."""
     own, other = found[name], found["lambdify" if name == OURS else OURS]
     if "why_not" in own or "why_not" in other:
-        return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "nothing to be held against"}
+        return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "no reference to compare with"}
     exact = np.array(other["runs"][-1]["q"])
     errors = [float(np.abs(np.array(run["q"]) - exact).max()) for run in own["runs"]]
     points = [Point(seconds=run["seconds"], error=error) for run, error in zip(own["runs"], errors, strict=True)]

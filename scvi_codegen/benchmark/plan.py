@@ -37,7 +37,7 @@ class Plan:
     def __post_init__(self) -> None:
         for name in self.peers:
             if name not in PEERS:
-                raise StateError(f"there is no peer '{name}'; known: {', '.join(PEERS)}")
+                raise StateError(f"there is no peer '{name}'. Known: {', '.join(PEERS)}")
         if self.repeats < 1:
             raise StateError(f"repeats must be at least 1, not {self.repeats}")
 

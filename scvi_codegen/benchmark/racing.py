@@ -114,7 +114,7 @@ def _peer_contenders(chosen: Case, makers: Makers, skipped: dict[str, str], say:
         if missing is not None:
             skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
         elif not PEERS[name].suits(chosen):
-            skipped[name] = "not for problems of this kind"
+            skipped[name] = "not applicable to this problem"
         else:
             say(f"{chosen.name}: compiling {name}")
             try:

@@ -131,7 +131,9 @@ def _write(path: Path, result: Reference) -> None:
 
 def _compute(case: Case, velocity: Extended) -> Reference:
     if np.finfo(np.longdouble).eps > 1e-18:
-        raise StateError("references need a long double of at least 64 digits, which this machine's NumPy has not")
+        raise StateError(
+            "references need a long double with at least 64 bits of precision, which NumPy lacks on this machine"
+        )
     start, field = np.concatenate([case.q.astype(np.longdouble), velocity], axis=1), field_of(case)
     fine, finer = (final_states(field, start, case.span, case.fine * factor) for factor in (1.0, 0.75))
     m = case.dimension

@@ -90,7 +90,7 @@ def run_samples(plan: Plan, say: Say) -> ResultTable:
             rows.append({"system": name, "by": method} | times | over)
     return ResultTable(
         name="samples",
-        title="microseconds that a sample of a controller costs",
+        title="microseconds per control step",
         columns={"system": "", "by": ""}
         | dict.fromkeys([key for key in rows[0] if key not in ("system", "by")], ".2f"),
         rows=tuple(rows),

@@ -35,7 +35,7 @@ def run_threads(plan: Plan, say: Say) -> ResultTable:
             rows.append({"problem": each.name, "coordinates": each.q.size} | _row(each, method, h, numbers, plan))
     return ResultTable(
         name="threads",
-        title="a step by one thread, and how many times as quick it is by several",
+        title="time of a step with one thread, and speed-up with several",
         columns={"problem": "", "coordinates": "d", "by": "", "one_us": ".4g"}
         | {f"threads_{number}": ".2f" for number in numbers},
         rows=tuple(rows),

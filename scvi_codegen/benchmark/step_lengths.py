@@ -49,7 +49,7 @@ def draw_step_lengths() -> Figure:
     axes = figure.subplots()
     for color, (name, (t, lengths)) in zip(COLORS, step_lengths().items(), strict=False):
         axes.step(t / PERIOD, lengths, where="post", color=color, label=name)
-    axes.set(yscale="log", xlabel="revolutions", ylabel="length of a step", title=f"Kepler, e = {ECCENTRICITY:g}")
+    axes.set(yscale="log", xlabel="revolutions", ylabel="step size", title=f"Kepler, e = {ECCENTRICITY:g}")
     axes.legend(loc="lower left")
     return figure
 

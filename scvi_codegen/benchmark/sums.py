@@ -65,7 +65,7 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
     names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog", *PLATFORMS)
     return ResultTable(
         name="sums",
-        title="time at equal error, and how many times as long others take",
+        title="time at equal error, and ratios of other methods",
         columns={"problem": "", "coordinates": "d", "error": ".0e", "ours_ms": ".2f", "by": ""}
         | dict.fromkeys(names, ".2f")
         | {"doubt": ".0e"},
@@ -224,22 +224,22 @@ def run_growth(plan: Plan, say: Say) -> ResultTable:
     rows, (memory, arithmetic) = list(_growth(plan, say)), machine_limits()
     return ResultTable(
         name="growth",
-        title="one library for any number of coordinates: h = 0.1 (field: 0.03), a process each with an empty cache",
+        title="scaling with size: h = 0.1 (field: 0.03), one process each with an empty cache",
         columns={
             "problem": "",
             "by": "",
             "coordinates": "d",
             "first_step_s": ".2f",
             "ns_a_coordinate_and_step": ".1f",
-            "sweeps": ".2f",
+            "iterations": ".2f",
             "gflops": ".2f",
             "gigabytes_s": ".1f",
             "memory_mb": ".0f",
         },
         rows=tuple(rows),
         remarks=(
-            "first step: from text; gflops: of the kernel and of the tables, in sweeps; gigabytes: what these read and",
-            "write of arrays; memory: of the process. One core of this machine, at most: multiply-adds in registers",
+            "first step: from text; gflops: of kernels and table products, in iterations; gigabytes: their array reads",
+            "and writes; memory: of the process. One core of this machine, at most: multiply-adds in registers",
             f"{arithmetic:.0f} GFLOP/s, STREAM's triad {memory:.1f} GB/s.",
         ),
     )
@@ -260,5 +260,5 @@ def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
 
 
 def _numbers(found: Sequence[str]) -> dict[str, float]:
-    names = ("first_step_s", "ns_a_coordinate_and_step", "sweeps", "gflops", "gigabytes_s", "memory_mb")
+    names = ("first_step_s", "ns_a_coordinate_and_step", "iterations", "gflops", "gigabytes_s", "memory_mb")
     return dict(zip(names, map(float, found), strict=True))

@@ -122,7 +122,7 @@ class _Plan:
             return
         for experiment in [e for e in self.pending.values() if outcome.name in e.needs]:
             if self.pending.pop(experiment.name, None):
-                yield from self.note(Failure(name=experiment.name, message=f"it needs '{outcome.name}', which failed"))
+                yield from self.note(Failure(name=experiment.name, message=f"its dependency '{outcome.name}' failed"))
 
 
 def _module_of(experiment: Experiment) -> str:
@@ -140,7 +140,7 @@ def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
     except Exception as error:  # noqa: BLE001  (others go on)
         return Failure(name=experiment.name, message=_described(error), details=traceback.format_exc())
     if result.name != experiment.name:
-        return Failure(name=experiment.name, message=f"its result is called '{result.name}'")
+        return Failure(name=experiment.name, message=f"its result has another name: '{result.name}'")
     return result
 
 

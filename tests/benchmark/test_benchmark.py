@@ -142,7 +142,7 @@ class TestCases:
     def test_unknown_names(self):
         with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
             cases.case("dufing")
-        with pytest.raises(StateError, match=r"nothing called 'drif' to measure; did you mean 'drift'\?"):
+        with pytest.raises(StateError, match=r"there is no section 'drif'; did you mean 'drift'\?"):
             bench.benchmark(["drif"])
         with pytest.raises(StateError, match="no peer 'heyoca'"):
             bench.Plan(peers=("heyoca",))
@@ -429,7 +429,7 @@ class TestCommand:
         assert [result.name for result in again.results] == ["one", "three", "two"]
         assert [table["name"] for table in json.loads(path.read_text())["tables"]] == ["one", "three", "two"]
         path.write_text("{}")
-        with pytest.raises(StateError, match="no report that could be resumed: KeyError: 'cases'"):
+        with pytest.raises(StateError, match="not a report that can be resumed: KeyError: 'cases'"):
             bench.benchmark(json_path=str(path), resume=True)
 
     def test_picture(self, tmp_path):

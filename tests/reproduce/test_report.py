@@ -67,9 +67,9 @@ class TestRunner:
         failures = {outcome.name: outcome for outcome in outcomes if isinstance(outcome, Failure)}
         assert failures["broken"].message == "ValueError: no such luck"
         assert "raise ValueError" in failures["broken"].details
-        assert failures["after-broken"].message == "it needs 'broken', which failed"
-        assert failures["last"].message == "it needs 'after-broken', which failed"
-        assert failures["misnamed"].message == "its result is called 'another'"
+        assert failures["after-broken"].message == "its dependency 'broken' failed"
+        assert failures["last"].message == "its dependency 'after-broken' failed"
+        assert failures["misnamed"].message == "its result has another name: 'another'"
 
     def test_processes_give_the_same_and_survive_a_crash(self):
         seen: list[tuple[str, ...]] = []
@@ -287,7 +287,7 @@ class TestCommand:
         ("words", "message"),
         [
             (["figur-4"], "did you mean 'figure-4'?"),
-            ([], "say what to reproduce"),
+            ([], "give 'all' or names of experiments"),
             (["table-9", "-o", "file"], "'file' is not a folder"),
             (["table-9", "--html", "no/where.html"], "there is no folder 'no'"),
             (["table-9", "--jobs", "0"], "Invalid value for '--jobs'"),

@@ -46,7 +46,7 @@ SETTING = (
     "Kepler's problem, e = 0.5, from the perihelion, h = 0.2, T = 2000 (10000 steps, 318 revolutions), six Chebyshev "
     "points: degree 5.",
     "The captions name no quadrature: SVI has 5 Gauss points.",
-    "Degree 6 stands in the table too, because the legends of section 3 count the degree in some figures.",
+    "Degree 6 is in the table, too, because the legends of section 3 count the degree in some figures.",
 )
 
 

@@ -164,7 +164,7 @@ def _printed_solution() -> Comparison:
         claim="The analytic solution is q1 = cos t - e, q2 = sqrt(1 - e^2) sin t.",
         measured=f"These start with the velocity {minor:.1f} instead of {VELOCITY[1]:.1f} and miss q'' = -q/|q|^3 by "
         f"up to {largest(residual):.1f}. The solution has the eccentric anomaly E, E - e sin E = t, in place of t: the "
-        f"same ellipse, so the drawn orbit stands; q2 differs by up to {q2:.2f}.",
+        f"same ellipse, so the drawn orbit is right; q2 differs by up to {q2:.2f}.",
         verdict=holds(largest(residual) < 1e-6),
     )
 
@@ -206,7 +206,7 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
         setting=(
             "The paper's drawing is a sketch. Here: one step of SVI for the pendulum, degree 4, five Chebyshev nodes, "
             f"five Gauss points, q = {START:g}, p = {MOMENTUM:g}, h = {CURVE_STEP:g}.",
-            "The second panel is the unnumbered picture of section 2.1, with equispaced points beside; Legendre points "
+            "The second panel is the unnumbered picture of section 2.1, with equispaced points, too; Legendre points "
             "are the Legendre-Gauss-Lobatto points, which contain the ends.",
             "Third panel: the interpolation of 1/(1 + 16 x^2), Runge's function, with n points.",
         ),

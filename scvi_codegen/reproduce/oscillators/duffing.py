@@ -65,7 +65,7 @@ WINDOW = (0.6, 1.1)
 SETTING = (
     "L = v^2/2 + q^2/2 - 2 q^4/3 (alpha = -1, beta = 8/3, undriven, undamped), q(0) = 0, p(0) = 1.",
     "h = 0.6; nonlinear iteration to 1e-14, the paper's rule.",
-    "6 Chebyshev points: degree 5. Degree 6 runs beside it, as the paper's N is the degree elsewhere.",
+    "6 Chebyshev points: degree 5. Degree 6 is run, too, as the paper's N is the degree elsewhere.",
     "The caption gives no quadrature: SVI has as many Gauss points as the degree.",
     "The symplectic Runge-Kutta method of order 6 is Gauss's of three stages.",
 )

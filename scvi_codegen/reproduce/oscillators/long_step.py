@@ -89,7 +89,7 @@ def convergence(_: Mapping[str, Result], degrees: Mapping[str, Sequence[int]] = 
             SYSTEM,
             "One step, h = 20, errors at its end.",
             "N on the axis counts Chebyshev points, as it says, so the degree is N - 1; verdicts are on this. N read "
-            "as the degree stands beside it.",
+            "as the degree is shown, too.",
             "The caption gives no quadrature; SVI has N Gauss points.",
             "Newton's iteration to relative round-off: SC does not reach an absolute 1e-14 on a step this long.",
             f"Lines C K^N are fitted to errors from {WINDOW[0]:g} to {WINDOW[1]:g}, and only these are compared.",

@@ -63,9 +63,7 @@ VISIBLE = 2e-3
 
 SYSTEM = "m = k = 1, q(0) = 0, p(0) = 1; the exact solution is q = sin t, p = cos t."
 NINE_POINTS = "9 Chebyshev points: degree 8."
-QUADRATURES = (
-    "The caption gives no quadrature; 8 Gauss points (as many as the degree) are drawn, 7 and 9 run beside them."
-)
+QUADRATURES = "The caption gives no quadrature; 8 Gauss points (as many as the degree) are drawn, 7 and 9 are run, too."
 TOLERANCE = "The nonlinear iteration ends at 1e-14, the paper's rule."
 
 

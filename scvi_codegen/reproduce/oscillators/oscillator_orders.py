@@ -77,7 +77,7 @@ SETTING = (
     SYSTEM,
     "One step of size h, errors at its end.",
     "N counts Chebyshev points, as the caption says, so the degree is N - 1; verdicts are on this. N read as the "
-    "degree stands beside it.",
+    "degree is shown, too.",
     "The caption gives no quadrature: SVI has N Gauss points, which is one more than the degree.",
     "Dotted lines are those of the paper's legend.",
     "Marks are the compiled code, iterated to relative round-off: at h = 8 SC does not reach an absolute 1e-14.",

@@ -63,7 +63,7 @@ SYSTEM = "m = l = g = 1, q(0) = 0.5, p(0) = 0."
 LONG_SETTING = (
     SYSTEM,
     "h = 0.5, T = 1000; nonlinear iteration to 1e-14, the paper's rule.",
-    "4 Chebyshev points: degree 3. Degree 4 runs beside it, as the paper's N is the degree elsewhere.",
+    "4 Chebyshev points: degree 3. Degree 4 is run, too, as the paper's N is the degree elsewhere.",
     "The caption gives no quadrature: SVI has as many Gauss points as the degree.",
     "The symplectic Runge-Kutta method of order 4 is Gauss's of two stages.",
 )

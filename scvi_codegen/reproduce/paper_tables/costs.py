@@ -182,7 +182,7 @@ def _result(setting: Setting) -> Result:
             "iteration ended by the paper's rule, TOL = 1e-14: "
             f"SRK is {names['SRK']}, SVI is {names['SVI']}, SC is {names['SC']}.",
             "The paper names neither the quadrature of SVI, here as many Gauss points as the degree, which makes it "
-            "the Gauss method of so many stages, nor the machine; ratios of times are compared.",
+            "the Gauss method with its number of stages, nor the machine; ratios of times are compared.",
             f"Processor time of one trajectory in compiled C, solver 'auto': medians of {ROUNDS} runs, the three "
             "schemes in turn.",
             f"The final position is compared with SVI of degree {REFERENCE.degree} at h/{FINER}, which differs from "

@@ -74,8 +74,8 @@ def table(number: int, _: Mapping[str, Result]) -> Result:
             "open.",
             "The paper names neither its iteration, nor its first guess, nor what N counts. Plain Picard iteration on "
             "(18) and (30), in every step from Q = q0, with N points (degree N - 1), fails where the table has dashes; "
-            "verdicts are on it. N read as the degree stands beside it.",
-            "An iteration ends when max |dQ| < 1e-14, the paper's tolerance (|dP| is not asked for), and fails after "
+            "verdicts are on it. The reading of N as the degree is shown, too.",
+            "An iteration ends when max |dQ| < 1e-14, the paper's tolerance (|dP| is not tested), and fails after "
             "1000 iterations.",
             "'fixed-point' and 'newton' are the two solvers of this project, with N points: they continue the curve of "
             "the step before and count a second attempt from the straight line.",

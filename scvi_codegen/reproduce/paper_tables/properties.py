@@ -146,7 +146,7 @@ def _collocation_check(found: Sequence[Properties]) -> Comparison:
     orders = ", ".join(str(one.order) for one in members)
     same = not unstable and len(named["symmetric"]) == len(members)
     return Comparison(
-        claim="What the table says of Chebyshev methods, A-stable and symmetric, is true of the SC of the experiments.",
+        claim="SC, the Chebyshev method of the experiments, is A-stable and symmetric, as the table states.",
         measured=f"SC is not A-stable with {_listed(unstable)}; symmetric: {_listed(named['symmetric'])}; symplectic: "
         f"{_listed(named['symplectic'])}; order {orders} for 1 to {len(members)} stages.",
         verdict=holds(same),

@@ -92,7 +92,7 @@ def _gauss_table(number: int, s: int) -> Result:
         name=f"table-{number}",
         title=f"Gauss method of order {2 * s}",
         setting=(
-            f"Printed entries are evaluated in 60 digits and set beside the collocation integrals (23) on the {s} "
+            f"Printed entries are evaluated in 60 digits and compared with the collocation integrals (23) on the {s} "
             "Gauss-Legendre points; they agree if they differ by less than 1e-50.",
             "Order and symplecticity are identities in square roots, checked by exact arithmetic.",
         ),

@@ -83,7 +83,7 @@ def fixed_point(step: Field, first: Array) -> Array:
         if max(map(abs, (following - here).ravel())) < mp.mpf(10) ** -54:
             return following
         here = following
-    raise ArithmeticError("the stage iteration does not converge: the step is too long")
+    raise ArithmeticError("the stage iteration does not converge: the step is too large")
 
 
 def collocation_step(f: Field, start: Array, h: Any, c: Sequence[Any]) -> Array:
