@@ -21,6 +21,7 @@ from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
 from scvi_codegen.runtime.stalling import Watch
+from scvi_codegen.runtime.times import WHOLE
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Observation", "observed_until"]
@@ -46,7 +47,7 @@ class Observation:
     ) -> None:
         self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
         self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
-        self.end, self.arrived = end, False
+        self.end, self.arrived, self.partial_steps = end, False, 0
         self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
         self.iterations = 0
 
@@ -137,6 +138,7 @@ class Observation:
         q, p, tau = self._inside(part, self.end)
         lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
+        self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
         if tau is None:
             run = self.run
             q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
@@ -198,7 +200,8 @@ class Observation:
     ) -> Trajectory:
         crossings = self.search.crossings() if self.search is not None else ()
         tau = stepped if self.run.stepper.interface.energy_parameter else None
-        return trajectory_of(self.run, t, q, p, iterations, step_sizes=lengths, events=crossings, tau=tau)
+        steps = self.run.steps + (self.partial_steps if self.arrived else 0)
+        return trajectory_of(self.run, t, q, p, iterations, steps=steps, step_sizes=lengths, events=crossings, tau=tau)
 
 
 def observed_until(

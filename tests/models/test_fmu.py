@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import subprocess
+import uuid
 import zipfile
 from ctypes import byref, c_bool, c_char_p, c_double, c_size_t, c_uint32, c_void_p
 from dataclasses import replace
@@ -214,6 +215,31 @@ def test_an_instance_that_cannot_be_is_none(fmu):
         one = Slave(fmu, **given)
         assert one.one.value is None
         assert one.said[-1][0] == ERROR
+
+
+def test_the_instantiation_token_identifies_the_model():
+    """The token is the same for equal models, and another for another state, step size, parameter or method."""
+
+    def token(model):
+        files = fmu_module._texts(model, "push", "auto")[1]
+        found = ElementTree.fromstring(files["modelDescription.xml"]).get("instantiationToken")
+        assert any(found.encode() in text for name, text in files.items() if name.startswith("sources/"))
+        return found
+
+    model = pushed()
+    others = [
+        replace(model, q=(0.4,)),
+        replace(model, velocity=(0.6,)),
+        replace(model, h=0.05),
+        replace(model, t=0.0),
+        replace(model, method=SVI(3)),
+        replace(model, system=model.system.with_parameters(m=1.6)),
+        pushed(p=(0.4,)),
+    ]
+    tokens = [token(each) for each in (model, *others)]
+    assert token(pushed()) == tokens[0]
+    assert len(set(tokens)) == len(tokens)
+    assert all(each == f"{{{uuid.UUID(each)}}}" for each in tokens)
 
 
 def test_discards_are_logged_where_that_is_wanted(fmu):

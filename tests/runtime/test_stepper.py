@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -11,7 +12,9 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.problems import problem
@@ -571,3 +574,28 @@ def test_the_fixed_point_starts_from_rest(name, method):
         for solver in ("fixed-point", "newton")
     ]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    ("t_end", "more", "steps"), [(1.0, {}, 4), (0.9, {}, 3), (0.9, {"save_every": 2}, 3), (-1.0, {}, 4), (0.2, {}, 1)]
+)
+def test_the_shorter_last_step_of_a_run_to_t_end_is_counted_as_for_arrays(t_end, more, steps):
+    scalar = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
+    arrays = IndexedSystem.from_text(
+        name="o", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2)"
+    )
+    given = {"h": math.copysign(0.3, t_end), "t_end": t_end, **more}
+    run = compile_stepper(scalar, SVI(2)).integrate([1.0], velocity=[0.0], **given)
+    other = compile_indexed(arrays, "svi:2").integrate([1.0, 0.5], **given)
+    assert (run.t[-1], other.t[-1]) == pytest.approx((t_end, t_end), abs=1e-15)
+    assert run.steps == other.steps == steps
+
+
+@pytest.mark.parametrize("method", [SVI(3), SVI(4), SCVI(3), Gauss(2)], ids=lambda method: method.name)
+def test_the_worst_step_of_a_kepler_orbit_is_at_the_pericentre(method):
+    """Started at the apocentre of an orbit of period 2 pi, of eccentricity 0.6."""
+    run = compile_stepper(problem("kepler").system, method).integrate(
+        [1.6, 0.0], velocity=[0.0, 0.5], h=0.05, t_end=6.0
+    )
+    assert run.worst_step_time == pytest.approx(math.pi, abs=0.1)
+    assert run.step_error > 0.0
