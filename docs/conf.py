@@ -1,6 +1,6 @@
-"""The documentation, by ``python -m sphinx -W docs site``: no network, no script but the search.
+"""Sphinx configuration: ``python -m sphinx -W docs site`` builds the site without network access.
 
-``-t online`` adds links to the documentation of Python, NumPy, SciPy and SymPy, whose lists of names are then fetched.
+``-t online`` adds links to the documentation of Python, NumPy, SciPy and SymPy, whose object inventories are fetched.
 """
 
 import sys

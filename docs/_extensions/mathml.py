@@ -12,11 +12,11 @@ __all__ = ["setup"]
 DOTTED = re.compile(
     r"<munderover>\s*<mi>(\w)</mi>\s*(.*?)\s*(<mo stretchy=\"false\">˙</mo>)\s*</munderover>", re.DOTALL
 )
-"""A velocity with an index, whose index docutils puts below the letter."""
+"""Dotted letter with a subscript, which docutils translates with the subscript below the letter."""
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Register the MathML renderer with Sphinx."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
     app.config.html_math_renderer = "mathml"
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""References to where a public name is defined lead to where it is documented: ``scvi_codegen.NAME``."""
+"""Resolve references to the defining module of a public name as its documented name, ``scvi_codegen.NAME``."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ __all__ = ["setup"]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Called by Sphinx."""
+    """Register the event handler with Sphinx."""
     app.connect("missing-reference", _resolve)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -21,7 +21,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 def _resolve(
     app: Sphinx, environment: BuildEnvironment, reference: pending_xref, content: nodes.Element
 ) -> nodes.reference | None:
-    """The link for ``scvi_codegen.runtime.stepper.Stepper.step``, or for ``Stepper.step`` alone; else nothing."""
+    """Return the link for ``scvi_codegen.runtime.stepper.Stepper.step`` or ``Stepper.step``; None for other targets."""
     if reference.get("refdomain") != "py":
         return None
     parts = reference["reftarget"].split(".")

@@ -1,7 +1,7 @@
-"""The pages of ``docs``: their code runs, links lead somewhere, all that is public is named, and the site builds.
+"""Tests of the documentation: code, links, API reference, site and search.
 
-What ``docs/extending.md`` adds is run in ``test_seams.py``, what ``docs/frameworks.md`` shows in
-``frameworks/test_page_lines.py``.
+``test_seams.py`` runs the code of ``docs/extending.md``, ``frameworks/test_page_lines.py`` that of
+``docs/frameworks.md``.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ PAGES = {str(path.relative_to(DOCS)): path.read_text(encoding="utf-8") for path 
 ELSEWHERE = ("extending.md", "frameworks.md")
 RUN = [name for name, page in PAGES.items() if name not in ELSEWHERE and any(runnable(page))]
 MINUTES = "scvi-codegen reproduce all"
-"""Takes minutes of processor time."""
+"""Command that takes minutes of processor time."""
 PICTURE = re.compile(r"!\[[^]]+\]\((\w+\.svg)\)")
-"""One that the code of a page draws."""
+"""Image that the code of a page draws."""
 PEERS = ("astropy", "casadi", "fmpy", "heyoka", "rebound")
-"""Libraries that a page may show beside this one, and without which it is skipped."""
+"""Optional libraries of pages; a page is skipped if one of them is not installed."""
 SHOWN = {"python", "text", "console", "sh", "toml", "c", "julia", "diff"}
-"""Languages of blocks."""
+"""Permitted languages of code blocks."""
 
 
 def imported(page: str) -> set[str]:
-    """Modules that the Python of a page asks for."""
+    """Return the modules that the Python code of a page imports."""
     trees = [ast.parse(part.text) for part in runnable(page) if part.kind == "python"]
     nodes = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Import)]
     return {alias.name.split(".")[0] for node in nodes for alias in node.names}
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_a_page_has_code_of_known_kinds_and_links_to_what_is_there(name):
+def test_code_blocks_have_known_languages_and_links_have_targets(name):
     page = PAGES[name]
     assert len(BLOCK.findall(page)) == len(re.findall(r"^```\w+$", page, re.MULTILINE))
     assert {language for _, language, _ in BLOCK.findall(page)} <= SHOWN
-    assert imported(page) is not None  # all of its Python is read
+    assert imported(page) is not None  # all Python blocks are parsed
     prose = BLOCK.sub("", page)
     targets = re.findall(r"\]\((?!https?:)([^)#\s]+)(?:#[^)]*)?\)", prose)
     assert [target for target in targets if not ((DOCS / name).parent / target).exists()] == []
 
 
-def test_c_that_is_shown_alone_is_in_a_generated_file():
+def test_c_blocks_without_file_name_are_in_a_generated_file():
     shown = [
         text for page in PAGES.values() for name, language, text in BLOCK.findall(page) if language == "c" and not name
     ]
@@ -62,7 +62,7 @@ def test_c_that_is_shown_alone_is_in_a_generated_file():
     assert [text for text in shown if text not in generated] == []
 
 
-def test_the_reference_has_every_public_name_once():
+def test_the_reference_contains_every_public_name_once():
     pages = "".join(page for name, page in PAGES.items() if name.startswith("reference/"))
     assert sorted(re.findall(r"^\.\. auto\w+:: (\w+)", pages, re.MULTILINE)) == sorted(scvi_codegen.__all__)
 
@@ -75,12 +75,12 @@ def test_every_page_is_in_a_table_of_contents():
     assert listed == set(PAGES)
 
 
-def test_numbers_that_a_page_prints_agree_with_those_on_it():
+def test_equal_numbers_are_accepted():
     agree("period 6.325, kept to 3e-14, after 12 steps", "period 6.326, kept to 2e-15, after 12 steps\n")
 
 
 @pytest.mark.parametrize(("said", "printed"), [("1.234", "1.237"), ("12", "13"), ("3e-14", "4e-13"), ("x 1", "y 1")])
-def test_numbers_that_do_not_are_found(said, printed):
+def test_different_numbers_are_detected(said, printed):
     with pytest.raises(AssertionError, match=r"is said|said\n"):
         agree(said, printed)
 
@@ -107,8 +107,8 @@ LIST_ITEM = re.compile(r"^ *(?:[-+*]|\d+[.)]) ", re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_no_line_of_a_formula_begins_as_an_item_of_a_list(name):
-    """Markdown would end the formula there and print its dollar signs."""
+def test_no_line_of_a_formula_is_a_list_item(name):
+    """A list item ends the formula in Markdown and leaves its dollar signs in the text."""
     text = CODE.sub("", PAGES[name])
     formulas = DISPLAYED.findall(text) + re.findall(r"\$([^$]*)\$", DISPLAYED.sub("", text))
     assert [formula for formula in formulas if LIST_ITEM.search(formula.partition("\n")[2])] == []
@@ -119,7 +119,7 @@ def test_no_line_of_a_formula_begins_as_an_item_of_a_list(name):
 @pytest.mark.parametrize("name", RUN)
 def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
     missing = [peer for peer in PEERS if peer in imported(PAGES[name]) and importlib.util.find_spec(peer) is None]
-    if "--platform " in PAGES[name]:  # other machines' code takes the compiler that is a wheel
+    if "--platform " in PAGES[name]:  # cross compilation requires the compiler from a wheel
         missing += [wheel for wheel in ["ziglang"] if importlib.util.find_spec(wheel) is None]
     if missing:
         pytest.skip(f"{missing[0]} is not installed")
@@ -129,7 +129,7 @@ def test_a_page_runs_from_top_to_bottom(name, tmp_path, monkeypatch):
 
 
 @pytest.mark.full
-def test_the_paper_is_run_again_as_its_page_says(tmp_path, monkeypatch):
+def test_the_reproduction_of_the_paper_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     [command] = [part.text for part in runnable(PAGES["paper.md"]) if part.text.startswith(MINUTES)]
     run_command(command)
@@ -205,7 +205,7 @@ FIRST_RESULTS = """() => {
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built without a warning, and without the network."""
+    """Return the folder of the site, built without warnings and without network access."""
     if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
         pytest.skip("sphinx, myst-parser or furo is not installed: pip install 'scvi-codegen[docs]'")
     folder = tmp_path_factory.mktemp("site")
@@ -223,23 +223,23 @@ class TestTheSite:
         with looked_at(browser, *request.param) as view:
             yield view
 
-    def test_every_public_name_has_a_place_with_its_docstring(self, site):
+    def test_every_public_name_has_an_anchor(self, site):
         text = "".join(path.read_text(encoding="utf-8") for path in (site / "reference").glob("*.html"))
         assert [name for name in scvi_codegen.__all__ if f'id="scvi_codegen.{name}"' not in text] == []
 
-    def test_formulas_are_mathml_and_no_page_needs_the_network(self, site):
+    def test_formulas_are_mathml_and_no_page_loads_remote_files(self, site):
         pages = {path.name: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
         assert pages["galerkin.html"].count("<math") > 10
         loaded = r'<(?:script|img|link rel="stylesheet")[^>]+(?:src|href)="https?:'
         assert [name for name, page in pages.items() if re.search(loaded, page)] == []
 
-    def test_no_formula_is_cut(self, site):
-        """No dollar sign is left in the text outside of code."""
+    def test_no_formula_is_incomplete(self, site):
+        """No dollar sign remains in the text outside of code."""
         code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)
         pages = {path.relative_to(site).as_posix(): path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
         assert [name for name, page in pages.items() if "$" in re.sub(r"<[^>]*>", "", code.sub("", page))] == []
 
-    def test_pages_fit_a_phone_and_a_desk_by_day_and_by_night(self, site, view):
+    def test_pages_fit_the_screen_and_have_sufficient_contrast(self, site, view):
         wide, pale = [], []
         for path in sorted(site.rglob("*.html")):
             view.goto(path.as_uri())
@@ -251,8 +251,8 @@ class TestTheSite:
         assert {url.split(":")[0] for url in view.asked} <= {"file", "data"}
         assert view.said == []
 
-    def test_who_walks_by_keys_sees_where_he_is(self, site, view):
-        """Links that a phone keeps in a drawer, too: it comes out."""
+    def test_keyboard_focus_is_visible(self, site, view):
+        """Links in a drawer of a narrow screen open the drawer."""
         view.goto((site / "solar_system.html").as_uri())
         for _ in range(8):
             view.keyboard.press("Tab")

@@ -1,4 +1,4 @@
-"""The README does what it says, from top to bottom, in a temporary folder with the examples in it."""
+"""Tests of the README: its code, commands and links."""
 
 import re
 
@@ -27,6 +27,6 @@ def test_the_checks_use_the_commands_of_the_readme():
     assert checks.count("=$line ;;") == 2
 
 
-def test_every_file_that_the_readme_links_to_is_there():
+def test_links_of_the_readme_have_targets():
     targets = re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", README) + re.findall(r'src="([^":]+)"', README)
     assert [target for target in targets if not (ROOT / target).exists()] == []

@@ -1,8 +1,8 @@
-"""What tests of documentation read out of pages in Markdown, and how they run it.
+"""Extract and run the code of Markdown pages.
 
-Blocks marked ``python`` run in one namespace; of those marked ``sh`` or ``console``, every command that begins with
-``scvi-codegen``, in ``console`` also what else follows a prompt; a block below a line with nothing but a file's name is
-written to that file first. A block marked ``text`` is what the Python since the last such block prints.
+``python`` blocks of a page share one namespace. In ``sh`` and ``console`` blocks every command that begins with
+``scvi-codegen`` runs, in ``console`` blocks also every other command after a prompt. A block preceded by a line that
+contains only a file name is written to that file. A ``text`` block is the output of the Python blocks before it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ BLOCK = re.compile(r"^(?:`([\w./-]+)`\n\n)?```(\w+)\n(.*?)^```$", re.MULTILINE |
 PROGRAM = "scvi-codegen "
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]\d+)?(?!\w)")
 MAGNITUDE = re.compile(r"\de[-+]\d+")
-"""One digit and a power: of a rounding or an error, not of a quantity."""
+"""One digit and a power of ten: the magnitude of an error, compared to a factor of 10."""
 
 
 class Part(NamedTuple):
-    """A piece of a page: kind ``"python"``, ``"output"``, ``"command"``, or ``"file"`` with its name."""
+    """Part of a page: kind ``"python"``, ``"output"``, ``"command"``, or ``"file"`` with its name."""
 
     kind: str
     text: str
@@ -38,7 +38,7 @@ class Part(NamedTuple):
 
 
 def runnable(page: str) -> Iterator[Part]:
-    """What a page does, in order; Python text stands on the line that it has in the page."""
+    """Yield the parts of a page in order; Python code keeps its line numbers."""
     for match in BLOCK.finditer(page):
         name, language, text = match.groups()
         if name:
@@ -52,7 +52,7 @@ def runnable(page: str) -> Iterator[Part]:
 
 
 def commands(block: str) -> Iterator[str]:
-    """The commands of a shell block: lines joined at a backslash and split at ``&&``."""
+    """Yield the commands of a shell block: lines joined at a backslash and split at ``&&``."""
     for line in block.replace("\\\n", " ").splitlines():
         for command in line.removeprefix("$ ").split(" && "):
             if line.startswith("$ ") or command.strip().startswith(PROGRAM):
@@ -60,7 +60,7 @@ def commands(block: str) -> Iterator[str]:
 
 
 def run_command(command: str) -> None:
-    """Run one line of a shell in the present folder, with the programs of this interpreter's environment."""
+    """Run a shell command in the current folder, with the programs of this Python environment."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = {**os.environ, "PATH": path}
     result = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True, check=False)
@@ -68,7 +68,7 @@ def run_command(command: str) -> None:
 
 
 def agree(said: str, printed: str) -> None:
-    """The same words; the same numbers to two units of the last digit that is said, magnitudes to a factor of 10."""
+    """Check equal words and equal numbers: to two units of the last printed digit, magnitudes to a factor of 10."""
     assert NUMBER.sub("#", said).split() == NUMBER.sub("#", printed).split(), f"said\n{said}\nprinted\n{printed}"
     for one, other in zip(NUMBER.findall(said), NUMBER.findall(printed), strict=True):
         if MAGNITUDE.fullmatch(one):
@@ -83,9 +83,9 @@ def agree(said: str, printed: str) -> None:
 def run_page(
     name: str, parts: list[Part], folder: Path, monkeypatch: Any, heard: Callable[[str, str], None] = agree
 ) -> None:
-    """Do what a page says, from top to bottom, in a folder that is given the examples.
+    """Run all parts of a page in order, in a folder with a copy of the examples.
 
-    ``heard`` gets what the page says is printed, and what is.
+    ``heard`` is called with the expected and the printed output.
     """
     shutil.copytree(ROOT / "examples", folder / "examples")
     monkeypatch.chdir(folder)

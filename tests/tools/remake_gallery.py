@@ -1,4 +1,4 @@
-"""Make the pictures of ``docs/gallery`` and the blocks of what its pages print again, by the code of the pages.
+"""Redraw the pictures of ``docs/gallery`` and update the printed output by running the code of its pages.
 
 python tests/tools/remake_gallery.py                 all of them
 python tests/tools/remake_gallery.py figure_eight    one
@@ -18,7 +18,7 @@ GALLERY = ROOT / "docs" / "gallery"
 
 
 def remake(page: Path) -> None:
-    """Run it; put what it prints, and what it draws, into their places."""
+    """Run a page, replace its output blocks and copy its pictures."""
     text = page.read_text(encoding="utf-8")
     heard: list[tuple[str, str]] = []
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
