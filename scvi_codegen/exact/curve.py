@@ -193,8 +193,9 @@ class Curve:
         field = np.eye(m) - border @ response
         if np.linalg.svd(field, compute_uv=False)[-1] < CONJUGATE:
             raise StateError(
-                "the trajectories that leave q0 meet again at the end of the step (conjugate points): the discrete "
-                "Lagrangian is not defined there. Take a smaller step, or give guess to reach another trajectory"
+                "q1 is conjugate to q0 (the trajectories from q0 meet again there), so the discrete "
+                "Lagrangian is undefined. Use a smaller step size, or give guess to select another "
+                "trajectory"
             )
 
         def solve(floats: Floats) -> Floats:

@@ -93,7 +93,9 @@ def exact_discrete_lagrangian(
             constraints; if no solution is found; if q1 is conjugate to q0, where the solution is not unique.
     """
     if system.forces:
-        raise StateError(f"forces act on '{system.name}': there is no action whose slopes the momenta are")
+        raise StateError(
+            f"forces act on '{system.name}', so its momenta are not derivatives of an action: use exact_map"
+        )
     problem = _Problem(system, h, t, parameters, digits)
     start, end = problem.vector(q0, "q0"), problem.vector(q1, "q1")
     velocity = None if guess is None else problem.vector(guess, "guess")
@@ -102,7 +104,7 @@ def exact_discrete_lagrangian(
         nonlocal velocity
         motion, times = problem.motion, (problem.t, problem.h)
         if velocity is None and grid.pieces > MOST_STRAIGHT:
-            raise NotConvergedError("Newton's iteration from the straight line stalls")
+            raise NotConvergedError("Newton's iteration from the straight line does not converge")
         if velocity is None:
             first = Curve.straight(motion, grid, *times, start, end)
         else:
@@ -111,7 +113,7 @@ def exact_discrete_lagrangian(
         velocity = curve.velocity
         return curve
 
-    hint = "give guess, the velocity at the start, or take a smaller step"
+    hint = "give guess, the initial velocity, or use a smaller step size"
     return problem.answer(solve, f"no trajectory from q0 = {_shown(start)} to q1 = {_shown(end)} was found: {hint}")
 
 
@@ -148,7 +150,7 @@ def exact_map(
     def solve(grid: Grid) -> Curve:
         return Curve.launched(problem.motion, grid, problem.t, problem.h, start, velocity, digits)
 
-    return problem.answer(solve, f"{origin} was not found up to h = {mp.nstr(problem.h, 8)}: take a smaller step")
+    return problem.answer(solve, f"{origin} was not found up to h = {mp.nstr(problem.h, 8)}: use a smaller step size")
 
 
 class _Problem:
@@ -159,9 +161,12 @@ class _Problem:
         self.names = [coordinate.name for coordinate in system.coordinates]
         self.digits, self.t, self.h = digits, _number(t, "the time t"), _number(h, "the step h")
         if self.h == 0:
-            raise StateError("the step h is 0")
+            raise StateError("the step size h is 0: it must be positive or negative")
         if system.constraints:
-            raise StateError(f"constraints hold '{system.name}': exact steps are those of motions without any")
+            raise StateError(
+                f"'{system.name}' has constraints, which exact steps do not support: use coordinates "
+                "without constraints"
+            )
         self.motion = ExactMotion(system, list(_parameter_values(system, parameters).values()))
 
     def vector(self, values: Sequence[Any], name: str) -> Array:
@@ -221,11 +226,11 @@ def _parameter_values(system: LagrangianSystem, parameters: Values) -> dict[str,
         given = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})
         for name in system.inputs:
             if f"{name}_0" not in (parameters or {}):
-                raise StateError(f"the input {name} is not given: parameters={{'{name}_0': ...}} holds it")
+                raise StateError(f"the input {name} is not set: give its value as parameters={{'{name}_0': ...}}")
     elif len(parameters) == len(names):
         given = dict(zip(names, parameters, strict=True))
     else:
-        raise StateError(f"there are {len(names)} parameters ({', '.join(names)}), not {len(parameters)}")
+        raise StateError(f"parameters must be {len(names)} numbers ({', '.join(names)}), not {len(parameters)}")
     for name in given:
         if name not in names:
             raise StateError(

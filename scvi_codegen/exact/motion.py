@@ -142,7 +142,7 @@ class ExactMotion:
         try:
             return newton(lambda v: self.momentum(q, v, t) - p, mass, numbers(np.zeros(m)), digits)
         except NotConvergedError as failure:
-            raise StateError(f"no velocity that Newton's iteration finds has these momenta: {failure}") from failure
+            raise StateError(f"Newton's iteration finds no velocity with these momenta: {failure}") from failure
 
     def lagrangian(self, q: Numbers, v: Numbers, t: Number) -> Number:
         """Return L of a Lagrangian."""
@@ -258,7 +258,7 @@ class ExactMotion:
         if found is not None:
             return found
         if not halvings:
-            raise StateError("the exact motion cannot be followed over one step: it may end in a singularity")
+            raise StateError("the exact trajectory cannot be computed over one step: it may contain a singularity")
         middle = self._followed(start, h / 2, t, halvings - 1)
         return self._followed(middle, h / 2, t + h / 2, halvings - 1)
 

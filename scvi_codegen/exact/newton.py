@@ -85,9 +85,9 @@ def inverse(matrix: Floats) -> Floats:
     try:
         found = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     except np.linalg.LinAlgError as failure:
-        raise NotConvergedError("the mass matrix d2L/dv2 is singular on the way") from failure
+        raise NotConvergedError("the mass matrix d2L/dv2 is singular at an iterate") from failure
     if not np.isfinite(found).all():
-        raise NotConvergedError("the iteration runs out of the range of double precision")
+        raise NotConvergedError("an iterate exceeds the range of double precision")
     return found
 
 

@@ -115,9 +115,9 @@ class DerivedStep:
             return self._end(z, self._rows(z, known), known)
         except NotConvergedError as failure:
             where = f"with h = {mp.nstr(known.h, 6)}"
-            raise StateError(f"the derived equations were not solved {where}: {failure}") from failure
+            raise StateError(f"Newton's iteration for the derived equations failed {where}: {failure}") from failure
         except ArithmeticError as failure:
-            leaves = "the derived equations lead out of the domain of the formula"
+            leaves = "an iterate of the derived equations is outside the domain of the formula"
             raise StateError(f"{leaves} with h = {mp.nstr(known.h, 6)}") from failure
 
     def first_update(self, q: Any, p: Any, h: Any, t: Any = 0) -> SolvedStep:
@@ -140,7 +140,7 @@ class DerivedStep:
         """
         shape = self.stages.shape
         if self.rate is None or not isinstance(shape, Velocities):
-            raise StateError(f"the time of '{self.system.name}' is not transformed")
+            raise StateError(f"'{self.system.name}' has no time transformation")
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.zero)
         family, z = self.stages.families[0], np.array(solved.unknowns, dtype=object)
         rates = [self.rate(self._point(family, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]

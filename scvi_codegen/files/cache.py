@@ -76,7 +76,7 @@ def remedy_of(folder: Path) -> str:
     """Return why a folder is not used, and what to do."""
     reason = exposed(folder)
     remedy = f"chmod go-w '{folder}', or name" if "write" in reason else "name"
-    return f"{reason}, and what lies there is run: {remedy} another folder in {CACHE_VARIABLE}"
+    return f"{reason}, and its contents are executed: {remedy} another folder in {CACHE_VARIABLE}"
 
 
 def make_folder(folder: Path) -> None:
@@ -95,8 +95,8 @@ def exposed(path: Path) -> str:
     if found.st_uid not in (os.geteuid(), 0):
         return f"it belongs to the user number {found.st_uid}, not to you ({os.geteuid()}) or root"
     if found.st_mode & stat.S_IWOTH:
-        return "every user of this machine may write into it"
-    return "every user of its group may write into it" if found.st_mode & stat.S_IWGRP else ""
+        return "every user of this machine may write to it"
+    return "every user of its group may write to it" if found.st_mode & stat.S_IWGRP else ""
 
 
 def size_limit() -> int:

@@ -112,7 +112,7 @@ def check_format(path: str | os.PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in WRITERS:
         known = ", ".join(WRITERS)
-        raise StateError(f"a trajectory is saved by the suffix of its file, one of {known}, not as {str(path)!r}")
+        raise StateError(f"the format of a trajectory is the suffix of its file, one of {known}, not {str(path)!r}")
     library = LIBRARIES.get(suffix)
     if library is not None and importlib.util.find_spec(library) is None:
         raise missing(library)
@@ -129,21 +129,21 @@ def write_states(states: States, path: str | os.PathLike[str]) -> None:
     check_format(path)
     suffix = Path(path).suffix.lower()
     if states.units and suffix not in LABELLED:
-        raise StateError(f"a file {suffix} has no place for units; {', '.join(LABELLED)} have")
+        raise StateError(f"the format {suffix} does not support units; {', '.join(LABELLED)} do")
     write_whole(path, lambda made: WRITERS[suffix](states, made))
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[Path], None]) -> None:
     """Create a file or a folder by ``write``, which then replaces ``path``; nothing changes on failure."""
     if Path(path).is_dir() and not (Path(path) / ".zgroup").exists():
-        raise StateError(f"{str(path)!r} is a folder with something else in it: choose another name")
+        raise StateError(f"{str(path)!r} is a folder with other contents: choose another name")
     try:
         with replaced(path) as made:
             write(made)
     except OSError as error:
         if error.errno is None:
             raise
-        what = f"{os.strerror(error.errno)}: nothing was written, what was there before is there still"
+        what = f"{os.strerror(error.errno)}: nothing was written, and existing files are unchanged"
         raise OSError(error.errno, what, str(path)) from error
 
 

@@ -34,15 +34,15 @@ LONG_NAMES = {
     "t": "time",
     "q": "position",
     "p": "momentum",
-    "iterations": "iterations of the solver since the state before",
-    "velocity": "velocity that belongs to the momentum",
+    "iterations": "solver iterations since the previous state",
+    "velocity": "velocity",
     "energy": "energy p.v - L",
-    "momentum_map": "what a symmetry conserves",
+    "momentum_map": "conserved quantity of a symmetry",
     "coordinate": "name of the coordinate",
     "symmetry": "name of the momentum map",
     "parameter": "name of the parameter",
     "parameters": "value of the parameter",
-    "status": "whether the trajectory reached the end, or why not",
+    "status": "end of the trajectory: success or reason of failure",
     "steps": "steps completed",
 }
 MEASURED = ("t", "q", "p", "velocity", "energy", "momentum_map")
@@ -105,7 +105,7 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
     found = dict(units or {})
     for name, unit in found.items():
         if name not in MEASURED or not isinstance(unit, str):
-            raise StateError(f"units are texts for {', '.join(MEASURED)}, not {unit!r} for {name!r}")
+            raise StateError(f"units must be texts for {', '.join(MEASURED)}, not {unit!r} for {name!r}")
     if "q" in found and "t" in found:
         found.setdefault("velocity", f"{found['q']} {found['t']}-1")
     return found

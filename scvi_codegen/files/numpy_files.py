@@ -29,4 +29,4 @@ def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
     except (OSError, ValueError):
         raise
     except Exception as error:
-        raise ValueError(f"it is no whole file of NumPy's: {error!r}") from error
+        raise ValueError(f"it is not a complete NumPy file: {error!r}") from error

@@ -48,4 +48,4 @@ def _check_whole_numbers(document: dict[str, Any]) -> None:
         elif isinstance(item, list):
             pending.extend(item)
         elif isinstance(item, int) and item.bit_length() > MAX_BITS:
-            raise ModelFileError(f"this is not TOML: a whole number of {item.bit_length()} bits, of {MAX_BITS} at most")
+            raise ModelFileError(f"this is not TOML: a whole number has {item.bit_length()} bits, more than {MAX_BITS}")

@@ -46,11 +46,11 @@ NODES = frozenset([Add, Mul, Pow, *NAME_OF])
 
 
 _SMOOTHER = {
-    "Abs": "the absolute value is not differentiable; sqrt(x**2) is one, too",
+    "Abs": "the absolute value is not differentiable, and neither is sqrt(x**2)",
     "sign": "the sign is not differentiable",
-    "Piecewise": "pieces are not differentiable where they meet",
-    "Heaviside": "steps are not differentiable",
-    "ImaginaryUnit": "a Lagrangian is real",
+    "Piecewise": "piecewise functions are not differentiable where pieces meet",
+    "Heaviside": "step functions are not differentiable",
+    "ImaginaryUnit": "a Lagrangian must be real",
 }
 
 
@@ -78,9 +78,9 @@ def _node_problem(node: Any) -> str | None:
         if node.is_Symbol or node in (S.Pi, S.Exp1):
             return None
         if node.is_Rational and bits(node) > MAX_BITS:
-            return f"a constant grows beyond {MAX_BITS} bits, more than any C double can hold"
+            return f"a constant exceeds {MAX_BITS} bits, more than any C double can represent"
         if node.is_Rational:
-            return f"the constant {shortened(node)} lies beyond any C double" if beyond_double(node) else None
+            return f"the constant {shortened(node)} exceeds the range of a C double" if beyond_double(node) else None
         if node in (S.NaN, S.ComplexInfinity, S.Infinity, S.NegativeInfinity):
             return f"a part of the formula is not finite ({node})"
     elif node.func in NODES:
@@ -97,8 +97,8 @@ def exponent_problem(exponent: Expr) -> str | None:
     if abs(constant) <= MAX_EXPONENT and constant.q <= MAX_EXPONENT_DENOMINATOR:
         return None
     return (
-        f"the constant in an exponent lies between -{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most "
-        f"{MAX_EXPONENT_DENOMINATOR}, not {shortened(constant)}"
+        f"the constant {shortened(constant)} in an exponent is not supported: it must lie between "
+        f"-{MAX_EXPONENT} and {MAX_EXPONENT}, with a denominator of at most {MAX_EXPONENT_DENOMINATOR}"
     )
 
 

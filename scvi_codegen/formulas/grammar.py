@@ -55,7 +55,7 @@ _HINTS = {
     "'": "strings are not part of the grammar",
     '"': "strings are not part of the grammar",
     "#": "comments are not part of the grammar",
-    "%": "there is no remainder in the grammar",
+    "%": "the remainder % is not part of the grammar",
     "{": "sets are not part of the grammar",
     ":": "lambda, slices and dictionaries are not part of the grammar",
 }
@@ -168,7 +168,7 @@ class Parser:
         if kind == "operator" and text == "**":
             self.refuse("a tower of powers is ambiguous: write (x**y)**z or x**(y**z)", column)
         if kind == "operator" and text in "),":
-            self.refuse(f"unexpected '{text}': it closes or separates nothing", column)
+            self.refuse(f"unexpected '{text}': there is nothing for it to close or separate", column)
         if kind == "end":
             self.refuse("the formula ends inside brackets: a ')' is missing", column)
         what = "only the functions of the grammar can be called" if text == "(" else "write * for a product"
@@ -213,7 +213,7 @@ class Parser:
     def bounded(self, number: Expr, column: int) -> Expr:
         """Return the number; raise an error if it is too long."""
         if bits(number) > MAX_BITS:
-            self.refuse(f"a constant grows beyond {MAX_BITS} bits here, more than any C double can hold", column)
+            self.refuse(f"a constant exceeds {MAX_BITS} bits here, more than any C double can represent", column)
         return number
 
     def product(self, *, negative: bool) -> Expr:
@@ -263,7 +263,7 @@ class Parser:
         if _vanishes(base) and not exponent.is_positive:
             self.refuse("division by zero: 0 to a power that is not positive", operator.column)
         if exponent.is_Rational and bits(base.as_coeff_Mul(rational=True)[0]) * abs(exponent) > MAX_BITS:
-            self.refuse(f"a constant grows beyond {MAX_BITS} bits here, more than any C double can hold", column)
+            self.refuse(f"a constant exceeds {MAX_BITS} bits here, more than any C double can represent", column)
         return self.supported(Pow(base, exponent), operator.column)
 
     def supported(self, result: Expr, column: int) -> Expr:
@@ -301,10 +301,10 @@ class Parser:
         mantissa, _, exponent = text.lower().partition("e")
         whole = text.isdigit()  # an integer, perhaps the numerator of a fraction, may be longer
         if len(mantissa) > (MAX_DIGITS if whole else 320) or len(exponent) > 8 or abs(int(exponent or 0)) > 640:
-            self.refuse("this number has too many digits: a C double ends at 1.8e308", column)
+            self.refuse("this number has too many digits: the largest C double is 1.8e308", column)
         value = Rational(text)
         if not whole and beyond_double(value):
-            self.refuse("this number lies outside the range of a C double", column)
+            self.refuse("this number exceeds the range of a C double", column)
         return self.bounded(value, column)
 
     def name(self, name: str, column: int) -> Expr:
@@ -317,7 +317,9 @@ class Parser:
         value = self.symbols.get(name, CONSTANTS.get(name))
         if value is None:
             known = ", ".join([*self.symbols, *CONSTANTS])
-            declared = f"a constant is declared: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
+            declared = (
+                f"declare a constant as a parameter: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
+            )
             self.refuse(f"unknown name '{name}'{closest(name, self.symbols)} Known here: {known}; {declared}", column)
         return value
 

@@ -91,7 +91,7 @@ def parse_indexed(
     for placeholder, (loops, formula, column) in parser.sums.items():
         factor = whole.diff(placeholder)
         if factor.free_symbols & (set(parser.sums) | set(parser.accesses)):
-            message = "a sum may be multiplied by numbers and parameters only: write factors that vary inside of it"
+            message = "a sum may be multiplied by numbers and parameters only: move factors that vary into the sum"
             raise ExpressionError(message, text, column)
         by_loops.setdefault(loops, []).append(factor * formula)
     by_loops.setdefault((), []).append(whole.xreplace(dict.fromkeys(parser.sums, S.Zero)))
@@ -156,22 +156,22 @@ class _Declaration(_Indices):
         name = self.take_name("the name of an array")
         check_name(name.text)
         if self.peek().text != "[":
-            self.refuse(f"an array has its sizes in brackets, as {name.text}[N]", self.column)
+            self.refuse(f"the sizes of an array are written in brackets, as {name.text}[N]", self.column)
         self.expect("[")
         axes = [self.axis()]
         while self.accept(","):
             axes.append(self.axis())
         self.expect("]")
         if self.peek().kind != "end":
-            self.refuse("a declaration ends with its brackets, as q[N]", self.column)
+            self.refuse("nothing may follow the brackets of a declaration, as q[N]", self.column)
         return Array(name.text, tuple(axes))
 
     def axis(self) -> Size:
         column, size = self.column, self.size()
         if size.name and size.number:
-            self.refuse("an axis is a name or a whole number, as q[N] or r[N, 3]", column)
+            self.refuse("an axis must be a name or a whole number, as q[N] or r[N, 3]", column)
         if not size.name and size.number < 1:
-            self.refuse("an axis has at least one place", column)
+            self.refuse("the size of an axis must be at least 1", column)
         if size.name:
             check_name(size.name)
         return size
@@ -198,13 +198,16 @@ class IndexedParser(_Indices):
         if name in self.arrays:
             return self.entry(self.arrays[name], column)
         if name in self.tables:
-            self.refuse(f"'{name}' is a table, whose entries are places: q[{name}[.., 0]]", column)
+            self.refuse(f"'{name}' is an index table, whose entries are indices: write q[{name}[.., 0]]", column)
         if self.peek().text == "[":
             known = ", ".join(map(str, self.arrays.values())) or "none"
-            self.refuse(f"'{name}' is no array{closest(name, self.arrays)} Arrays: {known}", column)
+            self.refuse(f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}", column)
         if name in self.bound or name in self.sizes:
             what = "an index" if name in self.bound else "a size"
-            self.refuse(f"'{name}' is {what}, which stands in brackets and bounds only: make it a parameter", column)
+            self.refuse(
+                f"'{name}' is {what}, which may occur only in brackets and bounds: declare a parameter for its value",
+                column,
+            )
         return super().name(name, column)
 
     def summed(self, column: int) -> Expr:
@@ -237,7 +240,7 @@ class IndexedParser(_Indices):
         """Unroll a sum with integer bounds: its formula is parsed once per value of the indices."""
         if any(loop.first.name or loop.end.name for loop in loops):
             message = (
-                "a sum within a sum has bounds that are whole numbers; write sum(i in N, j in N, ..) for a double sum"
+                "a sum within a sum must have whole numbers as bounds; write sum(i in N, j in N, ..) for a double sum"
             )
             self.refuse(message, column)
         count = 1
@@ -245,11 +248,11 @@ class IndexedParser(_Indices):
             length = max(0, loop.end.number - loop.first.number)
             count = count * (length - 1) // 2 if loop.behind else count * length
         if not 0 < count <= MOST_WRITTEN_OUT:
-            self.refuse(f"a sum over whole numbers has 1 to {MOST_WRITTEN_OUT} terms, not {count}", column)
+            self.refuse(f"a sum over whole numbers must have 1 to {MOST_WRITTEN_OUT} terms, not {count}", column)
         self.nested *= count
         if self.nested > MOST_NESTED:
-            message = f"sums over whole numbers within each other have at most {MOST_NESTED} terms, not {self.nested}"
-            self.refuse(f"{message}: name the size of an array in place of the number", column)
+            message = f"nested sums over whole numbers may have at most {MOST_NESTED} terms, not {self.nested}"
+            self.refuse(f"{message}: use a named size of an array instead of the number", column)
         rows: list[dict[str, int]] = [{}]
         for loop in loops:
             rows = [
@@ -279,14 +282,15 @@ class IndexedParser(_Indices):
             if bound.name and bound.name not in self.sizes:
                 known = ", ".join(sorted(self.sizes)) or "none"
                 self.refuse(
-                    f"'{bound.name}' is the size of no array{closest(bound.name, self.sizes)} Sizes: {known}", column
+                    f"'{bound.name}' is not the size of an array{closest(bound.name, self.sizes)} Sizes: {known}",
+                    column,
                 )
         periodic = self.peek().text == "periodic"
         self.position += periodic
         if pair is None:
             return [Loop(index=first.text, first=span[0], end=span[1], periodic=periodic)]
         if span[0] != Size("", 0) or periodic:
-            self.refuse(f"pairs are taken from a whole axis, as {first.text} < {pair.text} in N", column)
+            self.refuse(f"pairs must run over a whole axis, as {first.text} < {pair.text} in N", column)
         outer = Loop(index=first.text, first=span[0], end=span[1])
         return [outer, Loop(index=pair.text, first=span[0], end=span[1], behind=first.text)]
 
@@ -297,9 +301,9 @@ class IndexedParser(_Indices):
         except SystemDefinitionError as error:
             self.refuse(str(error), token.column)
         if token.text in self.bound:
-            self.refuse(f"the index '{token.text}' is used by a sum around this one: choose another", token.column)
+            self.refuse(f"the index '{token.text}' is used by an enclosing sum: choose another", token.column)
         if any(token.text in names for names in (self.arrays, self.tables, self.symbols, self.sizes)):
-            self.refuse(f"'{token.text}' has a meaning: choose another index", token.column)
+            self.refuse(f"'{token.text}' is the name of something else: choose another index", token.column)
 
     def entry(self, array: Array, column: int) -> Expr:
         """Parse ``[indices]`` after the name of an array."""
@@ -321,7 +325,7 @@ class IndexedParser(_Indices):
         if len(places) == 1 and self.tables.get(array.name) is array and array.axes[-1] == Size("", 1):
             places.append(Place())  # pins[p] is pins[p, 0]
         if len(places) != len(array.axes):
-            self.refuse(f"'{array}' has {len(array.axes)} axes, not {len(places)}", column)
+            self.refuse(f"'{array}' has {len(array.axes)} axes, but {len(places)} indices are given", column)
         for place, axis in zip(places, array.axes, strict=True):
             if problem := self.leaves(place, axis):
                 self.refuse(f"{Access(array=array, places=tuple(places))}: {problem}", column)
@@ -339,7 +343,10 @@ class IndexedParser(_Indices):
         bound = self.bound.get(token.text)
         if bound is None:
             known = ", ".join(self.bound) or "none here"
-            message = f"'{token.text}' is no index{closest(token.text, self.bound)} Indices: {known}. A place is"
+            message = (
+                f"'{token.text}' is not an index{closest(token.text, self.bound)} Indices: {known}. An "
+                "array is accessed by"
+            )
             self.refuse(f"{message} a whole number, N-1, i, i+1 or an entry of a table, bonds[b, 0]", token.column)
         self.position += 1
         if isinstance(bound, int):
@@ -353,7 +360,9 @@ class IndexedParser(_Indices):
         row, *columns = self.brackets(table, token.column)
         plain = row.index and not row.table and not row.base.number
         if not plain or len(columns) != 1 or columns[0].index or columns[0].base.name:
-            self.refuse("a table is accessed by an index and a whole number, as bonds[b, 0] (pins[p])", token.column)
+            self.refuse(
+                "a table must be accessed by an index and a whole number, as bonds[b, 0] (pins[p])", token.column
+            )
         return Place(index=row.index, table=table.name, column=columns[0].base.number)
 
     def leaves(self, place: Place, axis: Size) -> str:
@@ -364,12 +373,12 @@ class IndexedParser(_Indices):
         if not place.index:
             below = base.number < 0 and not base.name
             above = base.name == axis.name and base.number >= axis.number
-            return f"{base} is not on an axis of {axis}" if below or above else ""
+            return f"{base} is outside an axis of size {axis}" if below or above else ""
         loop = self.bound[place.index]
         assert isinstance(loop, Loop)
         if loop.periodic:
             whole = loop.is_whole and loop.end == axis
-            return "" if whole else f"'{loop}' is no index of a periodic axis of {axis}"
+            return "" if whole else f"'{loop}' is not an index of a periodic axis of size {axis}"
         last = loop.end + -1
         remedy = f"or write '{loop.index} in {axis} periodic'"
         if not loop.first.name and (first := loop.first.number + base.number) < 0:

@@ -43,14 +43,14 @@ def parse_constraint(
     equation, *behind = _FOR.split(text)
     sides = equation.split("=")
     if len(sides) > 2 or len(behind) > 1:
-        raise ExpressionError("a constraint has one '=' and one 'for' at most", text, 0)
+        raise ExpressionError("a constraint may contain one '=' and one 'for'", text, 0)
     loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
     parsers = [IndexedParser(side, symbols, arrays, tables) for side in sides]
     for parser in parsers:
         parser.bound = {loop.index: loop for loop in loops}
     left, *right = map(parsed, parsers)
     if any(parser.sums for parser in parsers):
-        message = "a constraint of a sum over a whole array is not there: constraints are of few entries each"
+        message = "a constraint must not contain a sum over a whole array: constraints couple few entries each"
         raise ExpressionError(message, text, text.find("sum"))
     accesses = dict(chain(*(parser.accesses.items() for parser in parsers)))
     return term_of(loops, left - right[0] if right else left, accesses)

@@ -86,7 +86,7 @@ class _Target(IndexedParser):
         token = self.take_name("an array of coordinates")
         if token.text not in self.arrays:
             known = ", ".join(map(str, self.arrays.values()))
-            self.refuse(f"a force acts on coordinates, {known}, not on '{token.text}'", token.column)
+            self.refuse(f"a force must act on coordinates, {known}, not on '{token.text}'", token.column)
         array, bounds = self.arrays[token.text], dict[str, Size]()
         self.expect("[")
         for number, axis in enumerate(array.axes):
@@ -115,5 +115,5 @@ class _Target(IndexedParser):
         place = self.peek()
         self.check_index(place)
         if place.text in bounds:
-            self.refuse(f"the index '{place.text}' stands for two axes", place.column)
+            self.refuse(f"the index '{place.text}' is used for two axes: use two indices", place.column)
         bounds[self.take_name("an index").text] = axis

@@ -39,7 +39,9 @@ class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
         wrapped = dict(map(_wrapped, expression.function.atoms(Mod)))
         for place in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):
             if place.is_Add and place.free_symbols & set(wrapped):
-                raise SystemDefinitionError(f"{place} leaves a ring: write Mod({place}, ..) as at its other places")
+                raise SystemDefinitionError(
+                    f"{place} leaves a periodic axis: write Mod({place}, ..), as in its other indices"
+                )
         loops = ", ".join(_loops(expression.limits, wrapped))
         return f"sum({loops}, {self._print(expression.function)})"
 
@@ -59,14 +61,14 @@ def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
     place, length = expression.args
     indices = [each for each in place.free_symbols if each not in length.free_symbols]
     if len(indices) != 1 or not (place - indices[0]).is_Integer:
-        raise SystemDefinitionError(f"{expression} is no place on a ring: write Mod(i + 1, N)")
+        raise SystemDefinitionError(f"{expression} is not an index of a periodic axis: write Mod(i + 1, N)")
     return indices[0], length
 
 
 def _loops(limits: Sequence[Tuple], wrapped: Mapping[Symbol, Expr]) -> list[str]:
     """Return the loops of a sum, outermost first; an index that begins at another plus 1 is the second of a pair."""
     if any(len(limit) != 3 for limit in limits):
-        raise SystemDefinitionError(f"a sum has an index and two bounds, as (i, 0, N - 1), not {limits}")
+        raise SystemDefinitionError(f"a sum must have an index and two bounds, as (i, 0, N - 1), not {limits}")
     spans = {index: (first, last) for index, first, last in reversed(limits)}
     pairs = {outer: inner for inner, (first, _) in spans.items() for outer in spans if first - outer == 1}
     loops = []
@@ -74,12 +76,13 @@ def _loops(limits: Sequence[Tuple], wrapped: Mapping[Symbol, Expr]) -> list[str]
         if index in pairs:
             length = spans[pairs[index]][1] + 1
             if first != 0 or last - length not in (-1, -2):
-                raise SystemDefinitionError(f"pairs are taken from a whole axis, ({index}, 0, N - 2), not {limits}")
+                raise SystemDefinitionError(f"pairs must run over a whole axis, ({index}, 0, N - 2), not {limits}")
             loops.append(f"{index} < {pairs[index]} in {length}")
         elif index in wrapped:
             if first != 0 or wrapped[index] != last + 1:
                 message = (
-                    f"Mod(.., {wrapped[index]}) needs the whole ring, ({index}, 0, {wrapped[index] - 1}), not {limits}"
+                    f"Mod(.., {wrapped[index]}) requires a sum over the whole periodic axis, "
+                    f"({index}, 0, {wrapped[index] - 1}), not {limits}"
                 )
                 raise SystemDefinitionError(message)
             loops.append(f"{index} in {last + 1} periodic")

@@ -40,7 +40,7 @@ def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[
     for name in parameters:
         if name in parts:
             raise SystemDefinitionError(
-                f"'{name}' is the name of both parameter '{name}' and a part of the input '{name[:-2]}': rename one"
+                f"'{name}' is the name of both a parameter and a component of the input '{name[:-2]}': rename one"
             )
     return {**parameters, **parts}
 

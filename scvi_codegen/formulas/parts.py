@@ -77,4 +77,4 @@ def key_of(value: Any) -> str:
         return repr(float(value))
     if value is None or isinstance(value, bool | int | str):
         return repr(value)
-    raise TypeError(f"a key of a cache cannot be made of a {type(value).__name__}: {value!r}")
+    raise TypeError(f"a cache key cannot be made from a {type(value).__name__}: {value!r}")

@@ -38,7 +38,9 @@ class Elements:
         spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
         counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
         if (total := math.prod(counts)) > MOST_ELEMENTS:
-            raise StateError(f"{total} elements of a sum are more than the {MOST_ELEMENTS} that NumPy adds up")
+            raise StateError(
+                f"a sum has {total} elements, more than the {MOST_ELEMENTS} that can be evaluated by NumPy"
+            )
         grids = np.meshgrid(*(np.arange(count) for count in counts), indexing="ij")
         self.index: dict[str, NDArray[np.int64]] = {}
         for (loop, span), grid in zip(spans, grids, strict=True):

@@ -73,7 +73,7 @@ def given_name(key: object) -> str:
         return str(key.name)
     if isinstance(key, str):
         return key
-    raise SystemDefinitionError(f"a parameter is a symbol or a name, not {key!r} ({type(key).__name__})")
+    raise SystemDefinitionError(f"a parameter must be a symbol or a name, not {key!r} ({type(key).__name__})")
 
 
 def check_name(name: object) -> None:
@@ -81,12 +81,13 @@ def check_name(name: object) -> None:
     if not isinstance(name, str) or not IDENTIFIER.fullmatch(name):
         arrays = "; arrays are those of IndexedSystem" if isinstance(name, str) and "[" in name else ""
         raise SystemDefinitionError(
-            f"{name!r} is not a name: use letters a-z, A-Z, digits and underscores, beginning with a letter{arrays}"
+            f"{name!r} is not a valid name: use letters a-z, A-Z, digits and underscores, beginning "
+            f"with a letter{arrays}"
         )
     if name in C_KEYWORDS:
-        raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for instance to '{name}_'")
+        raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for example to '{name}_'")
     if name in FUNCTIONS or name == "pi":
-        raise SystemDefinitionError(f"'{name}' has a meaning in formulas: rename the symbol, for instance to '{name}_'")
+        raise SystemDefinitionError(f"'{name}' is reserved in formulas: rename the symbol, for example to '{name}_'")
 
 
 def check_names(coordinates: Sequence[str], parameters: Sequence[str], momenta: Sequence[str] = ()) -> None:

@@ -46,7 +46,7 @@ class Tape:
             raise ArithmeticError(f"no real value: {error}") from error
         found = [values[place] for place in self._results]
         if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in found):
-            raise ArithmeticError("a value is not a finite real number: the state has left the domain of the formula")
+            raise ArithmeticError("a value is not a finite real number: the state is outside the domain of the formula")
         return found
 
     def _place(self, expression: sympy.Expr) -> int:

@@ -69,7 +69,8 @@ class Translation:
             self._add(self.user_time, TIME)
         if velocities is not None and len(velocities) != len(coordinates):
             raise SystemDefinitionError(
-                f"{len(coordinates)} coordinates, but {len(velocities)} velocities: list one each"
+                f"there are {len(coordinates)} coordinates, but {len(velocities)} velocities: list "
+                "one velocity per coordinate"
             )
         self.coordinates = tuple(self._coordinate(coordinate) for coordinate in coordinates)
         for index, coordinate in enumerate(coordinates):
@@ -101,8 +102,9 @@ class Translation:
         for other, taken in self.rules.items():
             if taken == target and other != source and not isinstance(other, sympy.Derivative):
                 raise SystemDefinitionError(
-                    f"'{other}' and '{source}' are different symbols that would both be called '{name}': rename one "
-                    "(two symbols of one name and different assumptions are different, too)"
+                    f"'{other}' and '{source}' are different symbols that would both be called "
+                    f"'{name}': rename one (symbols with equal names but different assumptions are "
+                    "different)"
                 )
         self.rules[source] = target
         return target

@@ -17,8 +17,8 @@ def check_tolerance(value: float, error: type[ScviCodegenError] = StateError) ->
     """Raise an error unless the tolerance of adaptive steps is positive and below 1."""
     if not 0.0 < value < 1.0:
         raise error(
-            f"the tolerance must be positive and below 1 (relative error of each step), not {value:g}: leave it out "
-            "for round-off"
+            "the tolerance must be positive and below 1 (relative error of each step), not "
+            f"{value:g}: leave it out for errors at round-off level"
         )
 
 

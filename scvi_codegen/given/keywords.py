@@ -11,20 +11,20 @@ from scvi_codegen.given.words import meanings, same_here
 __all__ = ["keyword_meant"]
 
 ELSEWHERE: Final = {
-    "inputs": "data belong to .integrate(..., inputs={'u': (t, values)}) and .integrate_ensemble, values that change "
+    "inputs": "pass them to .integrate(..., inputs={'u': (t, values)}) or .integrate_ensemble, and values that change "
     "during a run to run.set_inputs(u=...)",
-    "t_eval": "keep all states, and ask the run for those at times: run.at(times)",
-    "events": "they are of .integrate(..., events=...) or of compile_stepper(..., events=...)",
-    "save_every": "it is of run.record(n, save_every=...), and of .integrate",
-    "steps": "their number goes to run.advance(n) or run.record(n)",
-    "h": "steps of h are taken by a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
-    "parameters": "their values go to the run, .integrate(..., parameters={...}), their names to the system",
-    "velocity": "it takes momenta, p = stepper.momentum(q, velocity)",
-    "t_end": "adaptive steps belong to .integrate(..., t_end=...); a fixed number of steps takes steps of h: "
-    "h = (t_end - t) / steps",
-    "degree": "it goes with the name of the method, 'svi:8', or with its class, SVI(8)",
-    "solver": "it is chosen where a stepper is compiled: compile_stepper(system, method, solver=...)",
-    "method": "the method is said where it is compiled: compile_stepper(system, method)",
+    "t_eval": "save all states, and interpolate the run: run.at(times)",
+    "events": "pass them to .integrate(..., events=...) or compile_stepper(..., events=...)",
+    "save_every": "pass it to run.record(n, save_every=...) or .integrate",
+    "steps": "pass the number to run.advance(n) or run.record(n)",
+    "h": "pass it to a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",
+    "parameters": "pass their values to the run, .integrate(..., parameters={...}), and their names to the system",
+    "velocity": "use momenta, p = stepper.momentum(q, velocity)",
+    "t_end": "for adaptive steps use .integrate(..., t_end=...); for a fixed number of steps give h = (t_end "
+    "- t) / steps",
+    "degree": "include it in the method, 'svi:8' or SVI(8)",
+    "solver": "pass it when compiling: compile_stepper(system, method, solver=...)",
+    "method": "pass it when compiling: compile_stepper(system, method)",
 }
 """Explanations by keyword, for functions that do not have it."""
 

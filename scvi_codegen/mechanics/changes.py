@@ -44,8 +44,10 @@ def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem
     found = with_changes(twin, number) if twin else None
     if found is None:
         raise SystemDefinitionError(
-            f"changes of '{system.name}' do not follow by its own sweeps: that takes constant masses, one a "
-            "coordinate, forces of position and time alone, and no constraints. Take run.tangent(), which all have"
+            f"the variational equations of '{system.name}' cannot be solved by fixed-point iteration "
+            "together with the trajectory: that requires constant masses, one per coordinate, forces "
+            "of position and time only, and no constraints. Use run.tangent(), which supports all "
+            "systems"
         )
     return found
 

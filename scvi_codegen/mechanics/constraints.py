@@ -47,7 +47,9 @@ def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> 
         equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
         sides = formula.split("=") if isinstance(formula, str) else equation
         if len(sides) > 2:
-            raise SystemDefinitionError(f"the constraint '{formula}' has more than one '='")
+            raise SystemDefinitionError(
+                f"the constraint '{formula}' has more than one '=': write one equation per constraint"
+            )
         found.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))
     return tuple(found)
 
@@ -57,12 +59,15 @@ def check_constraints(system: MechanicalSystem) -> None:
     names = list(map(system.text_of, system.constraints))
     for name, g in zip(names, system.constraints, strict=True):
         if g.free_symbols.isdisjoint((*system.coordinates, *system.velocities)):
-            raise SystemDefinitionError(f"there is no coordinate in the constraint '{name}'")
+            raise SystemDefinitionError(
+                f"the constraint '{name}' contains no coordinate: constraints are g(q, t) = 0, or A(q, t) "
+                "v + b(q, t) = 0. Remove it, or write the condition in terms of the coordinates"
+            )
     for k, i in jacobian(list(constraint_slopes(system).values()), system.velocities):
         name = names[list(constraint_slopes(system))[k][0]]
         raise SystemDefinitionError(
-            f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: constraints are "
-            "g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
+            f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
+            "constraints must have the form g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
         )
     if len(names) >= system.dimension:
         raise SystemDefinitionError(
@@ -74,7 +79,7 @@ def check_constraints(system: MechanicalSystem) -> None:
         )
     if dependent := _dependent(system):
         raise SystemDefinitionError(
-            f"the constraint '{names[dependent]}' says nothing that those before it do not say: leave it out"
+            f"the constraint '{names[dependent]}' is redundant: it depends on the constraints before it. Remove it"
         )
 
 

@@ -48,7 +48,10 @@ def change_coordinates(
     new = [*coordinates, *staying]
     check_names(new, tuple(parameter.name for parameter in system.parameters))
     if len(new) != len(names):
-        raise SystemDefinitionError(f"{len(old)} coordinates are replaced by {len(coordinates)}: give as many new ones")
+        raise SystemDefinitionError(
+            f"{len(old)} coordinates are replaced by {len(coordinates)}: the numbers of old and new "
+            "coordinates must be equal"
+        )
     variables = tuple(symbol(name) for name in new)
     known = {given.name: given for given in (*variables, *system.parameters, system.time)}
     positions = {symbol(name): parse_expression(text, known) for name, text in old.items()}

@@ -37,6 +37,7 @@ def check_damping(name: str, damping: Expr, parameters: Sequence[Symbol]) -> Non
     others = sorted(free.name for free in damping.free_symbols.difference(parameters))
     if others:
         raise SystemDefinitionError(
-            f"the damping {damping} of '{name}' depends on '{others[0]}': it is one rate for all momenta, a number or "
-            "a formula of parameters. Write what varies, or differs from momentum to momentum, as forces"
+            f"the damping {damping} of '{name}' depends on '{others[0]}': damping is one rate for all "
+            "momenta, a number or a formula of parameters. Write damping that varies, or differs "
+            "between momenta, as forces"
         )

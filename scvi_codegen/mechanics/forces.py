@@ -41,13 +41,13 @@ def forces_by_coordinate(
         SystemDefinitionError: for keys that are not coordinates.
     """
     if not isinstance(given, Mapping):
-        raise SystemDefinitionError(f"forces are a mapping from coordinates to formulas, not {given!r}")
+        raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {given!r}")
     names = [q.name for q in coordinates]
     forces = {given_name(key): value for key, value in given.items()}
     for name in forces:
         if name not in names:
             hint = f"{closest(name, names)} Coordinates: {', '.join(names)}"
-            raise SystemDefinitionError(f"there is a force on '{name}', which is no coordinate{hint}")
+            raise SystemDefinitionError(f"there is a force on '{name}', which is not a coordinate{hint}")
     found = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
     return found if any(f != 0 for f in found) else ()
 
@@ -57,6 +57,7 @@ def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple
     slopes = gradient(dissipation, velocities)
     if not slopes:
         raise SystemDefinitionError(
-            f"no velocity occurs in the dissipation {dissipation}: Rayleigh's function D(q, v) gives the forces -dD/dv"
+            f"the dissipation {dissipation} contains no velocity: Rayleigh's function D(q, v) defines "
+            "the forces -dD/dv. Add velocities, or remove it"
         )
     return tuple(-slopes.get(i, sympy.S.Zero) for i in range(len(velocities)))

@@ -56,12 +56,14 @@ class HamiltonianSystem(MechanicalSystem):
     def __post_init__(self) -> None:
         if len(self.momenta) != len(self.coordinates):
             raise SystemDefinitionError(
-                f"{len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: list one each"
+                f"there are {len(self.coordinates)} coordinates, but {len(self.momenta)} momenta: "
+                "list one momentum per coordinate"
             )
         if self.constraints:
             raise SystemDefinitionError(
-                f"'{self.name}' has constraints, which are kept where a Lagrangian is given: leave them out here, and "
-                "take lagrangian_of(system, constraints=[...]), whose momenta are the same"
+                f"'{self.name}' is a Hamiltonian with constraints, which are supported for "
+                "Lagrangians only: use lagrangian_of(system, constraints=[...]), which has the same "
+                "momenta"
             )
         self._check("Hamiltonian", self.momenta, "a momentum")
 
@@ -250,11 +252,14 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     k*x**2/2 + p_x**2/(2*m)
     """
     if system.constraints:
-        raise SystemDefinitionError(f"'{system.name}' has constraints, which are kept where a Lagrangian is given")
+        raise SystemDefinitionError(
+            f"'{system.name}' has constraints, which are supported for Lagrangians only: keep the "
+            "Lagrangian, or convert it without constraints"
+        )
     names = _default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
     if len(names) != system.dimension:
         raise SystemDefinitionError(
-            f"there are {system.dimension} coordinates, but {len(names)} momenta: list one each"
+            f"there are {system.dimension} coordinates, but {len(names)} momenta: list one momentum per coordinate"
         )
     symbols = tuple(symbol(name) for name in names)
     hamiltonian = legendre_dual(system, system.velocities, symbols)
@@ -301,10 +306,14 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
 def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     if not system.is_regular:
         raise SystemDefinitionError(
-            f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine momenta"
+            f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine "
+            "momenta. Use the Hamiltonian"
         )
     if system.clock and system.clock.rate.free_symbols & set(system.momenta):
-        raise SystemDefinitionError(f"the clock of '{system.name}' contains momenta, that of a Lagrangian may not")
+        raise SystemDefinitionError(
+            f"the time transformation of '{system.name}' depends on momenta, which is not supported for a "
+            "Lagrangian: use the Hamiltonian, or a formula in coordinates only"
+        )
     lagrangian = legendre_dual(system, system.momenta, system.velocities)
     momenta = dict(zip(system.momenta, _slopes(lagrangian, system.velocities), strict=True))
     return LagrangianSystem(

@@ -357,8 +357,8 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
     subject = f"the mass matrix d2L/dv2 of '{system.name}'"
     if not block:
         raise SystemDefinitionError(
-            f"{subject} is singular: some velocities occur only in products with too few others. {REQUIRED} Give each "
-            "coordinate a kinetic energy of its own"
+            f"{subject} is singular: some velocities occur only in products with too few others. "
+            f"{REQUIRED} Give each coordinate its own kinetic energy"
         )
     own = set[Symbol]().union(*(entry.free_symbols for entry in block.values()))
     used = {parameter: value for parameter, value in system.constants.items() if parameter in own}
@@ -368,7 +368,7 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
     motion = f": a motion with ({direction}) has no kinetic energy" if direction else ""
     remedy = f"{zero} = 0 is the default: give it a positive value" if zero else REDUNDANT
     raise SystemDefinitionError(
-        f"{subject} in {names} is singular at every point tried{values}{motion}. {REQUIRED} {remedy}"
+        f"{subject} in {names} is singular at every sampled point{values}{motion}. {REQUIRED} {remedy}"
     )
 
 

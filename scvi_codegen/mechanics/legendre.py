@@ -52,8 +52,9 @@ def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int
         return y[i] ** 2 / (2 * curvature[i, i])
     if len(block) > LARGEST_INVERSE:
         raise SystemDefinitionError(
-            f"Legendre's transform couples {len(block)} variables: their quadratic form is not inverted symbolically. "
-            "Give both functions yourself, or use the system as it is"
+            f"the Legendre transform couples {len(block)} variables, more than are inverted "
+            f"symbolically ({LARGEST_INVERSE}). Define the other function yourself, or use the system "
+            "as it is"
         )
     size = len(block)
     matrix = sympy.Matrix(size, size, lambda a, b: curvature.get((block[a], block[b]), 0))
@@ -66,8 +67,8 @@ def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, 
     """Return the x with y = slope(x), whose branch is checked at random points near the default parameters."""
     if slope.free_symbols & (set(variables) - {x}):
         raise SystemDefinitionError(
-            f"Legendre's transform of '{system.name}' needs the solution of coupled equations that are not linear; "
-            "give the other function yourself, or use the system as it is"
+            f"the Legendre transform of '{system.name}' requires the solution of coupled nonlinear "
+            "equations. Define the other function yourself, or use the system as it is"
         )
     positive = positive_parameters(system)
     back = {dummy: symbol for symbol, dummy in positive.items()}
@@ -75,7 +76,10 @@ def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, 
         found = root.xreplace(back)
         if unsupported_part(found) is None and _holds(system, found, slope, x, y):
             return found
-    raise SystemDefinitionError(f"SymPy does not solve {y} = {slope} for {x}; give the other function yourself")
+    raise SystemDefinitionError(
+        f"SymPy does not solve {y} = {slope} for {x}, as the Legendre transform requires: define the "
+        "other function yourself"
+    )
 
 
 def _roots(expression: Expr, x: Symbol) -> list[Expr]:

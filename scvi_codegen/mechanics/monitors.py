@@ -56,13 +56,17 @@ def monitor_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: 
     elif isinstance(monitor, str):
         formula = _read(monitor, known)
     else:
-        raise SystemDefinitionError(f"a monitor is a name, text or a SymPy expression, not {monitor!r}")
+        raise SystemDefinitionError(f"a monitor must be a name, text or a SymPy expression, not {monitor!r}")
     unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
     if unknown:
         kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"
-        raise SystemDefinitionError(f"'{unknown[0]}' in the monitor: it may depend on {kinds} of '{system.name}' alone")
+        raise SystemDefinitionError(
+            f"the monitor contains '{unknown[0]}': it may depend only on {kinds} of '{system.name}'"
+        )
     if not formula.free_symbols & {*system.coordinates, *system.auxiliaries}:
-        raise SystemDefinitionError(f"the monitor {formula} is constant: steps would not adapt")
+        raise SystemDefinitionError(
+            f"the monitor {formula} is constant, so the step size would not adapt: use a formula in the coordinates"
+        )
     return formula.xreplace(driven)
 
 
@@ -72,8 +76,7 @@ def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
     except SystemDefinitionError as error:
         if text.isidentifier():
             raise SystemDefinitionError(
-                f"there is no monitor '{text}'{closest(text, list(MONITORS))} "
-                f"There are {', '.join(MONITORS)}, and formulas"
+                f"there is no monitor '{text}'{closest(text, list(MONITORS))} Use {', '.join(MONITORS)}, or a formula"
             ) from None
         raise error
 
@@ -88,8 +91,8 @@ def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr,
     constant = set(system.parameters)
     if len(diagonal) < len(slopes) or any(not entry.free_symbols <= constant for entry in diagonal.values()):
         raise SystemDefinitionError(
-            f"the monitor '{monitor}' needs constant masses, one a coordinate, which '{system.name}' has not: "
-            "give a formula in its coordinates"
+            f"the monitor '{monitor}' requires constant masses, one per coordinate, which "
+            f"'{system.name}' does not have: use a formula in its coordinates"
         )
     return rest, {i: 1 / entry for i, entry in diagonal.items()} if system.auxiliaries else diagonal
 
@@ -99,7 +102,8 @@ def _frequency(system: MechanicalSystem) -> Expr:
     entries = hessian(potential, system.coordinates)
     if not entries:
         raise SystemDefinitionError(
-            f"no force of '{system.name}' changes from place to place: nothing sets a frequency"
+            f"the forces of '{system.name}' do not depend on the position, so the monitor 'frequency' "
+            "is undefined: use a formula in its coordinates"
         )
     squares = sympy.Add(*((entry / masses[i]) ** 2 for (i, _), entry in entries.items()))
     if sympy.count_ops(squares) > MOST_SIMPLIFIED:
@@ -124,7 +128,8 @@ def _distance(system: MechanicalSystem) -> Expr:
     )
     if not squares:
         raise SystemDefinitionError(
-            f"no distance in a denominator stands in the potential of '{system.name}': give a formula as its monitor"
+            f"the potential of '{system.name}' contains no distance in a denominator, so the monitor "
+            "'distance' is undefined: use a formula in its coordinates"
         )
     return sympy.Add(*(square ** sympy.Rational(-3, 2) for square in squares)) ** sympy.Rational(-1, 2)
 
@@ -136,7 +141,7 @@ def _potential(system: MechanicalSystem) -> Expr:
 
 def _arclength(system: MechanicalSystem) -> Expr:
     if not system.auxiliaries:
-        raise SystemDefinitionError("the monitor 'arclength' contains momenta: give it hamiltonian_of(system)")
+        raise SystemDefinitionError("the monitor 'arclength' contains momenta: use it with hamiltonian_of(system)")
     function = forms_of(system).energy
     slopes = gradient(function, (*system.coordinates, *system.auxiliaries)).values()
     return sympy.Add(*(slope**2 for slope in slopes)) ** sympy.Rational(-1, 2)

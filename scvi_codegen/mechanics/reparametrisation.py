@@ -66,23 +66,23 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
     """
     if system.clock is not None:
         raise SystemDefinitionError(
-            f"the time of '{system.name}' is transformed already, with dt = {system.clock.rate} dtau"
+            f"'{system.name}' has a time transformation already, dt = {system.clock.rate} dtau: apply only one"
         )
     if system.depends_on_time:
         raise SystemDefinitionError(
-            f"'{system.name}' depends on time: there is no energy to keep. Take controlled steps (t_end=...), or "
-            f"{REVERSIBLE}"
+            f"'{system.name}' depends on time, so its energy is not conserved, which the symplectic "
+            f"time transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     if system.forces or system.damping != 0:
         acting = "forces act" if system.forces else "damping acts"
         raise SystemDefinitionError(
-            f"{acting} on '{system.name}': the energy, on whose level time is transformed, is not kept. Take "
-            f"controlled steps (t_end=...), or {REVERSIBLE}"
+            f"{acting} on '{system.name}', so its energy is not conserved, which the symplectic time "
+            f"transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     if any(velocities_held(system)):
         raise SystemDefinitionError(
-            f"'{system.name}' has constraints of velocities, which transformed time would change: take controlled "
-            f"steps (t_end=...), or {REVERSIBLE}"
+            f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
+            f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     level = _free_symbol(system)
     rate = monitor_function(system, monitor)
@@ -121,16 +121,19 @@ def with_monitor(
         SystemDefinitionError: for a controller without a monitor, an unknown controller, and as :func:`reparametrise`.
     """
     if controller is not None and controller not in CONTROLLERS:
-        raise SystemDefinitionError(f"a controller is {' or '.join(CONTROLLERS)}, not {controller!r}")
+        raise SystemDefinitionError(f"controller must be {' or '.join(CONTROLLERS)}, not {controller!r}")
     if monitor is None:
         if controller is not None:
-            raise SystemDefinitionError(f'the {controller} controller wants a monitor: "frequency", or a formula')
+            raise SystemDefinitionError(
+                f'the {controller} controller requires a monitor: give "frequency", or a formula'
+            )
         return system, None
     if controller != "reversible":
         return reparametrise(system, monitor), None
     if system.clock is not None:
         raise SystemDefinitionError(
-            f"the time of '{system.name}' is transformed already: its steps have one controller"
+            f"'{system.name}' has a time transformation already, which controls its steps: leave out "
+            "the reversible controller, or use the system without the transformation"
         )
     monitor_function(system, monitor, in_time=True)  # validated here rather than at the first step
     return system, monitor

@@ -144,7 +144,7 @@ class MechanicalSystem(ABC):
         if self.forces or self.damping != 0:
             return "forces act" if self.forces else "damping takes it"
         if self._constraints_work():
-            return "constraints move, and do work"
+            return "constraints do work"
         return f"{'H' if self.auxiliaries else 'L'} depends on time" if self.depends_on_time else ""
 
     @property
@@ -212,9 +212,11 @@ class MechanicalSystem(ABC):
     def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         """Raise :class:`SystemDefinitionError` for invalid names, default values or symbols of the formulas."""
         if not isinstance(self.name, str) or not self.name.strip():
-            raise SystemDefinitionError(f"a system needs a name, not {self.name!r}")
+            raise SystemDefinitionError(f"the name of a system must be non-empty text, not {self.name!r}")
         if any("\ud800" <= character <= "\udfff" for character in self.name):
-            raise SystemDefinitionError(f"the name {self.name!r} has half of a character in it, which no file can hold")
+            raise SystemDefinitionError(
+                f"the name {self.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
+            )
         for given in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
             if not isinstance(given, Symbol) or given != symbol(given.name):
                 raise SystemDefinitionError(
@@ -228,7 +230,8 @@ class MechanicalSystem(ABC):
         check_names(coordinates, [*parameters, *self.inputs], momenta)
         if len(self.defaults) != len(self.parameters):
             raise SystemDefinitionError(
-                f"{len(self.parameters)} parameters, but {len(self.defaults)} default values: give one each"
+                f"there are {len(self.parameters)} parameters, but {len(self.defaults)} default "
+                "values: give one value per parameter"
             )
         for parameter, value in self.constants.items():
             number(parameter.name, value)
@@ -236,7 +239,9 @@ class MechanicalSystem(ABC):
 
     def _check_symbols_of_formula(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
         if self.forces and len(self.forces) != self.dimension:
-            raise SystemDefinitionError(f"{self.dimension} coordinates, but {len(self.forces)} forces: give one each")
+            raise SystemDefinitionError(
+                f"there are {self.dimension} coordinates, but {len(self.forces)} forces: give one force per coordinate"
+            )
         check_damping(self.name, self.damping, self.parameters)
         known = [*self.coordinates, *arguments, self.time, *self.parameters]
         named = zip(self.coordinates, self.forces, strict=False)

@@ -102,7 +102,7 @@ def as_method(method: Method | str, system: MechanicalSystem | None = None) -> M
     if isinstance(method, Method):
         return method
     if not isinstance(method, str):
-        raise MethodError(f"a method is wanted, as SVI(8), or a name such as 'svi:8', not {method!r}")
+        raise MethodError(f"method must be a method, as SVI(8), or a name such as 'svi:8', not {method!r}")
     return method_from_specification(fitted(sized(specification_of(method)), system))
 
 
@@ -131,10 +131,14 @@ def specification_of(name: str) -> dict[str, Any]:
     if not colon:
         return {"method": method}
     if size is None:
-        raise MethodError(f"{name!r} is no method: no number follows {method}; it takes {_listed(ARGUMENTS[method])}")
+        raise MethodError(
+            f"{name!r} is not a method: {method} does not take a number; its arguments are {_listed(ARGUMENTS[method])}"
+        )
     if not (number.isascii() and number.isdigit()):
         example = f"{method}:{DEFAULT_SIZE}"
-        raise MethodError(f"{name!r} is no method: a number, its {size}, follows the colon, as in {example}")
+        raise MethodError(
+            f"{name!r} is not a method: the colon must be followed by a number, its {size}, as in {example}"
+        )
     return {"method": method, size: int(number)}
 
 
@@ -174,7 +178,7 @@ def method_from_specification(specification: Specification) -> Method:
     accepted = ARGUMENTS[name]
     for argument in arguments:
         if argument not in accepted:
-            raise MethodError(f"{name} takes no {argument!r}; it takes {_listed(accepted)}")
+            raise MethodError(f"{name} does not take {argument!r}; its arguments are {_listed(accepted)}")
     for argument in {"degree", "stages", "order"} & set(arguments):
         checked_count(arguments[argument], argument, least=1, error=MethodError)
     if not isinstance(arguments.get("abscissae", ""), str | list | tuple):

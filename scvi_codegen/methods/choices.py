@@ -17,7 +17,9 @@ def resolve_quadrature(quadrature: Quadrature | str | None, degree: int) -> Quad
     if isinstance(quadrature, str):
         return quadrature_by_name(quadrature)
     if not isinstance(quadrature, Quadrature):
-        raise MethodError(f"a quadrature is wanted, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}")
+        raise MethodError(
+            f"quadrature must be a Quadrature, or a name such as 'gauss-legendre:{degree}', not {quadrature!r}"
+        )
     return quadrature
 
 
@@ -28,7 +30,7 @@ def resolve_space(space: CurveSpace | str | None) -> CurveSpace:
     if isinstance(space, str):
         return space_by_name(space)
     if not isinstance(space, CurveSpace):
-        raise MethodError(f"a space of curves is wanted, or a name such as 'splines:2', not {space!r}")
+        raise MethodError(f"space must be a CurveSpace, or a name such as 'splines:2', not {space!r}")
     return space
 
 
@@ -39,9 +41,11 @@ def resolve_nodes(nodes: Nodes | str | None, degree: int) -> Nodes:
     if isinstance(nodes, str):
         nodes = nodes_by_name(nodes, degree)
     if not isinstance(nodes, Nodes):
-        raise MethodError(f"nodes are wanted, or a name such as 'chebyshev-lobatto', not {nodes!r}")
+        raise MethodError(f"nodes must be Nodes, or a name such as 'chebyshev-lobatto', not {nodes!r}")
     if nodes.degree != degree:
-        raise MethodError(f"nodes of degree {nodes.degree} do not fit a curve of degree {degree}")
+        raise MethodError(
+            f"nodes of degree {nodes.degree} do not match a curve of degree {degree}: give nodes of degree {degree}"
+        )
     if not nodes.contains_ends:
         raise MethodError(
             f"the nodes '{nodes.name}' lack an end point of the step, but Q^0 = q0 and Q^s = q1 must be node values; "

@@ -75,7 +75,7 @@ FIRST_HALVES = {
 def check_sequence(sequence: str) -> None:
     """Raise :class:`MethodError` for an unknown sequence."""
     if sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
-        raise MethodError(f"a leapfrog step is a '{KICK_DRIFT_KICK}' or a '{DRIFT_KICK_DRIFT}', not {sequence!r}")
+        raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {sequence!r}")
 
 
 def sequence_of(sequence: str) -> Specification:
@@ -101,7 +101,7 @@ class Composition(Method):
     def __post_init__(self) -> None:
         check_sequence(self.sequence)
         if checked_count(self.composition_order, "the order", least=2, error=MethodError) not in FIRST_HALVES:
-            raise MethodError(f"there are compositions of order 2, 8 and 10, not {self.composition_order!r}")
+            raise MethodError(f"order must be 2, 8 or 10, not {self.composition_order!r}")
 
     @classmethod
     def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:
@@ -179,8 +179,9 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
         system = twin
     elif not forms_of(system).split:
         raise MethodError(
-            f"{method.name} needs a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with constant masses, or "
-            f"H = T(p) + V(q, t), without damping; '{system.name}' is not: use an SVI"
+            f"{method.name} requires a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with "
+            f"constant masses, or H = T(p) + V(q, t), without damping; '{system.name}' is not "
+            "separable: use an SVI"
         )
     kicks, drifts = kicks_and_drifts(method)
     moving = [k for k, x in enumerate(drifts) if x]

@@ -91,13 +91,16 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
     family, s = stages.families[0], len(stages.blocks)
     ends = (family.abscissae[0], family.abscissae[-1]) == (0, 1)
     if any(velocities_held(system)) and ends and not _is_polynomial(family):
-        raise MethodError(f"{name}, whose curves are no polynomials, does not keep the velocities of '{system.name}'")
+        raise MethodError(
+            f"{name} does not support the nonholonomic constraints of '{system.name}', because its curves "
+            "are not polynomials: use an SVI with polynomials"
+        )
     if ends and len(stages.families) == 1 and len(family.abscissae) == s + 1 and family.in_action:
         return
     raise MethodError(
-        f"{name} does not keep the constraints of '{system.name}', which hold at the points of a quadrature: one more "
-        "than the degree, both ends of the step among them. Take SVI(4, 'gauss-lobatto:5'), of order 8, or so; "
-        "SVI(1, 'gauss-lobatto:2') is RATTLE"
+        f"{name} does not support the constraints of '{system.name}': they require an SVI whose "
+        "quadrature has one point more than its degree, including both ends of the step. Use SVI(4, "
+        "'gauss-lobatto:5'), of order 8, for example; SVI(1, 'gauss-lobatto:2') is RATTLE"
     )
 
 
@@ -159,7 +162,7 @@ def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily)
             weight_names=("",) * size,
             gathers=tuple(gathers),
             scatters=(Scatter(results=held, table=place, power=0),),
-            computes="What constraints say of velocities",
+            computes="Velocity constraints",
         ),
     )
 

@@ -41,7 +41,8 @@ def _completed(system: MechanicalSystem, stages: StageSystem, name: str) -> Stag
 def _check_damping(system: MechanicalSystem, method: Method, stages: StageSystem) -> None:
     if system.damping != 0 and not isinstance(stages.shape, Velocities):
         raise MethodError(
-            f"{method.name} does not take the damping of '{system.name}', which weighs L_q and L_v at the points of a "
-            'quadrature: take an SVI, or a Runge-Kutta method in phase space. As forces, "-gamma*p", every method '
-            "takes it, though area does not shrink by exactly exp(-gamma h)"
+            f"{method.name} does not support the damping of '{system.name}', which weights L_q and "
+            "L_v at quadrature points: use an SVI, or a Runge-Kutta method in phase space. Every "
+            'method supports damping as forces, "-gamma*p", but then areas do not shrink by exactly '
+            "exp(-gamma h)"
         )

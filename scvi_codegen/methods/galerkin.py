@@ -76,7 +76,7 @@ class SVI(Method):
         own = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
         object.__setattr__(self, "quadrature", resolve_quadrature(own, self.degree))
         if self.nodes is not None and not self.curves.nodal:
-            raise MethodError(f"nodes parametrise polynomials, not {self.curves.name}: leave them out")
+            raise MethodError(f"nodes apply to polynomials only, not to {self.curves.name}: leave them out")
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
         size = self.curves.dimension(self.degree)
         if self.rule.conditions < size:

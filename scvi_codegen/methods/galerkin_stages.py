@@ -109,13 +109,13 @@ def action_families(
     """
     if len(weights) > 1 and system.auxiliaries:
         raise MethodError(
-            "this quadrature differentiates L along the curve of positions, which a Hamiltonian does not have: give L "
-            "(lagrangian_of), or use a quadrature without derivatives"
+            "this quadrature uses derivatives of L along the curve of positions, which a Hamiltonian "
+            "does not define: use the Lagrangian (lagrangian_of), or a quadrature without derivatives"
         )
     if len(weights) > 1 and system.forces:
         raise MethodError(
-            "this quadrature differentiates L along the curve, and would have to differentiate the work of the forces "
-            f"of '{system.name}', too: use a quadrature without derivatives"
+            "this quadrature uses derivatives of L along the curve, which is not supported with the "
+            f"forces of '{system.name}': use a quadrature without derivatives"
         )
     scalars = (system.lagrangian, *forms_of(system).rates(len(weights) - 1))
     return tuple(

@@ -148,9 +148,9 @@ def check_regular(method: Method, system: MechanicalSystem) -> None:
     """Raise :class:`MethodError` for a Hamiltonian with singular d2H/dp2 and a method that requires regularity."""
     if method.needs_regular and isinstance(system, HamiltonianSystem) and not system.is_regular:
         raise MethodError(
-            f"{method.name} needs a Hamiltonian that determines momenta by velocities, but d2H/dp2 of '{system.name}' "
-            "is singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or collocation "
-            "method in phase-space form"
+            f"{method.name} requires a regular Hamiltonian, but d2H/dp2 of '{system.name}' is "
+            "singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or "
+            "collocation method in phase-space form"
         )
 
 

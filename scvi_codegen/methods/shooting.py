@@ -74,15 +74,20 @@ class SCVI(Method):
             self, "degree", degree_count(self.degree, "the degree of a spectral-collocation variational integrator")
         )
         if not isinstance(self.variational, bool):
-            raise MethodError(f"variational is True or False, not {self.variational!r}")
+            raise MethodError(f"variational must be True or False, not {self.variational!r}")
         object.__setattr__(self, "quadrature", resolve_quadrature(self.quadrature, self.degree))
         if self.rule.derivative_weights and not self.variational:
-            raise MethodError(f"the form printed in the paper sums L alone, {self.rule.name} its derivatives, too")
+            raise MethodError(
+                f"the form printed in the paper does not support derivatives of L, which {self.rule.name} "
+                "uses: use a quadrature without derivatives"
+            )
         if self.abscissae is not None:
             if self.nodes is not None:
-                raise MethodError("give nodes or abscissae, not both: they say where the curve is collocated")
+                raise MethodError(
+                    "give nodes or abscissae, not both: they are alternative definitions of the collocation points"
+                )
             if not self.variational:
-                raise MethodError("the form printed in the paper needs nodes at both ends: leave out the abscissae")
+                raise MethodError("the form printed in the paper requires nodes at both ends: leave out the abscissae")
             object.__setattr__(self, "abscissae", _resolve_abscissae(self.abscissae, self.degree))
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
 
@@ -215,5 +220,5 @@ def _resolve_abscissae(abscissae: Sequence[Any] | str, degree: int) -> Vector | 
     check_kind(NUMBERS, abscissae, "abscissae", MethodError)
     numbers = tuple(collocation_tableau(tuple(abscissae)).c)
     if len(numbers) != degree:
-        raise MethodError(f"a curve of degree {degree} has {degree} abscissae, not {len(numbers)}")
+        raise MethodError(f"a curve of degree {degree} requires {degree} abscissae, not {len(numbers)}")
     return numbers

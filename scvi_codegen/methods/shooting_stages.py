@@ -55,7 +55,8 @@ def shooting_increments(
     """
     if system.forces and system.auxiliaries:
         raise MethodError(
-            f"shooting-based methods follow forces on positions: give the Lagrangian of '{system.name}' (lagrangian_of)"
+            "shooting-based methods support forces for Lagrangians only: use the Lagrangian of "
+            f"'{system.name}' (lagrangian_of)"
         )
     size = len(tableau.b)
     position, velocities, beta = _curve(tableau, rule)

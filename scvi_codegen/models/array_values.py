@@ -76,13 +76,13 @@ def read_array(
     for name in array.names:
         if name not in sizes:
             raise ModelFileError(
-                f"{where}: nothing says how large {name} is: write [sizes] {name} = .., or --size {name}=.."
+                f"{where}: the size {name} is undefined: write [sizes] {name} = .., or --size {name}=.."
             )
     shape = array.shape(sizes)
     if not isinstance(value, list):
         return _filled(value, shape, where, {**parameters, **sizes})
     if array.axes[-1].name or len(value) != shape[-1]:
-        raise ModelFileError(f"{where} has {len(value)} formulas: one, or one for each component of {array}")
+        raise ModelFileError(f"{where} has {len(value)} formulas: give one, or one for each component of {array}")
     parts = [_filled(entry, shape[:-1], f"{where}[{k}]", {**parameters, **sizes}) for k, entry in enumerate(value)]
     return np.stack(parts, axis=-1)
 
@@ -94,7 +94,7 @@ def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, 
     indices = INDICES[: len(shape)]
     if taken := next((name for name in indices if name in names), None):
         raise ModelFileError(
-            f"{where}: {taken} is an index in formulas of places: rename the parameter or size {taken}"
+            f"{where}: {taken} is the name of an index in formulas of arrays: rename the parameter or size {taken}"
         )
     try:
         formula = parse_expression(value, {name: symbol(name) for name in (*indices, *names)})
@@ -122,11 +122,11 @@ def _from_file(array: Array, value: Mapping[str, Any], where: str, folder: Path)
             )
     name, wanted = value.get("file"), value.get("array", array.name)
     if not isinstance(name, str) or not isinstance(wanted, str):
-        raise ModelFileError(f'{where} must be a file, {{ file = "{array.name}.npy" }}, with texts between quotes')
+        raise ModelFileError(f'{where} must be a file, {{ file = "{array.name}.npy" }}, with text between quotes')
     readers = {".npy": _read_npy, ".npz": _read_npz, ".csv": _read_csv}
     reader = readers.get(Path(name).suffix.lower())
     if reader is None:
-        raise ModelFileError(f"{where}: {name}: arrays are read from {', '.join(readers)} files")
+        raise ModelFileError(f"{where}: {name}: arrays must be in {', '.join(readers)} files")
     try:
         return reader(folder / name, wanted, array)
     except OSError as error:

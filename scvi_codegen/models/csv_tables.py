@@ -47,13 +47,13 @@ def parse_table(text: str, check: Callable[[list[str]], None] | None = None) -> 
     try:
         lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
     except csv.Error as error:
-        raise ModelFileError(f"line {reader.line_num} is no line of a table: {error}") from error
+        raise ModelFileError(f"line {reader.line_num} is not a line of a table: {error}") from error
     if len(lines) < 2:
-        raise ModelFileError("a table has a header of names and at least one line of numbers")
+        raise ModelFileError("a table must have a header of names and at least one line of numbers")
     names = lines[0][1]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ModelFileError(f"the column '{repeated[0]}' is there twice")
+        raise ModelFileError(f"the column '{repeated[0]}' occurs twice: rename one")
     if "" in names:
         raise ModelFileError(f"column {names.index('') + 1} has no name in the first line")
     if check is not None:

@@ -130,7 +130,7 @@ def load_ensemble(path: str | os.PathLike[str], model: Model) -> EnsembleStates:
     suffix = Path(path).suffix.lower()
     try:
         if suffix not in readers:
-            raise ModelFileError("an ensemble is a grid in a .toml file or a table in a .csv file")
+            raise ModelFileError("an ensemble must be a grid in a .toml file or a table in a .csv file")
         columns = readers[suffix](Path(path).read_text(encoding="utf-8-sig"), partial(_check_names, model))
     except OSError as error:
         raise ModelFileError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -150,7 +150,7 @@ def _read_grid(text: str, check: Check) -> dict[str, Array]:
     axes = [_axis(value, f"[grid] {name}") for name, value in grid.items()]
     count = math.prod(map(len, axes))
     if count > MOST:
-        raise ModelFileError(f"the grid has {count} combinations, of at most {MOST}")
+        raise ModelFileError(f"the grid has {count} combinations, more than the {MOST} that are supported")
     combined = np.meshgrid(*axes, indexing="ij")
     return {name: values.ravel() for name, values in zip(grid, combined, strict=True)}
 
@@ -180,6 +180,6 @@ def _check_names(model: Model, names: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             hint = f"{closest(name, known)} Known: {', '.join(known[:12])}"
-            raise ModelFileError(f"'{name}' is no coordinate, velocity, momentum or parameter of the system{hint}")
+            raise ModelFileError(f"'{name}' is not a coordinate, velocity, momentum or parameter of the system{hint}")
     if not set(names).isdisjoint(velocities) and not set(names).isdisjoint(momenta):
         raise ModelFileError("there are both velocities and momenta: give one or the other")

@@ -82,7 +82,7 @@ def generate_fmu(
     """
     target = Path(path)
     if target.suffix != ".fmu":
-        raise PackageError(f"the name of an FMU ends with .fmu, as in {target.name or 'model'}.fmu")
+        raise PackageError(f"the name of an FMU must end with .fmu, as in {target.name or 'model'}.fmu")
     prefix = prefix_of(target.with_suffix(""))
     _check(platforms)
     if not force:
@@ -101,7 +101,7 @@ def generate_fmu(
 def _check(platforms: tuple[str, ...]) -> None:
     for name in platforms:
         if name not in TARGETS:
-            raise PackageError(f"{name!r} is no platform of FMUs; there are {', '.join(TARGETS)}")
+            raise PackageError(f"{name!r} is not a platform of FMUs; use one of {', '.join(TARGETS)}")
 
 
 def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, bytes]]:
@@ -125,9 +125,11 @@ def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, by
 def _start(model: Model) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
     if model.h is None or model.paced:
-        raise ModelFileError("an FMU has steps of one length, in time: give a step h (--step, [run] step), no monitor")
+        raise ModelFileError(
+            "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a monitor"
+        )
     if model.h < 0:
-        raise ModelFileError(f"an FMU goes forward in time: its step is positive, not {model.h:g}")
+        raise ModelFileError(f"the step size of an FMU must be positive, not {model.h:g}")
     start = example_of(replace(model, inputs={}), controlled=False)
     return start if model.velocity is None else replace(start, p=model.velocity)
 
@@ -153,7 +155,9 @@ def _place(platform: str, prefix: str) -> str:
 def _refuse_to_lose(target: Path) -> None:
     """Raise :class:`PackageError` if the target exists and is not an FMU."""
     if target.exists() and not (zipfile.is_zipfile(target) and DESCRIPTION in zipfile.ZipFile(target).namelist()):
-        raise PackageError(f"{target} is no FMU: choose another name, or overwrite it with --force (force=True)")
+        raise PackageError(
+            f"{target} exists and is not an FMU: choose another name, or overwrite it with --force (force=True)"
+        )
 
 
 def _write(files: Mapping[str, bytes], file: IO[bytes]) -> None:

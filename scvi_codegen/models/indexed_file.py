@@ -151,7 +151,7 @@ def _check_known(document: Document) -> None:
             if key in OTHERS[name]:
                 where = f"[{name}] {key}" if name else f"[{key}]"
                 raise ModelFileError(
-                    f"{where} is not for sums over indices: leave it out, or write the system out (unroll_sums)"
+                    f"{where} is not supported for indexed systems: leave it out, or unroll the system (unroll_sums)"
                 )
     check_keys(document, SECTIONS, "section")
     for name, known in KEYS.items():
@@ -206,7 +206,7 @@ def _state_entries(section: Section, system: IndexedSystem) -> dict[tuple[str, s
         if not isinstance(value, dict) or (len(names) == 1 and names[0] not in value):
             if len(names) > 1:
                 raise ModelFileError(
-                    f"{where} must be a table by array, [initial.{key}] with a line for {', '.join(names)}"
+                    f"{where} must be a table by array, [initial.{key}] with a line for each of {', '.join(names)}"
                 )
             value = {names[0]: value}
         check_keys(value, names, "array", where)
@@ -233,11 +233,11 @@ def _read_arrays(
     for key, entry in sorted(entries.items(), key=lambda item: is_filled(item[1].value)):
         values = read_array(entry.array, entry.value, entry.where, folder=folder, sizes=sizes, parameters=numbers)
         if values.ndim != len(entry.array.axes):
-            raise ModelFileError(f"{entry.where} has the shape {values.shape}, which is not that of {entry.array}")
+            raise ModelFileError(f"{entry.where} has the shape {values.shape}, which does not match {entry.array}")
         for axis, length in zip(entry.array.axes, values.shape, strict=True):
             if axis.name and sizes.setdefault(axis.name, length) != length:
                 raise ModelFileError(
-                    f"{entry.where}: {axis} is {length} there, and {sizes[axis.name]} elsewhere or in [sizes]"
+                    f"{entry.where}: the size {axis} is {length} here, but {sizes[axis.name]} elsewhere or in [sizes]"
                 )
         found[key] = values
     return found

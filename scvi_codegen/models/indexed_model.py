@@ -102,7 +102,9 @@ class IndexedModel:
     def step(self) -> float:
         """Fixed step size h; ModelFileError for adaptive steps."""
         if self.h is None:
-            raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
+            raise ModelFileError(
+                "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
+            )
         return self.h
 
     @property

@@ -48,7 +48,7 @@ def read_input(name: str, entry: Any, folder: str | os.PathLike[str]) -> InputTa
         if key not in KEYS:
             raise ModelFileError(f"unknown key '{key}' in {where}. Known: {', '.join(KEYS)}")
     if ("file" in entry) == ("t" in entry or "values" in entry):
-        raise ModelFileError(f"{where} has a file, or t and values: give one of the two")
+        raise ModelFileError(f"{where} must have either file, or t and values")
     kind = entry.get("kind", "linear")
     if not isinstance(kind, str):
         raise ModelFileError(f"{where} kind must be text between quotes, not {kind!r}")
@@ -74,7 +74,7 @@ def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return times and values of an input in a file."""
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
-        raise ModelFileError(f"inputs are read from {' and '.join(readers)} files")
+        raise ModelFileError(f"inputs must be in {' or '.join(readers)} files")
     try:
         table = readers[path.suffix.lower()](path)
     except OSError as error:
@@ -87,7 +87,7 @@ def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     late = np.flatnonzero(np.diff(t) <= 0.0)
     if late.size:
         k = int(late[0]) + 1
-        raise ModelFileError(f"{table.place(k)}, t: {t[k]:g} does not come after {t[k - 1]:g}")
+        raise ModelFileError(f"{table.place(k)}, t: {t[k]:g} is not greater than {t[k - 1]:g}: times must ascend")
     return tuple(t.tolist()), tuple(_column(table, own or others[0]).tolist())
 
 
@@ -114,6 +114,6 @@ def _read_npz(path: Path) -> CsvTable:
         with loaded(path) as arrays:
             columns = {name: real_array(arrays[name], name) for name in arrays}
     except ValueError as error:
-        raise ModelFileError(f"it holds no arrays of numbers: {error}") from error
+        raise ModelFileError(f"it contains no arrays of numbers: {error}") from error
     count = columns[TIME].size if TIME in columns else 0
     return CsvTable({name: values for name, values in columns.items() if values.shape == (count,)}, ())

@@ -33,10 +33,10 @@ def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[s
     for name, table in given.items():
         if name not in system.inputs:
             raise ModelFileError(
-                f"'{name}' is no input of '{system.name}', which has {', '.join(system.inputs) or 'none'}"
+                f"'{name}' is not an input of '{system.name}', whose inputs are {', '.join(system.inputs) or 'none'}"
             )
         if not isinstance(table, tuple):
-            raise ModelFileError(f"the input {name} of a model is a table, (t, values) or (t, values, kind)")
+            raise ModelFileError(f"the input {name} of a model must be a table, (t, values) or (t, values, kind)")
         try:
             input_of(name, tuple(table))
         except StateError as error:

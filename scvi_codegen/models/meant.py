@@ -16,7 +16,7 @@ KEYS: Final = {
     "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints monitor inputs",
 }
-EVENTS: Final = "events exist in Python only, as stepper.integrate(..., events=[...])"
+EVENTS: Final = "events are supported in Python only, as stepper.integrate(..., events=[...])"
 PLACES: Final = {
     **{key: f"'{key}' belongs in [{section}]" for section, keys in KEYS.items() for key in keys.split()},
     **{section: f"there is a section [{section}]" for section in ("parameters", "forces", "initial", "run")},

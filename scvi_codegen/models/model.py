@@ -135,7 +135,7 @@ class Model:
         step = self.step
         if self.ends_at_time:
             raise ModelFileError(
-                "how many steps of tau a span takes is not known before: give steps (--steps) for this"
+                "the number of steps in tau for a time span is not known in advance: give steps (--steps)"
             )
         assert self.span is not None  # by construction
         return steps_in(self.span, step)
@@ -160,9 +160,13 @@ class Model:
     def step(self) -> float:
         """Fixed step size h; ModelFileError for adaptive steps."""
         if self.h is None:
-            raise ModelFileError("steps choose their length (tolerance): give a step h (--step, [run] step) for this")
+            raise ModelFileError(
+                "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
+            )
         if self.monitor is not None:
-            raise ModelFileError("the reversible controller chooses how long steps are: leave it out for this")
+            raise ModelFileError(
+                "this requires a fixed step size, but the reversible controller varies it: leave out the controller"
+            )
         return self.h
 
     def first_step(self, stepper: Stepper) -> float:
@@ -235,7 +239,7 @@ class Model:
         for name in self.system.inputs:
             if name not in self.inputs:
                 way = f'[inputs] {name} = {{ file = "{name}.csv" }}, or --input {name}=FILE'
-                raise ModelFileError(f"the input {name} is not given: {way}")
+                raise ModelFileError(f"the input {name} is not set: give {way}")
         return self.inputs
 
     def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
@@ -252,7 +256,9 @@ class Model:
             from scvi_codegen.runtime.longest_step import longest_step  # imported here: not needed for reading
 
             if self.system.inputs:
-                raise ModelFileError("with inputs no pilot run finds a step of tau: give one (--step, [run] step)")
+                raise ModelFileError(
+                    "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
+                )
             own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
             h = longest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
         to_end = h is None or self.monitor is not None
@@ -285,8 +291,8 @@ class Model:
     def _check_length(self) -> None:
         if self.monitor is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
-                f"the reversible controller of the monitor {self.monitor} takes steps that lead to a time (give span, "
-                "not steps), of a system whose time is not transformed"
+                f"the reversible controller of the monitor {self.monitor} requires a time span (give "
+                "span, not steps), and a system without a time transformation"
             )
         if self.h is None:
             check_controlled(self.tolerance, self.span)
@@ -306,11 +312,11 @@ class Model:
 def check_step(h: float, span: float | None) -> None:
     """Raise an error for a step size of 0, and a span that is not a positive number of steps."""
     if h == 0.0:
-        raise ModelFileError("the step is 0: it must be positive, or negative to go back")
+        raise ModelFileError("the step size is 0: it must be positive, or negative for a run backward in time")
     if span is not None and not 0.0 < span / abs(h) <= LARGEST_COUNT:
         raise ModelFileError(
-            f"span is {span:g} with a step of {h:g}: it is a positive length of time, also for a run backward, of "
-            "fewer than 2^53 steps"
+            f"span is {span:g} with a step size of {h:g}: it must be positive, also for a run "
+            "backward in time, and less than 2^53 steps"
         )
 
 
@@ -319,9 +325,9 @@ def check_controlled(tolerance: float | None, span: float | None) -> None:
     if tolerance is not None:
         check_tolerance(tolerance, ModelFileError)
     if span is None:
-        raise ModelFileError("steps that choose their length (tolerance) have no number: give span, not steps")
+        raise ModelFileError("adaptive steps require a time span: give span, not steps")
     if span == 0.0:
-        raise ModelFileError("span is 0: it is a length of time, negative to go back")
+        raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
 
 
 def steps_in(span: float, h: float) -> int:
@@ -340,18 +346,19 @@ def check_at_most_one(h: float | None, tolerance: float | None, error: float | N
     """Raise an error for several step-size options; none means adaptive steps with errors at round-off level."""
     if sum(each is not None for each in (h, tolerance, error)) > 1:
         raise ModelFileError(
-            "give h (step) for a fixed step size, tolerance for the error of each adaptive step or error for that of "
-            "the whole run: one of them, not both"
+            "give only one of h (step: fixed step size), tolerance (error of each adaptive step) and "
+            "error (error of the whole run)"
         )
 
 
 def check_error(error: float | None, *, paced: bool) -> None:
     """Raise an error for an invalid bound of the global error, and for one with a time transformation."""
     if error is not None and not 0.0 < error < 1.0:
-        raise ModelFileError(f"error is {error:g}: the bound of the relative global error is between 0 and 1")
+        raise ModelFileError(f"error is {error:g}: the bound of the relative global error must be between 0 and 1")
     if error is not None and paced:
         raise ModelFileError(
-            f"error = {error:g} needs adaptive steps, and a monitor has fixed steps of tau: give tolerance or step"
+            f"error = {error:g} requires adaptive steps, but a time transformation has fixed steps in "
+            "tau: give tolerance or step instead"
         )
 
 
@@ -375,5 +382,5 @@ def real(value: Any, where: str) -> float:
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise ModelFileError(f"{where} is {number}: a finite number is wanted")
+        raise ModelFileError(f"{where} is {number}: it must be a finite number")
     return number

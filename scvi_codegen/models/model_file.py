@@ -161,7 +161,10 @@ def read_model_file(path: str | os.PathLike[str], given: Document | None = None)
 
 def _of_kind(path: str | os.PathLike[str], model: object, kind: type[Kind], other: str) -> Kind:
     if not isinstance(model, kind):
-        raise ModelFileError(f"{path}: this is read by {other}: sums over indices have coordinates that are arrays")
+        raise ModelFileError(
+            f"{path}: use {other} for this file (models of indexed systems, whose coordinates are arrays, "
+            "and other models have different readers)"
+        )
     return model
 
 
@@ -225,8 +228,8 @@ def dump_model(model: Model) -> str:
     if again != model:
         part = "method" if again.method != model.method else "system" if again.system != model.system else "state"
         raise ModelFileError(
-            f"the {part} of this model does not survive in a file: quadratures, nodes and tableaux must be found by "
-            "their names, and abscissae be binary64 numbers"
+            f"the {part} of this model cannot be represented in a file: quadratures, nodes and "
+            "tableaux must be built-in ones with a name, and abscissae binary64 numbers"
         )
     return text
 
@@ -269,8 +272,8 @@ def _check_kept(error: Any, run: Section) -> None:
     """Raise an error for a time transformation added to a model with ``error``, unless that is replaced."""
     if not {"step", "tolerance"} & run.keys():
         raise ModelFileError(
-            f"[run] error = {error} needs adaptive steps, and a monitor has fixed steps of tau: give --tolerance or "
-            "--step with --monitor"
+            f"[run] error = {error} requires adaptive steps, but a monitor has fixed steps in tau: "
+            "give --tolerance or --step with --monitor"
         )
 
 
@@ -283,7 +286,11 @@ def _check_complete(document: Document) -> None:
             if choice.isdisjoint(document.get(name, {})):
                 missing.append(f"{' or '.join(sorted(choice))} in [{name}]")
     if missing:
-        rest = "; from rest it is q_dot = [0.0, ..], or --velocity 0,.." if "p or q_dot in [initial]" in missing else ""
+        rest = (
+            "; for a start from rest write q_dot = [0.0, ..], or --velocity 0,.."
+            if "p or q_dot in [initial]" in missing
+            else ""
+        )
         raise ModelFileError(f"there is no {', no '.join(missing)}{rest}")
 
 
@@ -310,7 +317,9 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     values = {key: real(value, f"[parameters] {key}") for key, value in document.get("parameters", {}).items()}
     if entry is not None:
         if forces:
-            raise ModelFileError("[forces] act on a system that is written out, not on one of the catalogue")
+            raise ModelFileError(
+                "[forces] are not supported for a system of the catalogue: write the system out in [system]"
+            )
         return in_section("[parameters]", lambda: entry.system.with_parameters(**values))
     check_one(section, "system", "lagrangian", "hamiltonian")
     name, coordinates = text_of(section, "name", "[system]"), names_of(section, "coordinates")
@@ -321,13 +330,17 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     if "hamiltonian" in section:
         bound = names_of(section, "constraints") if "constraints" in section else ()
         if "dissipation" in section:
-            raise ModelFileError("[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]")
+            raise ModelFileError(
+                "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces] instead"
+            )
         common["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
         common["momenta"] = names_of(section, "momenta") if "momenta" in section else None
         given = in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
         return in_section("[system]", lambda: lagrangian_of(given, constraints=bound)) if bound else given
     if "momenta" in section:
-        raise ModelFileError("[system] has momenta beside a lagrangian: they are names for a hamiltonian")
+        raise ModelFileError(
+            "[system] has momenta and a lagrangian: momenta are names for a hamiltonian; leave them out"
+        )
     common["lagrangian"] = text_of(section, "lagrangian", "[system]")
     common["dissipation"] = text_of(section, "dissipation", "[system]") if "dissipation" in section else None
     common["constraints"] = names_of(section, "constraints") if "constraints" in section else ()

@@ -95,7 +95,9 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
     target, record = Path(folder), read_record(folder)
     try:
         if "__init__.py" not in record["files"]:
-            raise PackageError(f"{target} is for a microcontroller: for Python generate it without --embedded")
+            raise PackageError(
+                f"{target} was generated for a microcontroller: for Python generate it without --embedded"
+            )
         interface = Interface.from_json(json.dumps(record["interface"]))
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, PackageError):
@@ -131,7 +133,7 @@ def source_in(folder: Path, prefix: str) -> Source:
         PackageError: if the folder lacks a file or was written by another version.
     """
     if not PREFIX.fullmatch(prefix):
-        raise _damaged(folder, ValueError(f"{prefix!r} begins no C name"))
+        raise _damaged(folder, ValueError(f"{prefix!r} is not a prefix of C names"))
     try:
         header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
         declarations = "\n".join(read_record(folder)["declarations"])
@@ -165,11 +167,12 @@ def prefix_of(folder: Path) -> str:
     cleaned = c_identifier(name)
     if name != cleaned:
         raise PackageError(
-            f"the folder's name begins every C name and is the name of the Python package; '{name}' does not serve "
-            f"(lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): call it '{cleaned}'"
+            "the name of the folder must be a prefix of C names and a name of a Python package; "
+            f"'{name}' is not (lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): "
+            f"use '{cleaned}'"
         )
     if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
-        raise PackageError(f"'{name}' has a meaning in C or Python: call the folder '{name}_integrator'")
+        raise PackageError(f"'{name}' is reserved in C or Python: use '{name}_integrator' for the folder")
     return name
 
 
@@ -210,10 +213,13 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     clock = model.system.clock
     if model.h is None and (clock or model.monitor is not None):
         raise ModelFileError(
-            "give a step of tau (--step, [run] step): without compiling none can be found for a tolerance"
+            "a step size in tau cannot be found for a tolerance without compiling: give one (--step, [run] step)"
         )
     if model.h is None and not controlled:
-        raise MethodError(f"{model.method.name} has no steps that choose their length (tolerance): give a step h")
+        raise MethodError(
+            f"adaptive steps are unavailable for {model.method.name} and this system: give a step h "
+            "(--step, [run] step)"
+        )
     given = model.all_inputs() if model.inputs else {}
     inputs, parameters = tables_of_example(model.system, given, (model.t, model.end if given else model.t))
     momenta = model.p if model.p is not None else _momenta(model, parameters)
@@ -277,9 +283,11 @@ def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> A
     try:
         rate = evaluate(system.clock.rate, dict(zip(symbols, map(mp.mpf, numbers), strict=True)))
     except ArithmeticError as error:
-        raise StateError(f"the rate of time, the monitor, has no value at the initial state: {error}") from error
+        raise StateError(f"the time transformation (monitor) has no value at the initial state: {error}") from error
     if not rate > 0:
-        raise StateError(f"the rate of time, the monitor, is {float(rate):g} at the initial state, not positive")
+        raise StateError(
+            f"the time transformation (monitor) is {float(rate):g} at the initial state: it must be positive"
+        )
     return rate
 
 

@@ -273,12 +273,12 @@ def problem(name: str) -> Problem:
     base, colon, size = name.partition(":")
     if base not in PROBLEMS:
         raise SystemDefinitionError(
-            f"no problem is called '{base}'{closest(base, PROBLEMS)} Known: {', '.join(PROBLEMS)}"
+            f"there is no problem '{base}'{closest(base, PROBLEMS)} Known: {', '.join(PROBLEMS)}"
         )
     if not colon:
         return PROBLEMS[base]()
     if base != "fput-chain":
         raise SystemDefinitionError(f"'{base}' has no size: only fput-chain takes one, as in fput-chain:64")
     if not (size.isascii() and size.isdigit() and len(size) < 10):
-        raise SystemDefinitionError(f"the size of a chain is a whole number, as in fput-chain:64, not '{size}'")
+        raise SystemDefinitionError(f"the size of a chain must be a whole number, as in fput-chain:64, not '{size}'")
     return _fput_problem(int(size))

@@ -108,7 +108,7 @@ def names_of(section: Section, key: str) -> list[str]:
 def check_one(section: Section, name: str, one: str, other: str) -> None:
     """Raise an error if two alternative keys are both given."""
     if one in section and other in section:
-        raise ModelFileError(f"[{name}] has both of {one} and {other}: give one of them")
+        raise ModelFileError(f"[{name}] has both {one} and {other}: give one of them")
 
 
 def required(section: Section, key: str, where: str) -> Any:
@@ -161,7 +161,7 @@ def read_run(section: Section) -> dict[str, Any]:
         field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
     }
     if not {"step", "tolerance", "error"} & section.keys() and "steps" in section:
-        raise ModelFileError("[run] has steps and no step, which says how long they are")
+        raise ModelFileError("[run] has steps but no step: give the step size")
     if "steps" in section:
         found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
     found["save_every"] = checked_count(section.get("save_every", 1), "[run] save_every", least=1, error=ModelFileError)

@@ -71,7 +71,7 @@ def checked_points(points: Iterable[Number]) -> Vector:
     for index, point in enumerate(numbers):
         if point in numbers[:index]:
             raise MethodError(
-                f"point {index} ({mp.nstr(point, 8)}) occurs twice; cardinal functions need distinct points"
+                f"point {index} ({mp.nstr(point, 8)}) occurs twice; cardinal functions require distinct points"
             )
     return numbers
 
@@ -188,7 +188,7 @@ def extrapolation(points: Iterable[Number], shift: Number, degree: int | None = 
         return cardinal_values(numbers, [point + offset for point in numbers])
     degree = point_count(degree, "the degree of an extrapolation", least=0)
     if degree >= len(numbers):
-        raise MethodError(f"degree {degree} does not fit {len(numbers)} points; give 0 to {len(numbers) - 1}")
+        raise MethodError(f"degree {degree} is too high for {len(numbers)} points; give 0 to {len(numbers) - 1}")
     with mp.workdps(guard_digits(numbers) + len(numbers)):
         rows = least_squares_shift(numbers, [point + offset for point in numbers], degree)
     return rounded(rows)
@@ -209,7 +209,9 @@ def continuation(points: Iterable[Number], degree: int) -> tuple[Matrix, Matrix]
     numbers = checked_points(points)
     sources = (*numbers, *(point - 1 for point in numbers))
     if not 0 <= degree < len(set(sources)):
-        raise MethodError(f"degree {degree} does not fit {len(set(sources))} points")
+        raise MethodError(
+            f"degree {degree} must be between 0 and {len(set(sources)) - 1} for {len(set(sources))} points"
+        )
     with mp.workdps(guard_digits(numbers) + 2 * len(sources)):
         rows = rounded(least_squares_shift(sources, [point + 1 for point in numbers], degree))
     return tuple(row[: len(numbers)] for row in rows), tuple(row[len(numbers) :] for row in rows)

@@ -120,7 +120,8 @@ def ascending_points(values: Iterable[Any], what: str) -> Vector:
             raise MethodError(f"{what} {index} is {mp.nstr(point, 8)}, outside [-1, 1]; map the interval to [-1, 1]")
         if index and point <= points[index - 1]:
             raise MethodError(
-                f"{what} {index} is {mp.nstr(point, 8)}, not above the one before it; sort them, each once"
+                f"{what} {index} is {mp.nstr(point, 8)}, not greater than the one before it; give "
+                "distinct points in ascending order"
             )
     return points
 

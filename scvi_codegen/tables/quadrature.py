@@ -95,8 +95,8 @@ class Quadrature:
             raise MethodError(f"the weights of quadrature {self.name!r} have sum {total}; scale them to sum 2")
         if found < claimed:
             raise MethodError(
-                f"quadrature {self.name!r} has order {found}, not {claimed}: "
-                f"the Legendre moment of degree {found} does not vanish; correct the numbers or leave order out"
+                f"quadrature {self.name!r} has order {found}, not {claimed}: the Legendre moment of "
+                f"degree {found} is not zero; correct the numbers or leave order out"
             )
         object.__setattr__(self, "order", claimed or found)
 
@@ -322,7 +322,7 @@ def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item
     family, _, count = str(name).partition(":")
     found = family_named(family, families, what)
     if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
-        raise MethodError(f"{what} {name!r} lacks its number of points; write {family!r} as '{family}:3', say")
+        raise MethodError(f"{what} {name!r} lacks its number of points; write '{family}:3', for example")
     return found, int(count)
 
 

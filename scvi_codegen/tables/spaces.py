@@ -147,7 +147,9 @@ class Trigonometric(CurveSpace):
     def __post_init__(self) -> None:
         frequency = float(to_number(self.frequency))
         if not frequency > 0.0:
-            raise MethodError(f"the frequency of trigonometric curves is positive, in radians a step, not {frequency}")
+            raise MethodError(
+                f"the frequency of trigonometric curves must be positive, in radians per step, not {frequency}"
+            )
         if self.harmonics is not None:
             harmonics = checked_count(self.harmonics, "the number of harmonics", least=1, error=MethodError)
             object.__setattr__(self, "harmonics", harmonics)
@@ -189,7 +191,10 @@ class Trigonometric(CurveSpace):
             sums.append(mp.fdot(rule.weights, map(product, rule.points)))
             if len(sums) > BETTER and abs(sums[-1 - BETTER] - sums[-1]) < mp.ldexp(1, powers - 56):
                 return gauss_legendre(n - BETTER)
-        raise MethodError(f"{self.name} turns too often in a step for {MOST_POINTS} points: take a smaller step")
+        raise MethodError(
+            f"the frequency of {self.name} per step is too high for {MOST_POINTS} quadrature points: use "
+            "a smaller step size"
+        )
 
     def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
         """See :meth:`CurveSpace.velocities`."""
@@ -208,8 +213,8 @@ class Trigonometric(CurveSpace):
         harmonics = degree // 2 if self.harmonics is None else self.harmonics
         if not 2 <= 2 * harmonics <= degree:
             raise MethodError(
-                f"trigonometric curves of degree {degree} have {degree // 2} harmonics at most, not {harmonics}; "
-                "one harmonic takes degree 2"
+                f"trigonometric curves of degree {degree} have 1 to {degree // 2} harmonics, not "
+                f"{harmonics}; one harmonic requires degree 2"
             )
         return harmonics
 
@@ -222,8 +227,8 @@ class Trigonometric(CurveSpace):
                 solved = mp.matrix([self._functions(degree, c, derivative) for c in at]) * mp.inverse(own)
             except ZeroDivisionError:
                 raise MethodError(
-                    f"{self.name} of degree {degree} is not determined by {degree} velocities: the curves turn too "
-                    "often in a step; take a smaller step"
+                    f"{self.name} of degree {degree} is not determined by {degree} velocities, "
+                    "because its frequency per step is too high: use a smaller step size"
                 ) from None
         return tuple(tuple(+solved[i, j] for j in range(degree)) for i in range(len(at)))
 
@@ -286,12 +291,12 @@ class Splines(CurveSpace):
     def dimension(self, degree: int) -> int:
         """Return the dimension of the velocities, which are continuous and of one degree less."""
         if degree < 2:
-            raise MethodError("splines with a continuous slope have degree 2 at least")
+            raise MethodError("splines require degree 2 at least, for a continuous velocity")
         velocities = self.pieces * (degree - 1) + 1
         if velocities > MOST_POINTS:
             raise MethodError(
-                f"{self.name} of degree {degree} has {velocities} velocities, of at most {MOST_POINTS}: take fewer "
-                "pieces, and more steps"
+                f"{self.name} of degree {degree} has {velocities} velocities, more than "
+                f"{MOST_POINTS}: use fewer pieces, and more steps"
             )
         return velocities
 
@@ -304,7 +309,10 @@ class Splines(CurveSpace):
     def along(self, rule: Quadrature) -> Quadrature:
         """Return the composite rule."""
         if rule.derivative_weights:
-            raise MethodError(f"{rule.name} uses derivatives along the curve: at breakpoints of {self.name} they jump")
+            raise MethodError(
+                f"{rule.name} uses derivatives along the curve, which are discontinuous at the "
+                f"breakpoints of {self.name}: use a quadrature without derivatives"
+            )
         return _composite(rule, tuple(self.ends))
 
     def velocities(self, points: Vector, at: Vector, derivative: int = 0) -> Matrix:
@@ -382,6 +390,7 @@ def space_by_name(name: str) -> CurveSpace:
     except ValueError:
         pass
     raise MethodError(
-        f"there are no curves called {name!r}: write polynomials, trigonometric:FREQUENCY[:HARMONICS] with radians a "
-        "step, or splines:PIECES or splines:BREAKPOINT,.."
+        f"there is no space of curves {name!r}: write polynomials, "
+        "trigonometric:FREQUENCY[:HARMONICS] with radians per step, or splines:PIECES or "
+        "splines:BREAKPOINT,.."
     )

@@ -151,7 +151,7 @@ def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
         if multiplicity % 2 == 1:
             odd.append(factor)
         rest, other = divided(rest, factor)[0], divided(gap, factor)[0]
-    raise ArithmeticError("60 digits do not tell the roots of this polynomial apart")
+    raise ArithmeticError("60 digits do not separate the roots of this polynomial")
 
 
 def positive_roots(polynomial: Polynomial) -> int:

@@ -169,11 +169,12 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
     """
     c = _intended(tuple(abscissae))
     if len(c) > MOST_STAGES:
-        raise MethodError(f"{len(c)} abscissae are too many: take at most {MOST_STAGES}, and more steps")
+        raise MethodError(f"{len(c)} abscissae are too many: use at most {MOST_STAGES}, and more steps")
     for index, (left, right) in enumerate(pairwise(c), start=1):
         if left >= right:
             raise MethodError(
-                f"abscissa {index} is {mp.nstr(right, 8)}, not above the one before it; sort them, each once"
+                f"abscissa {index} is {mp.nstr(right, 8)}, not greater than the one before it; give "
+                "distinct abscissae in ascending order"
             )
     return tableau_on(c, name)
 

@@ -122,7 +122,7 @@ def test_an_ensemble_of_them(model):
 def test_no_steps_and_columns_that_inputs_say():
     assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of("--steps", "0")
     Path("many.csv").write_text("q,u_0\n0.1,5\n")
-    assert "'u_0' is no coordinate" in invoke("--ensemble", "many.csv").stderr
+    assert "'u_0' is not a coordinate" in invoke("--ensemble", "many.csv").stderr
 
 
 def test_an_input_that_is_not_given():

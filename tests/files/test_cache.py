@@ -125,7 +125,7 @@ class TestTrust:
     def test_a_folder_that_everyone_may_write_is_not_used(self, folder):
         folder.mkdir()
         folder.chmod(0o777)
-        with pytest.warns(CacheWarning, match=r"every user of this machine may write into it.*chmod go-w"):
+        with pytest.warns(CacheWarning, match=r"every user of this machine may write to it.*chmod go-w"):
             assert answer(1) == 1.0
         assert list(folder.iterdir()) == []
         with pytest.warns(CacheWarning):
@@ -135,7 +135,7 @@ class TestTrust:
     def test_a_folder_that_its_group_may_write_is_not_used(self, folder):
         folder.mkdir()
         folder.chmod(0o775)
-        with pytest.warns(CacheWarning, match=r"every user of its group may write into it.*chmod go-w"):
+        with pytest.warns(CacheWarning, match=r"every user of its group may write to it.*chmod go-w"):
             assert answer(1) == 1.0
         assert list(folder.iterdir()) == []
 

@@ -276,9 +276,9 @@ def test_time_and_parameters_of_a_flow_of_several_pieces():
         assert_allclose(along(jnp.array(row)), pumped.states(row), rtol=0, atol=2e-12)
         for derivative in (jax.jacfwd, jax.jacrev):
             assert_allclose(derivative(along)(jnp.array(row)), pumped.slopes(row), rtol=1e-11, atol=1e-11)
-    with pytest.raises(ArgumentError, match=r"no 't_end'.*steps of h: h = \(t_end - t\) / steps"):
+    with pytest.raises(ArgumentError, match=r"no 't_end'.*fixed number of steps give h = \(t_end - t\) / steps"):
         flow(pumped.ROWS[0][:2], pumped.ROWS[0][2:4], t_end=3.0)
-    with pytest.raises(ArgumentError, match=r"no 'velocity': it takes momenta, p = stepper.momentum"):
+    with pytest.raises(ArgumentError, match=r"no 'velocity': use momenta, p = stepper.momentum"):
         flow(pumped.ROWS[0][:2], velocity=pumped.ROWS[0][2:4], h=0.1)
     with pytest.raises(ArgumentError, match=r"no 't_end'.*steps of h"):
         jax_flow(pumped.stepper(), t_end=3.0)

@@ -55,11 +55,11 @@ def test_from_sympy_as_from_text():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"forces": {"z": "1"}}, "force on 'z', which is no coordinate"),
+        ({"forces": {"z": "1"}}, "force on 'z', which is not a coordinate"),
         ({"forces": {"x": "1 +"}}, "column"),
         ({"forces": {"x": "k*x"}}, "'k'"),
         ({"forces": "x"}, "mapping from names"),
-        ({"dissipation": "c*x**2"}, "no velocity occurs in the dissipation"),
+        ({"dissipation": "c*x**2"}, "contains no velocity"),
     ],
 )
 def test_unfit_forces_are_named(given, message):
@@ -124,7 +124,7 @@ def test_what_needs_an_action_refuses_forces():
     system = driven(forces={"x": "-c*x_dot"})
     with pytest.raises(SystemDefinitionError, match="forces act on 'driven'"):
         reparametrise(system, "1 + x**2")
-    with pytest.raises(StateError, match="no action"):
+    with pytest.raises(StateError, match="not derivatives of an action"):
         exact_discrete_lagrangian(system, [0, 0], [1, 1], 0.1)
     with pytest.raises(MethodError, match="without derivatives"):
         discretise(system, SVI(2, "hermite:2"))

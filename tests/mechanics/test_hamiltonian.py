@@ -132,8 +132,8 @@ def test_model_files_hold_a_hamiltonian() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("hamiltonian =", "lagrangian =", "momenta beside a lagrangian"),
-        ('hamiltonian = "p*q"', 'hamiltonian = "p*q"\nlagrangian = "q"', "both of lagrangian and hamiltonian"),
+        ("hamiltonian =", "lagrangian =", "momenta and a lagrangian"),
+        ('hamiltonian = "p*q"', 'hamiltonian = "p*q"\nlagrangian = "q"', "both lagrangian and hamiltonian"),
         ('hamiltonian = "p*q"', "", "no hamiltonian or lagrangian"),
         ('"p",', "1,", "momenta must be a list of names"),
     ],
@@ -179,7 +179,7 @@ def test_what_has_no_legendre_transform_is_named() -> None:
         lagrangian_of(hyperbolic())
     assert lagrangian_twin(hyperbolic()) is None
     quintic = LagrangianSystem.from_text(name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2")
-    with pytest.raises(SystemDefinitionError, match="give the other function yourself"):
+    with pytest.raises(SystemDefinitionError, match="define the other function yourself"):
         hamiltonian_of(quintic)
 
 

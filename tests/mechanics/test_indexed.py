@@ -21,12 +21,12 @@ def system(coordinates: str, lagrangian: str, **beside: object) -> IndexedSystem
 @pytest.mark.parametrize(
     ("lagrangian", "message"),
     [
-        ("sum(i in N, q[i]*q_dot[i]**2)", "velocities as m*v**2/2 alone"),
+        ("sum(i in N, q[i]*q_dot[i]**2)", "velocities as m*v**2/2 only"),
         ("sum(i in N, t*q_dot[i]**2)", "with a constant mass m"),
-        ("sum(i in N, q_dot[i]**2 + q[i]*q_dot[i])", "velocities as m*v**2/2 alone"),
-        ("sum(i in 0..N-2, q_dot[i]*q_dot[i+1] + q_dot[i]**2)", "velocities as m*v**2/2 alone"),
+        ("sum(i in N, q_dot[i]**2 + q[i]*q_dot[i])", "velocities as m*v**2/2 only"),
+        ("sum(i in 0..N-2, q_dot[i]*q_dot[i+1] + q_dot[i]**2)", "velocities as m*v**2/2 only"),
         ("sum(i in N, q_dot[i]**4)", "with a constant mass m"),
-        ("sum(i in N, q[i]**2)", "no term has q_dot"),
+        ("sum(i in N, q[i]**2)", "no term contains q_dot"),
         ("sum(i in N, q_dot[i]**2 + sqrt(q[i] - q[i] - 1))", "real"),
     ],
 )
@@ -96,8 +96,8 @@ def test_what_is_written_out() -> None:
 @pytest.mark.parametrize(
     ("sizes", "beside", "message"),
     [
-        ({}, {}, "the sizes of 'chain' are N: give each"),
-        ({"N": 1}, {}, r"q\[1\] is at \[1\], outside of q\[N\]"),
+        ({}, {}, "the sizes of 'chain' are N: give exactly these"),
+        ({"N": 1}, {}, r"q\[1\] has the index \[1\], which is outside of q\[N\]"),
         ({"N": 3}, {"parameters": {"mu": np.ones(3)}}, "has no parameter 'mu'"),
         ({"N": 3}, {"parameters": {"m": np.ones(4)}}, r"'m' has the shape \(4,\)"),
         ({"N": 3}, {"tables": {"x": [[1]]}}, "the tables of 'chain' are none"),
@@ -205,12 +205,12 @@ def test_maps_of_a_hamiltonian() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "give a lagrangian or a hamiltonian"),
-        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "hamiltonian": "sum(i in N, q[i])"}, "one of them"),
-        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "momenta": ["p[N]"]}, "a Lagrangian has velocities"),
-        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["p[K]"]}, "momenta are arrays like"),
+        ({}, "give exactly one of lagrangian and hamiltonian"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "hamiltonian": "sum(i in N, q[i])"}, "give exactly one"),
+        ({"lagrangian": "sum(i in N, q_dot[i]**2)", "momenta": ["p[N]"]}, "a Lagrangian, which has velocities"),
+        ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["p[K]"]}, "momenta must be arrays"),
         ({"hamiltonian": "sum(i in N, q[i])", "momenta": ["q[N]"]}, "'q'"),
-        ({"hamiltonian": "sum(i in N, q_dot[i]**2)"}, "'q_dot' is no array"),
+        ({"hamiltonian": "sum(i in N, q_dot[i]**2)"}, "'q_dot' is not an array"),
     ],
 )
 def test_a_lagrangian_or_a_hamiltonian(given: dict[str, object], message: str) -> None:
@@ -249,12 +249,12 @@ def test_forces_are_written_out() -> None:
 @pytest.mark.parametrize(
     ("beside", "message"),
     [
-        ({"forces": {"x[i]": "1"}}, "a force acts on coordinates"),
-        ({"forces": {"q[i]": "-q_dot[j]"}}, "'j' is no index"),
+        ({"forces": {"x[i]": "1"}}, "a force must act on coordinates"),
+        ({"forces": {"q[i]": "-q_dot[j]"}}, "'j' is not an index"),
         ({"forces": {"q[i]": "q[i+1]"}}, "i\\+1 is N at i = N-1"),
-        ({"forces": {"q[N]": "1"}}, "is not on an axis"),
+        ({"forces": {"q[N]": "1"}}, "is outside an axis"),
         ({"forces": {"q[i": "1"}}, "is expected here"),
-        ({"dissipation": "sum(i in N, q[i]**2)"}, "no velocity occurs in the dissipation"),
+        ({"dissipation": "sum(i in N, q[i]**2)"}, "contains no velocity"),
     ],
 )
 def test_forces_that_are_refused(beside: dict[str, object], message: str) -> None:

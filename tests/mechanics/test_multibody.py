@@ -201,7 +201,7 @@ def test_masses_that_depend_on_coordinates_and_unknown_velocities_are_refused() 
         taken(method)
     method.bodies[0].mass = M
     method.bodies[0].masscenter = Point("lost")
-    with pytest.raises(SystemDefinitionError, match=r"SymPy cannot tell how .*lost"):
+    with pytest.raises(SystemDefinitionError, match=r"SymPy cannot determine .*lost"):
         taken(method)
 
 

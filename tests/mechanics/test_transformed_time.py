@@ -140,15 +140,15 @@ TWICE = sc.reparametrise(KEPLER, "frequency")
 DRIVEN = sc.LagrangianSystem.from_text(name="driven", coordinates=["q"], lagrangian="q_dot**2/2 + q*cos(t)")
 FREE = sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2 - q")
 REFUSED = {
-    "twice": (TWICE, "x", "is transformed already"),
+    "twice": (TWICE, "x", "has a time transformation already"),
     "driven": (DRIVEN, "q", "'driven' depends on time"),
     "constant": (KEPLER, "m*mu", "constant"),
     "velocity": (KEPLER, "1/sqrt(1 + x_dot**2)", "x_dot"),
     "unknown": (KEPLER, "sqrt(x**2 + z**2)", "z"),
     "misspelt": (KEPLER, "frequenzy", "no monitor 'frequenzy'.*'frequency'"),
     "no text": (KEPLER, 3, "not 3"),
-    "masses": (CHARGED, "frequency", "needs constant masses, one a coordinate"),
-    "uniform": (FREE, "frequency", "no force of 'free' changes"),
+    "masses": (CHARGED, "frequency", "requires constant masses, one per coordinate"),
+    "uniform": (FREE, "frequency", "forces of 'free' do not depend on the position"),
     "no distance": (FREE, "distance", "no distance in a denominator"),
     "momenta": (KEPLER, "arclength", "hamiltonian_of"),
 }

@@ -370,7 +370,7 @@ def test_from_sympy_and_from_lagranges_method():
         (["x**2 + y**2 = l**2", "2*x**2 + 2*y**2 - 2*l**2"], "of 'plane' leave no degree of freedom.*nothing to int"),
         (["x = l*cos(t)", "y = l*sin(t)"], "2 constraints on 2 coordinates.*fully driven .*by a force or torque"),
         (["x_dot*y_dot + y"], "not linear in the velocity y_dot"),
-        (["l - t"], "no coordinate in the constraint"),
+        (["l - t"], "contains no coordinate"),
         (["x = y = l"], "more than one '='"),
         (["z - x"], "'z'"),
         ("x - y", "list of texts"),
@@ -388,7 +388,7 @@ def test_what_is_no_constraint(constraints, said):
 
 
 def test_a_constraint_said_twice_is_named():
-    with pytest.raises(SystemDefinitionError, match=r"'x\*z - 1' says nothing|'2\*x\*z - 2' says nothing"):
+    with pytest.raises(SystemDefinitionError, match=r"'x\*z - 1' is redundant|'2\*x\*z - 2' is redundant"):
         LagrangianSystem.from_text(
             name="space",
             coordinates=["x", "y", "z"],
@@ -459,7 +459,7 @@ def test_what_constraints_do_not_go_with():
     rolling = LagrangianSystem.from_text(
         name="blade", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"]
     )
-    with pytest.raises(SystemDefinitionError, match="constraints of velocities"):
+    with pytest.raises(SystemDefinitionError, match="nonholonomic constraints"):
         reparametrise(rolling, "1 + x**2")
     with pytest.raises(SystemDefinitionError, match="constraints"):
         hamiltonian_of(rod())

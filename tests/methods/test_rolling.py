@@ -136,7 +136,7 @@ def test_beside_constraints_of_positions_and_in_motion():
         constraints=["x_dot = cos(t)"],
         **common,
     )
-    assert dragged.changes_energy == "constraints move, and do work"
+    assert dragged.changes_energy == "constraints do work"
     run = compile_stepper(dragged, lobatto(3)).integrate([0, 0, 0], velocity=[1, 0, 0], h=0.1, steps=30)
     assert_allclose(run.q[:, 0], np.sin(run.t), atol=1e-9)
     assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), atol=1e-13)
@@ -161,16 +161,16 @@ def test_what_is_refused():
     skate = {"name": "skate", "coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2"}
     with pytest.raises(SystemDefinitionError, match="not linear in the velocity x_dot"):
         LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
-    with pytest.raises(SystemDefinitionError, match="says nothing"):
+    with pytest.raises(SystemDefinitionError, match="is redundant"):
         LagrangianSystem.from_text(
             name="s",
             coordinates=["x", "y", "z"],
             lagrangian="x_dot**2 + y_dot**2 + z_dot**2",
             constraints=["x_dot = y*z_dot", "2*x_dot = 2*y*z_dot"],
         )
-    with pytest.raises(MethodError, match="does not keep the constraints"):
+    with pytest.raises(MethodError, match="does not support the constraints"):
         compile_stepper(sleigh(), SVI(3))
-    with pytest.raises(MethodError, match="no polynomials"):
+    with pytest.raises(MethodError, match="not polynomials"):
         compile_stepper(sleigh(), SVI(3, "gauss-lobatto:4", space="trigonometric:0.5"))
     stepper = compile_stepper(sleigh(), lobatto(2))
     with pytest.raises(StateError, match=r"x_dot\*sin\(a\) - y_dot\*cos\(a\) is [-\d.]+, not 0"):

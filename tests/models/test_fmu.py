@@ -361,7 +361,7 @@ def test_models_and_names_that_do_not_serve_are_refused(tmp_path):
         with pytest.raises(PackageError):
             generate_fmu(model, tmp_path / name)
     (tmp_path / "mine.fmu").write_text("mine")
-    with pytest.raises(PackageError, match="is no FMU"):
+    with pytest.raises(PackageError, match="is not an FMU"):
         generate_fmu(model, tmp_path / "mine.fmu")
     assert (tmp_path / "mine.fmu").read_text() == "mine"
     for _ in range(2):
@@ -397,7 +397,7 @@ class TestPlatforms:
         assert archive.read("binaries/aarch64-windows/push.dll") == b"aarch64-windows ('-O1',)"
 
     def test_what_is_no_platform_or_cannot_be_made_is_said_and_leaves_nothing(self, tmp_path, monkeypatch):
-        with pytest.raises(PackageError, match=r"'windows' is no platform .* x86_64-windows"):
+        with pytest.raises(PackageError, match=r"'windows' is not a platform .* x86_64-windows"):
             generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("windows",))
         monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
         with pytest.raises(BuildError, match=r"for aarch64-windows .* pip install 'scvi-codegen\[compiler\]'"):

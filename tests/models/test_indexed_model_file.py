@@ -131,7 +131,7 @@ def test_arrays(value: Any, expected: Any, tmp_path: Path) -> None:
 
 def test_an_index_means_one_thing() -> None:
     """A parameter of its name is refused where a formula of places is read."""
-    with pytest.raises(sc.ModelFileError, match="i is an index in formulas of places"):
+    with pytest.raises(sc.ModelFileError, match="i is the name of an index in formulas of arrays"):
         read_array(parse_array("q[N]"), "i", "q", folder=".", sizes={"N": 3}, parameters={"i": 1.0})
 
 
@@ -145,18 +145,18 @@ def test_an_index_means_one_thing() -> None:
         ("N = 3", "", "nothing says how large N is"),
         ('"cos(2*pi*i/N)"', '"cos(2*pi*x/N)"', "x"),
         ('"cos(2*pi*i/N)"', "\"__import__('os')\"", "strings are not part of the grammar"),
-        ('"cos(2*pi*i/N)", ', "", r"1 formulas: one, or one for each component of r\[N, 2\]"),
+        ('"cos(2*pi*i/N)", ', "", r"1 formulas: give one, or one for each component of r\[N, 2\]"),
         ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0], [1.0]]", "lists of one length"),
         ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0]]", "N is 1 there, and 3 elsewhere"),
-        ("bonds.csv", "bonds.txt", "arrays are read from .npy, .npz, .csv files"),
+        ("bonds.csv", "bonds.txt", "arrays must be in .npy, .npz, .csv files"),
         ("bonds.csv", "none.csv", "cannot be read"),
         ('file = "bonds.csv"', 'file = "bonds.csv", colum = "a"', "unknown key 'colum' in"),
-        ('file = "bonds.csv"', "file = 3", "must be a file, .* with texts between quotes"),
+        ('file = "bonds.csv"', "file = 3", "must be a file, .* with text between quotes"),
         ('{ file = "bonds.csv" }', "[[0.5, 1], [1, 2]]", "must be whole numbers"),
         ("steps = 4", "steps = 4\ntolerance = 1e-9", "step.*tolerance"),
         ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not for sums over indices"),
         ("steps = 4", "", "span"),
-        ("step = 0.1", "", "has steps and no step"),
+        ("step = 0.1", "", "has steps but no step"),
         ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
         ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not for sums over indices"),
     ],

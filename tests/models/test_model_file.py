@@ -162,7 +162,7 @@ def test_a_catalogue_reference_may_be_changed():
         (
             "[system]",
             "[[events]]\nfunction = 'q'\n[system]",
-            "section 'events' in the file; events exist in Python only",
+            "section 'events' in the file; events are supported in Python only",
         ),
         ("[method]", "[zzz]", "Known: system, forces, inputs, parameters, initial, method, run"),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
@@ -180,16 +180,16 @@ def test_a_catalogue_reference_may_be_changed():
         ("lagrangian", "L", "unknown key 'L' in [system]; did you mean 'lagrangian'?"),
         ("[parameters]", "[constants]", "unknown section 'constants' in the file; did you mean 'parameters'?"),
         ('name = "pendulum"\n', "", "there is no name in [system]"),
-        ("step = 0.25\nspan = 10\n", "steps = 40\n", "[run] has steps and no step"),
+        ("step = 0.25\nspan = 10\n", "steps = 40\n", "[run] has steps but no step"),
         ("degree = 3\n", "", "svi needs 'degree'"),
         ("q = [0.5]\n", "", "there is no q in [initial]"),
         ("q_dot = [0]\n", "", "there is no p or q_dot in [initial]"),
-        ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both of p and q_dot"),
+        ("q_dot = [0]\n", "q_dot = [0]\np = [0]\n", "[initial] has both p and q_dot"),
         ("span = 10\n", "", "there is no span or steps in [run]"),
-        ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both of span and steps"),
-        ("span = 10\n", "span = 10\ntolerance = 1e-9\n", "[run] has both of step and tolerance"),
+        ("span = 10\n", "span = 10\nsteps = 40\n", "[run] has both span and steps"),
+        ("span = 10\n", "span = 10\ntolerance = 1e-9\n", "[run] has both step and tolerance"),
         ("step = 0.25\nspan = 10\n", "tolerance = 1e-9\nsteps = 40\n", "give span, not steps"),
-        ("step = 0.25\n", "tolerance = 2\n", "not 2: leave it out for round-off"),
+        ("step = 0.25\n", "tolerance = 2\n", "not 2: leave it out for errors at round-off level"),
         ("step = 0.25\nspan = 10\n", "span = 0\n", "span is 0"),
         (
             "step = 0.25\n",
@@ -207,9 +207,9 @@ def test_a_catalogue_reference_may_be_changed():
         ("m = 2.0", "m = nan", "[parameters] m is nan"),
         ("m = 2.0", 'm = "2"', "[parameters] m must be a number, not '2'"),
         ("m = 2.0", "m = 1" + "0" * 400, "[parameters] m is inf"),
-        ("step = 0.25", "step = 0", "the step is 0"),
-        ("step = 0.25", "step = 1e-300", "fewer than 2^53 steps"),
-        ("span = 10", "span = -10", "a positive length of time"),
+        ("step = 0.25", "step = 0", "the step size is 0"),
+        ("step = 0.25", "step = 1e-300", "less than 2^53 steps"),
+        ("span = 10", "span = -10", "it must be positive"),
         ("save_every = 4", "save_every = 0", "[run] save_every must be at least 1"),
         ("save_every = 4", "save_every = 1.5", "[run] save_every must be a whole number, not 1.5"),
         ("span = 10", "steps = -1", "[run] steps must be at least 0"),
@@ -217,7 +217,7 @@ def test_a_catalogue_reference_may_be_changed():
         ('"svi"', "3", "[method] method must be text between quotes, not 3"),
         ("degree = 3", "degree = 0", "[method]: "),
         ("degree = 3", 'degree = 3\nquadrature = "gauss:3"', "unknown quadrature 'gauss'"),
-        ("degree = 3", "degree = 3\nquadrature = 3", "[method]: a quadrature is wanted"),
+        ("degree = 3", "degree = 3\nquadrature = 3", "[method]: quadrature must be a Quadrature"),
         ('"svi"\ndegree = 3', '"scvi"\ndegree = 3\nvariational = "no"', "[method] variational must be true or false"),
         ('"svi"\ndegree = 3', '"collocation"\nabscissae = 0.5', "[method] abscissae must be a list"),
         ('["q"]', '"q"', "[system] coordinates must be a list of names"),
@@ -228,11 +228,11 @@ def test_a_catalogue_reference_may_be_changed():
         ("[run]", "[run", "this is not TOML"),
         ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to coordinates that are arrays"),
         ('"svi"', '"svi:4"', "[method] method = 'svi:4' and degree = 3 contradict each other"),
-        ('["q"]', '["q"]\nmomenta = ["p"]', "[system] has momenta beside a lagrangian"),
+        ('["q"]', '["q"]\nmomenta = ["p"]', "[system] has momenta and a lagrangian"),
         (
             'lagrangian = "m*q_dot**2/2 + cos(q)"',
             'hamiltonian = "p_q**2/2"\ndissipation = "q_dot**2"',
-            "[system] has a dissipation, in velocities, beside a hamiltonian: write [forces]",
+            "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces]",
         ),
     ],
 )
@@ -246,7 +246,7 @@ def test_mistakes_are_named(old, new, message, tmp_path):
 
 
 def test_forces_are_for_systems_that_are_written_out():
-    with pytest.raises(ModelFileError, match=r"\[forces\] act on a system that is written out"):
+    with pytest.raises(ModelFileError, match=r"\[forces\] are not supported for a system of the catalogue"):
         parse_model('[system]\ncatalogue = "kepler"\n[forces]\nq1 = "-q1_dot"\n')
 
 

@@ -124,7 +124,7 @@ def test_one_file_holds_several_inputs(file):
     ("table", "said"),
     [
         ("t,u\n0,0\n1,x\n", r"\[inputs\] u: tables/u.csv: line 3, u: 'x' is not a number"),
-        ("t,u\n0,0\n\n1,1\n1,2\n", "line 5, t: 1 does not come after 1"),
+        ("t,u\n0,0\n\n1,1\n1,2\n", "line 5, t: 1 is not greater than 1"),
         ("t,u\n0,0\n1\n", "line 3 must have a number for each of 2 names"),
         ("t,u\n0,0\n1,inf\n", "line 3, u: inf is not a finite number"),
         ("time,u\n0,0\n1,1\n", "no column t among time, u"),
@@ -143,7 +143,7 @@ def test_what_is_said_of_a_faulty_table(file, table, said):
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"t": [0.0, 2.0, 1.0], "u": [0.0, 0.0, 0.0]}, "row 2, t: 1 does not come after 2"),
+        ({"t": [0.0, 2.0, 1.0], "u": [0.0, 0.0, 0.0]}, "row 2, t: 1 is not greater than 2"),
         ({"t": [0.0, 1.0], "u": [0.0, np.nan]}, "row 1, u: nan is not a finite number"),
         ({"t": [0.0, 1.0], "u": [0.0, 1.0, 2.0]}, "no column u or value"),
         ({"u": [0.0, 1.0]}, "no column t"),

@@ -248,7 +248,7 @@ def test_a_rate_may_be_a_number_in_a_model_file(written):
 
 def test_who_does_not_take_it():
     for method in (SCVI(2), SpectralCollocation(3), SVI(2, "hermite:2"), Gauss(2, form="position")):
-        with pytest.raises(MethodError, match=r"does not take the damping of 'damped'.*take an SVI"):
+        with pytest.raises(MethodError, match=r"does not support the damping of 'damped'.*use an SVI"):
             compile_stepper(damped(), method)
     plain = damped("x_dot**2/2 + y_dot**2/2 + cos(x)")
     with pytest.raises(MethodError, match="without damping"):

@@ -63,7 +63,7 @@ def test_of_a_run(given, said, stepper):
     [
         (
             {"lagrangian": "q_dot**2/2 + k*cos(q)"},
-            "unknown name 'k'. Known here: q, q_dot, t, pi; a constant is declared",
+            "unknown name 'k'. Known here: q, q_dot, t, pi; declare a constant as a parameter",
         ),
         ({"forces": {"x": "1"}}, "there is a force on 'x', which is no coordinate. Coordinates: q"),
     ],

@@ -37,7 +37,7 @@ def chain():
 
 def test_inputs_go_to_integrate(stepper, chain):
     for start in (partial(stepper.start, [0.2], [0.0]), partial(chain.start, np.zeros(3))):
-        with pytest.raises(ArgumentError, match=r"start\(\) takes no 'inputs': data belong to \.integrate\("):
+        with pytest.raises(ArgumentError, match=r"start\(\) takes no 'inputs': pass them to \.integrate\("):
             start(h=0.1, inputs=DATA)
     assert stepper.integrate([0.2], [0.0], h=0.1, steps=3, inputs=DATA).t[-1] == pytest.approx(0.3)
 
@@ -55,8 +55,8 @@ def test_states_of_runs_with_inputs_are_kept_at_steps(stepper):
         ({"n_steps": 10}, "'n_steps'; did you mean 'steps'?"),
         ({"velocty": [0.0]}, "'velocty'; did you mean 'velocity'?"),
         ({"v0": [0.0]}, "'v0'; did you mean 'velocity'?"),
-        ({"solver": "newton"}, "'solver': it is chosen where a stepper is compiled"),
-        ({"method": "svi:4"}, "'method': the method is said where it is compiled"),
+        ({"solver": "newton"}, "'solver': pass it when compiling"),
+        ({"method": "svi:4"}, "'method': pass it when compiling"),
         ({"colour": "red"}, "'colour': it takes q, p, inputs, velocity, h, steps, t_end"),
     ],
     ids=str,
@@ -70,9 +70,9 @@ def test_words_of_other_programs(wrong, meant, stepper):
 @pytest.mark.parametrize(
     ("function", "wrong", "meant"),
     [
-        (sc.compile_stepper, {"h": 0.1}, "takes no 'h': steps of h are taken by a stepper"),
-        (sc.compile_stepper, {"degree": 8}, "takes no 'degree': it goes with the name of the method, 'svi:8'"),
-        (sc.verify, {"velocity": [0.0]}, "takes no 'velocity': it takes momenta, p = stepper.momentum(q, velocity)"),
+        (sc.compile_stepper, {"h": 0.1}, "takes no 'h': pass it to a stepper"),
+        (sc.compile_stepper, {"degree": 8}, "takes no 'degree': include it in the method, 'svi:8'"),
+        (sc.verify, {"velocity": [0.0]}, "takes no 'velocity': use momenta, p = stepper.momentum(q, velocity)"),
         (sc.LagrangianSystem.from_text, {"L": "x"}, "takes no 'L'; did you mean 'lagrangian'?"),
     ],
     ids=lambda each: getattr(each, "__name__", None) or str(each),
@@ -86,7 +86,7 @@ def test_functions_say_what_was_meant(function, wrong, meant):
 def test_no_word_hides_a_keyword():
     """What a function has is never said to be another, and every place that is named is one."""
     assert keyword_meant("q", ["y0"]) == "; did you mean 'y0'?"
-    assert keyword_meant("n", ["mass"]).startswith(": their number goes to run.advance(n)")
+    assert keyword_meant("n", ["mass"]).startswith(": pass the number to run.advance(n)")
     assert not [here for here, elsewhere in WORDS.items() if {*here.split()} & {*elsewhere.split()}]
     for name in ("integrate", "integrate_ensemble", "momentum"):
         assert hasattr(Stepper, name)

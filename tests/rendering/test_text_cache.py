@@ -254,7 +254,7 @@ def test_keys_hold_what_equality_or_texts_would_confuse():
     a, b = sympy.symbols("x x", real=True), sympy.Symbol("x")
     same = [(1, 2), ("1, 2",), (1, (2,)), (1.0, 2), (True, 2), ("None",), (None,), (sympy.Integer(1), 2), (a[0],), (b,)]
     assert len({key_of(each) for each in same}) == len(same)
-    with pytest.raises(TypeError, match="cannot be made of a object"):
+    with pytest.raises(TypeError, match="cannot be made from a object"):
         key_of(object())
     assert keys({}, prefix="None") != keys({})
     assert keys({}, monitor="None") != keys({})

@@ -406,7 +406,7 @@ class TestFiles:
             xarray.testing.assert_identical(
                 dataset.drop_attrs().load(), whole.to_xarray(units={"t": "day", "q": "au"}).drop_attrs()
             )
-            assert dataset.velocity.attrs == {"long_name": "velocity that belongs to the momentum", "units": "au day-1"}
+            assert dataset.velocity.attrs == {"long_name": "velocity", "units": "au day-1"}
             assert (dataset.t.attrs["units"], dataset.p.attrs) == ("day", {"long_name": "momentum"})
 
     def test_velocities_energies_and_momentum_maps_are_there(self, kepler):
@@ -457,7 +457,7 @@ class TestFiles:
     def test_a_folder_of_something_else_is_not_replaced(self, kepler):
         pytest.importorskip("zarr")
         Path("a.zarr").mkdir()
-        with pytest.raises(StateError, match="a folder with something else in it"):
+        with pytest.raises(StateError, match="a folder with other contents"):
             kepler.integrate(**STATE, h=H, steps=3).save("a.zarr")
 
     def test_a_file_that_cannot_be_finished_leaves_the_old_one(self, kepler, monkeypatch):

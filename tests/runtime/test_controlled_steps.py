@@ -251,9 +251,9 @@ def test_what_rests_or_moves_freely_needs_few_steps():
         ({"t_end": math.nan}, "t_end is nan"),
         (
             {"t_end": 1.0, "tolerance": 0.0},
-            "tolerance must be positive and below 1 .*, not 0: leave it out for round-off",
+            "tolerance must be positive and below 1 .*, not 0: leave it out for errors at round-off level",
         ),
-        ({"t_end": 1.0, "tolerance": 2.0}, "and below 1 .*, not 2: leave it out for round-off"),
+        ({"t_end": 1.0, "tolerance": 2.0}, "and below 1 .*, not 2: leave it out for errors at round-off level"),
         ({"t_end": 1.0, "save_every": 0}, "save_every"),
         ({"t_end": 1.0, "t_eval": [2.0]}, "outside"),
     ],

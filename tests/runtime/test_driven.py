@@ -248,7 +248,7 @@ def test_what_inputs_are_made_of_is_no_parameter_beside_them(pendulum):
 @pytest.mark.parametrize(
     ("parameters", "inputs", "said"),
     [
-        ({"u_0": 5.0}, ["u"], "both parameter 'u_0' and a part of the input 'u'"),
+        ({"u_0": 5.0}, ["u"], "both a parameter and a component of the input 'u'"),
         ({"u": 5.0}, ["u"], "'u' is listed twice"),
         ({}, ["u", "u"], "'u' is listed twice"),
         ({}, ["u", "q_dot"], "the velocity of 'q'"),

@@ -400,7 +400,7 @@ class TestEnsembleFiles:
             (
                 "a.toml",
                 "[grid]\nq3 = 1",
-                "'q3' is no coordinate, velocity, momentum or parameter of the system. Known: q1",
+                "'q3' is not a coordinate, velocity, momentum or parameter of the system. Known: q1",
             ),
             ("a.toml", "[grid]\nq1 = []", r"\[grid\] q1 is an empty list"),
             ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a number, not 'x'"),
@@ -413,7 +413,7 @@ class TestEnsembleFiles:
             ),
             ("a.toml", "[grid]\nq1_dot = 1\np_q2 = 1", "both velocities and momenta"),
             ("a.csv", "q1,q2\n", "a header of names and at least one line of numbers"),
-            ("a.csv", "q1,q1\n1,2", "the column 'q1' is there twice"),
+            ("a.csv", "q1,q1\n1,2", "the column 'q1' occurs twice"),
             (
                 "a.toml",
                 "[grid]\nq1 = {from = 1, to = 2, count = 1000000000}",
@@ -422,11 +422,11 @@ class TestEnsembleFiles:
             (
                 "a.toml",
                 "[grid]\nq1 = {from = 1, to = 2, count = 30000}\nq2 = {from = 1, to = 2, count = 30000}",
-                "the grid has 900000000 combinations, of at most 100000000",
+                "the grid has 900000000 combinations, more than the 100000000",
             ),
             ("a.csv", "q1,q2\n1,2\n3", "line 3 must have a number for each of 2 names, and has 1"),
             ("a.csv", "q1,,q2\n1,2,3", "column 2 has no name in the first line"),
-            ("a.csv", "q1;q2\n1;2", "'q1;q2' is no coordinate"),
+            ("a.csv", "q1;q2\n1;2", "'q1;q2' is not a coordinate"),
             ("a.csv", "q1,q2\n1,x", "line 2, q2: 'x' is not a number"),
             ("a.csv", "q1\ninf", "line 2, q1: inf is not a finite number"),
         ],

@@ -564,8 +564,8 @@ class TestCommandLine:
     @pytest.mark.parametrize(
         ("run", "words", "message"),
         [
-            ("error = 1e-9\ntolerance = 1e-9", [], "has both of tolerance and error"),
-            ("error = 1e-9\nstep = 0.1", [], "has both of step and error"),
+            ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
+            ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
             ("error = 2.0", [], "between 0 and 1"),
             ("error = 1e-9", ["--monitor", "frequency"], "needs adaptive steps"),
         ],

@@ -270,11 +270,11 @@ def test_parameters_of_constraints_do_not_jump(stepper):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("r[i, 0] = r_dot[i, 1] for i in N", "names the velocity r_dot"),
+        ("r[i, 0] = r_dot[i, 1] for i in N", "contains the velocity r_dot"),
         ("g = 1", "no coordinate"),
-        ("sum(i in N, r[i, 0]) = 1", "of a sum over a whole array"),
+        ("sum(i in N, r[i, 0]) = 1", "contain a sum over a whole array"),
         ("r[i, 0] = 1 for i in N for i in N", "one 'for'"),
-        ("r[i, 0] = 1 for i in M", "size of no array"),
+        ("r[i, 0] = 1 for i in M", "not the size of an array"),
         ("r[i, 0] = 1 for i in N x", "the end is expected"),
     ],
 )

@@ -155,10 +155,10 @@ def test_products_and_transposes() -> None:
     [
         (lambda: cardinal_values((0, 1, 0), (0,)), "point 2 .* occurs twice"),
         (lambda: differentiation_matrix(()), "at least one point"),
-        (lambda: extrapolation((0, 1), 1, 2), "degree 2 does not fit 2 points"),
+        (lambda: extrapolation((0, 1), 1, 2), "degree 2 is too high for 2 points"),
         (lambda: extrapolation((0, 1), 1, 0.5), "must be a whole number"),
         (lambda: extrapolation((0, 1), 1, -1), "at least 0"),
-        (lambda: continuation((0, 1), 3), "degree 3 does not fit 3 points"),
+        (lambda: continuation((0, 1), 3), "degree 3 must be between 0 and 2 for 3 points"),
     ],
 )
 def test_impossible_requests_are_refused(call: object, message: str) -> None:

@@ -163,8 +163,8 @@ def test_an_unknown_family_names_the_closest_and_all_others() -> None:
     ("degree", "points", "message"),
     [
         (2, (-1, 1), "needs 3 nodes, got 2"),
-        (2, (-1, 0, 0), "node 2 is 0.0, not above"),
-        (2, (-1, 1, 0), "node 2 is 0.0, not above"),
+        (2, (-1, 0, 0), "node 2 is 0.0, not greater"),
+        (2, (-1, 1, 0), "node 2 is 0.0, not greater"),
         (1, (0, 2), "outside"),
         (0, (0,), "at least 1"),
     ],

@@ -151,7 +151,7 @@ def test_the_order_of_a_users_rule_is_computed() -> None:
     [
         ((0,), (1, 1), 0, "1 points and 2 weights"),
         ((), (), 0, "at least one point"),
-        ((0, -1), (1, 1), 0, "not above the one before"),
+        ((0, -1), (1, 1), 0, "not greater than the one before"),
         ((0, 2), (1, 1), 0, "outside"),
         ((0, 1), (0.5, 0.5), 0, "sum 1.0; scale them to sum 2"),
         ((-1, 1), (1, 1), 4, "has order 2, not 4"),
@@ -167,7 +167,7 @@ def test_what_is_no_quadrature_is_refused(points: tuple, weights: tuple, order: 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("gauss-legendre", "lacks its number of points; write 'gauss-legendre' as 'gauss-legendre:3'"),
+        ("gauss-legendre", "lacks its number of points; write 'gauss-legendre:3'"),
         ("gauss-legendre:x", "lacks its number"),
         ("gauss-legendre:-1", "lacks its number"),
         ("gauss-legendre:0", "at least 1, not 0"),

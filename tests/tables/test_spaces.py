@@ -79,22 +79,22 @@ def test_names_read_back(name: str) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: space_by_name("wavelets:3"), "there are no curves called 'wavelets:3'"),
-        (lambda: space_by_name("splines:x"), "there are no curves called"),
-        (lambda: space_by_name("trigonometric"), "there are no curves called"),
+        (lambda: space_by_name("wavelets:3"), "there is no space of curves 'wavelets:3'"),
+        (lambda: space_by_name("splines:x"), "there is no space of curves"),
+        (lambda: space_by_name("trigonometric"), "there is no space of curves"),
         (lambda: Trigonometric(0.0), "positive"),
         (lambda: Trigonometric(-1.0), "positive"),
         (lambda: Trigonometric(1.0, 0), "number of harmonics must be at least 1"),
-        (lambda: SVI(1, space=Trigonometric(1.0)), "0 harmonics at most"),
-        (lambda: SVI(3, space=Trigonometric(1.0, 2)), "1 harmonics at most"),
-        (lambda: SVI(2, space=Trigonometric(2000.0)), "turns too often"),
+        (lambda: SVI(1, space=Trigonometric(1.0)), "at most 0 harmonics"),
+        (lambda: SVI(3, space=Trigonometric(1.0, 2)), "at most 1 harmonics"),
+        (lambda: SVI(2, space=Trigonometric(2000.0)), "per step is too high"),
         (lambda: Splines(0), "number of pieces must be at least 1"),
         (lambda: Splines(breakpoints=(0.5, 0.5)), "must ascend"),
         (lambda: Splines(breakpoints=(0.5, 1.0)), "must ascend"),
         (lambda: SVI(1, space="splines:2"), "degree 2 at least"),
-        (lambda: SVI(3, "hermite:3", space="splines:2"), "they jump"),
+        (lambda: SVI(3, "hermite:3", space="splines:2"), "which are discontinuous"),
         (lambda: SVI(3, nodes="equispaced", space="splines:2"), "leave them out"),
-        (lambda: SVI(3, space=7), "a space of curves is wanted"),  # type: ignore[arg-type]
+        (lambda: SVI(3, space=7), "space must be a CurveSpace"),  # type: ignore[arg-type]
     ],
 )
 def test_refused_spaces(make, message: str) -> None:

@@ -47,13 +47,18 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
     if moving := {access.array for _, access in term.slots} - {*coordinates, *fields}:
         name = min(array.name for array in moving)
         raise SystemDefinitionError(
-            f"the constraint '{shown}' names the velocity {name}: those of sums over indices are of positions"
+            f"the constraint '{shown}' contains the velocity {name}: constraints of indexed systems "
+            "must be holonomic (coordinates and time only)"
         )
     if not held_slots(term, coordinates):
-        raise SystemDefinitionError(f"there is no coordinate in the constraint '{shown}'")
+        raise SystemDefinitionError(
+            f"the constraint '{shown}' contains no coordinate: remove it, or write the condition in terms "
+            "of the coordinates"
+        )
     if inputs and any(re.fullmatch(inputs, each.name) for each in term.formula.free_symbols):
         raise SystemDefinitionError(
-            f"the constraint '{shown}' depends on an input, which may jump: make it a parameter or a formula in t"
+            f"the constraint '{shown}' depends on an input, which may be discontinuous: use a "
+            "parameter or a formula in t instead"
         )
 
 

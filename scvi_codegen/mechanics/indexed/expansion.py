@@ -62,7 +62,9 @@ def unroll_sums(
         ([table.name for table in system.tables], places, "table"),
     ):
         if set(known) != set(named):
-            raise SystemDefinitionError(f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give each")
+            raise SystemDefinitionError(
+                f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
+            )
     fields = {
         array.name: _filled(array, given.pop(array.name, default), sizes)
         for array, default in zip(system.fields, system.field_defaults, strict=True)
@@ -114,7 +116,7 @@ def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
 
 def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray[np.float64]:
     if np.shape(value) not in ((), array.shape(sizes)):
-        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, not that of {array}")
+        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, which does not match {array}")
     return np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape(sizes))
 
 
@@ -165,7 +167,9 @@ class _Elements:
         except IndexError as error:
             raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
         if any(not 0 <= place < length for place, length in zip(places, access.array.shape(self.sizes), strict=True)):
-            raise SystemDefinitionError(f"{access} is at {list(places)}, outside of {access.array}, at {dict(at)}")
+            raise SystemDefinitionError(
+                f"{access} has the index {list(places)}, which is outside of {access.array}, at {dict(at)}"
+            )
         name = access.array.name
         if name in self.names:
             return symbol(str(self.names[name][places]))

@@ -75,7 +75,8 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     pulls = like_terms((term for term, _ in acting), places, defaults, MOST_FAMILIES, (target for _, target in acting))
     if not kinds or (acting and not pulls):
         raise SystemDefinitionError(
-            f"the terms of '{system.name}' are of more than {MOST_FAMILIES} kinds: they are no sums of few"
+            f"the terms of '{system.name}' have more than {MOST_FAMILIES} different structures: "
+            "systems with so few repeated terms cannot be rolled into sums"
         )
     found = [_family(f"{mark}{k}", b, kind, defaults) for k, kind in enumerate((*kinds, *pulls))]
     used = {name: value for each in found for name, value in each.numbers.items()}
@@ -112,7 +113,7 @@ def _check_what_stands_beside(system: MechanicalSystem) -> None:
         ("transformed time", system.clock),
     ):
         if given:
-            raise SystemDefinitionError(f"{what} of '{system.name}' cannot be gathered into sums over indices")
+            raise SystemDefinitionError(f"'{system.name}' has {what}, which systems rolled into sums do not support")
 
 
 def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol, float]:
@@ -120,7 +121,7 @@ def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol
     parts = {symbol(f"{name}_{part}") for name in system.inputs for part in "0123t"}
     if any(parts & formula.free_symbols for formula in formulas):
         raise SystemDefinitionError(
-            f"an input of '{system.name}' occurs in a form in which it is not found again: multiply it out"
+            f"an input of '{system.name}' occurs in expanded form and cannot be recognised: multiply the formula out"
         )
     return {name: value for name, value in system.constants.items() if name not in parts}
 

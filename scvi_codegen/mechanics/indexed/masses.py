@@ -53,8 +53,8 @@ def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol)
         mass = slope.diff(v)
         if mass.free_symbols & (varies | {time}) or sympy.expand(slope - mass * v) != 0:
             raise SystemDefinitionError(
-                f"in '{term}' the derivative by {v} is {slope}: a Lagrangian of sums over indices has velocities as "
-                "m*v**2/2 alone, with a constant mass m"
+                f"in '{term}' the derivative with respect to {v} is {slope}: the Lagrangian of an "
+                "indexed system may contain velocities as m*v**2/2 only, with a constant mass m"
             )
 
 

@@ -83,14 +83,16 @@ class IndexedSystem:
                 if problem := unsupported_part(formula):
                     raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
         if self.constraints and self.momenta:
-            raise SystemDefinitionError("constraints stand beside a lagrangian, whose masses they are held by")
+            raise SystemDefinitionError(
+                "constraints of an indexed system require a lagrangian: write the system by its lagrangian"
+            )
         for term in self.constraints:
             check_constraint(term, self.coordinates, self.fields, "|".join(f"{name}_[0123t]" for name in self.inputs))
         for array in () if self.momenta else self.coordinates:
             if not any(mass.access.array == array for mass in self.masses):
                 raise SystemDefinitionError(
-                    f"no term has {array.name}{DOT}: give '{array.name}' a kinetic energy, as "
-                    f"sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)"
+                    f"no term contains {array.name}{DOT}: add a kinetic energy for '{array.name}', "
+                    f"such as sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)"
                 )
 
     @classmethod
@@ -341,15 +343,15 @@ class IndexedSystem:
         known = [array.name for array in self.arrays] + [each.name for each in self.parameters]
         for name in known:
             if known.count(name) > 1 or name in self.sizes:
-                raise SystemDefinitionError(f"'{name}' is the name of two things: rename one")
+                raise SystemDefinitionError(f"the name '{name}' is used twice: rename one")
         for table in self.tables:
             if len(table.axes) != 2 or not table.axes[0].name or table.axes[1].name:
                 raise SystemDefinitionError(
-                    f"a table has a size and a whole number of columns, as bonds[B, 2]: {table}"
+                    f"the table {table} must be declared with a size and a number of columns, as bonds[B, 2]"
                 )
         for array in self.coordinates:
             if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
-                raise SystemDefinitionError(f"of the axes of {array} only the last can be a whole number")
+                raise SystemDefinitionError(f"of the axes of {array} only the last may be a number: name the others")
 
 
 def _with_formulas(term: IndexedTerm, rule: Mapping[Any, Expr]) -> IndexedTerm:
@@ -373,10 +375,13 @@ def _momenta(
 ) -> tuple[Array, ...]:
     """Return the arrays of momenta of a Hamiltonian; none for a Lagrangian."""
     if (lagrangian is None) == (hamiltonian is None):
-        raise SystemDefinitionError("give a lagrangian or a hamiltonian, one of them")
+        raise SystemDefinitionError("give exactly one of lagrangian and hamiltonian")
     if hamiltonian is None:
         if names is not None:
-            raise SystemDefinitionError("a Lagrangian has velocities, q_dot[i]: momenta are those of a hamiltonian")
+            raise SystemDefinitionError(
+                "momenta were given for a Lagrangian, which has velocities, q_dot[i]: leave them out, or "
+                "give a hamiltonian"
+            )
         return ()
     if names is None:
         return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
@@ -384,7 +389,7 @@ def _momenta(
     if [array.axes for array in given] != [array.axes for array in coordinates]:
         shown = ", ".join(map(str, coordinates))
         raise SystemDefinitionError(
-            f"momenta are arrays like those of the coordinates, {shown}, not {', '.join(names)}"
+            f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
         )
     return given
 
@@ -405,7 +410,8 @@ def _friction(
         )
         if not targets:
             raise SystemDefinitionError(
-                f"no velocity occurs in the dissipation {term}: Rayleigh's function gives the forces -dD/dq_dot"
+                f"the dissipation {term} contains no velocity: Rayleigh's function defines the forces "
+                "-dD/dq_dot. Add velocities, or remove it"
             )
         found.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
     return tuple(found)

@@ -66,8 +66,9 @@ class Multibody:
             return self._with_ignored(list(map(variables.write, idle))).formulas()
         if len(equations) != len(variables.u):
             raise SystemDefinitionError(
-                f"{len(variables.u)} generalised speeds, but {len(equations)} kinematic equations for them: as many "
-                "are needed, so that speeds are an invertible combination of the rates of the coordinates"
+                f"there are {len(variables.u)} generalised speeds, but {len(equations)} kinematic "
+                "equations for them: give as many, so that speeds are an invertible combination of "
+                "the rates of the coordinates"
             )
         rolling = list(map(variables.write, self._beyond_configuration(variables)))
         variables.settle(solved_for_speeds(equations, variables))
@@ -101,9 +102,11 @@ class Multibody:
             groups = [load_forces(group, self.frame, variables) for group in self.loads]
         except (ValueError, TypeError) as error:
             said = " ".join(str(error).split())
-            raise SystemDefinitionError(f"SymPy cannot tell how bodies and loads move: {said}") from error
+            raise SystemDefinitionError(f"SymPy cannot determine the velocities of bodies and loads: {said}") from error
         if any(entry.has(*variables.x) for motion in motions for entry in motion.inertia):
-            raise SystemDefinitionError("a mass or an inertia depends on a coordinate, which is not supported")
+            raise SystemDefinitionError(
+                "a mass or an inertia depends on a coordinate, which is not supported: make it a parameter"
+            )
         potential, forces = _split(groups, variables)
         beyond = gyroscopic_forces(motions, variables)
         return kinetic_energy(motions) - potential, tuple(map(sympy.Add, forces, beyond))

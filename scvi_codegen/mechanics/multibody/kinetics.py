@@ -82,8 +82,9 @@ def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Varia
     for symbol in variables.given:
         if any(component.has(symbol) for component in found):
             raise SystemDefinitionError(
-                f"the velocity of '{place}' depends on '{variables.write(symbol)}', which is neither a coordinate nor "
-                "a generalised speed: list it among them, or write a formula of time in its place"
+                f"the velocity of '{place}' depends on '{variables.write(symbol)}', which is neither "
+                "a coordinate nor a generalised speed: add it to these, or replace it by a formula "
+                "of time"
             )
     return found
 

@@ -28,7 +28,9 @@ def forces_of_lagranges_method(method: LagrangesMethod) -> dict[Expr, Expr]:
     """
     loads = tuple(method.forcelist or ())
     if loads and method.inertial is None:
-        raise SystemDefinitionError("this LagrangesMethod has a forcelist, but no inertial frame: frame=...")
+        raise SystemDefinitionError(
+            "this LagrangesMethod has a forcelist, but no inertial frame: create it with frame=..."
+        )
     variables = Variables(tuple(method.q), dynamicsymbols._t)
     forces = load_forces(loads, method.inertial, variables)
     return {q: variables.write(f) for q, f in zip(method.q, forces, strict=True) if f != 0}
@@ -42,13 +44,15 @@ def of_kanes_method(method: KanesMethod) -> Multibody:
     """
     if not method.bodies:
         raise SystemDefinitionError(
-            "this KanesMethod has no bodies, so no kinetic energy: KanesMethod(..., bodies=..., forcelist=...), or "
-            "kanes_equations(bodies, loads) first"
+            "this KanesMethod has no bodies, so no kinetic energy: create it with KanesMethod(..., "
+            "bodies=..., forcelist=...), or call kanes_equations(bodies, loads) first"
         )
     implicit = copy.copy(method)
     implicit.explicit_kinematics = False  # kinematic equations in implicit form, not solved for the rates
     if not implicit.mass_matrix_kin:
-        raise SystemDefinitionError("this KanesMethod has no kinematic equations between speeds and rates: kd_eqs=...")
+        raise SystemDefinitionError(
+            "this KanesMethod has no kinematic equations between speeds and rates: create it with kd_eqs=..."
+        )
     rates = method.q.diff(dynamicsymbols._t)
     constraints = method._k_nh * method.u + method._f_nh if method._k_nh else ()  # private; so below
     return Multibody(

@@ -60,4 +60,6 @@ def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.
         for place, value in zip(entries, values, strict=True):
             matrix[place] = float(value)
         return matrix
-    raise SystemDefinitionError("the constraints have no value at any of the points tried")
+    raise SystemDefinitionError(
+        "the constraints have no finite value at any of the sampled points: check their domains"
+    )

@@ -59,13 +59,15 @@ def check_symmetry(
     """
     if generator is not None:
         if direction is not None or gauge is not None:
-            raise SystemDefinitionError("give check_symmetry a direction, perhaps with its gauge, or a generator alone")
+            raise SystemDefinitionError(
+                "give check_symmetry either a direction, optionally with its gauge, or a generator"
+            )
         return _generated(system, _expression(system, generator, "generator"), name)
     if direction is None:
-        raise SystemDefinitionError("check_symmetry wants a direction, or a generator")
+        raise SystemDefinitionError("check_symmetry requires a direction or a generator")
     if isinstance(direction, str) or len(direction) != system.dimension:
         names = ", ".join(q.name for q in system.coordinates)
-        raise SystemDefinitionError(f"a direction has {system.dimension} components, one for each of {names}")
+        raise SystemDefinitionError(f"direction must have {system.dimension} components, one for each of {names}")
     xi = tuple(_expression(system, component) for component in direction)
     f = None if gauge is None else _expression(system, gauge, "gauge")
     p, q, t = system.momentum_symbols, system.coordinates, system.time
@@ -102,7 +104,8 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
         rate = sympy.Add(*(slope * moved[i] for i, slope in slopes.items())).xreplace(motion.numbers)
         rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
         raise SystemDefinitionError(
-            f"{G} generates no symmetry of '{system.name}': {{G, H}} + G_t, its rate of change, is {_cut(rate)}, not 0"
+            f"{G} does not generate a symmetry of '{system.name}': its rate of change, {{G, H}} + "
+            f"G_t, is {_cut(rate)}, not 0"
         )
     slopes = gradient(G, p)
     direction = tuple(slopes.get(i, sympy.S.Zero) for i in range(len(q)))
@@ -122,8 +125,8 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     if is_total_derivative(system, change, motion.points(parameters, DECIDED_AT)) is False:
         raise SystemDefinitionError(_defect(system, xi, None))
     raise SystemDefinitionError(
-        f"whether ({', '.join(map(str, xi))}) is a symmetry of '{system.name}' is not decided: along it L changes by "
-        f"{_cut(change)}, whose f was not found; give it as gauge"
+        f"it is undecided whether ({', '.join(map(str, xi))}) is a symmetry of '{system.name}': along "
+        f"it L changes by {_cut(change)}, whose gauge f was not found. Give f as gauge"
     )
 
 
@@ -136,7 +139,7 @@ def _expression(system: MechanicalSystem, given: Expr | str, what: str = "compon
         return parse_expression(given, known)
     expression = sympy.sympify(given) if isinstance(given, int | float) else given
     if not isinstance(expression, Expr):
-        raise SystemDefinitionError(f"a {what} is text or a SymPy expression, not {given!r}")
+        raise SystemDefinitionError(f"a {what} must be text or a SymPy expression, not {given!r}")
     unknown = sorted(free.name for free in expression.free_symbols if free.name not in known)
     if unknown:
         kinds = "coordinate, momentum, time or parameter" if generates else "coordinate, time or parameter"
@@ -160,7 +163,7 @@ def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str
     else:
         change, what = change - _rate(system, f), "the change of L is not the derivative of the gauge but differs by"
         reason = "not 0"
-    return f"({', '.join(map(str, xi))}) is no symmetry of '{system.name}': {what} {_cut(change)}, {reason}"
+    return f"({', '.join(map(str, xi))}) is not a symmetry of '{system.name}': {what} {_cut(change)}, {reason}"
 
 
 def _cut(change: Expr) -> str:

@@ -157,12 +157,12 @@ def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple
     for symmetry in given:
         if (symmetry.coordinates, symmetry.momenta) != own:
             raise SystemDefinitionError(
-                f"'{symmetry.name}' is a symmetry of another system: check it for '{system.name}' with check_symmetry"
+                f"'{symmetry.name}' is a symmetry of another system: verify it for '{system.name}' with check_symmetry"
             )
     names = [symmetry.name for symmetry in found]
     for name in names:
         if names.count(name) > 1:
-            raise SystemDefinitionError(f"two symmetries are called '{name}': give yours a name of its own")
+            raise SystemDefinitionError(f"two symmetries are called '{name}': choose another name for yours")
     return found
 
 
