@@ -221,7 +221,10 @@ class TestChoices:
             ("kepler --method svi:6 --degree 4", "--method svi:6 and --degree 4 contradict each other"),
             ("kepler --method gauss:3 --stages 2", "--method gauss:3 and --stages 2 contradict each other: leave one"),
             ("kepler --method gauss:3 --degree 4", "--method gauss:3 takes no --degree; it takes --stages, --form"),
-            ("kepler --method svi:x", "'svi:x' is not a method: the colon must be followed by a number, its degree, as in svi:8"),
+            (
+                "kepler --method svi:x",
+                "'svi:x' is not a method: the colon must be followed by a number, its degree, as in svi:8",
+            ),
             ("kepler --method gauss:", "the colon must be followed by a number, its stages, as in gauss:8"),
             ("kepler --method collocation:2", "collocation does not take a number; its arguments are abscissae, form"),
             ("kepler --method gaus:2", "did you mean 'gauss'?"),

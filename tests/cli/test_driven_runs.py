@@ -86,7 +86,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
     ("words", "said"),
     [
         (["--input", "u"], "not of the form NAME=FILE"),
-        (["--input", "v=u.csv"], "'v' is no input of 'pushed pendulum', which has u"),
+        (["--input", "v=u.csv"], "'v' is not an input of 'pushed pendulum', whose inputs are u"),
         (["--input", "u=u.csv:quintic"], "constant or linear or cubic"),
         (["--input", "u=none.csv"], "none.csv: it cannot be read"),
         (["--span", "4"], "the input u is given from t = 0 to 3; the run is from 0 to 4"),
@@ -127,7 +127,7 @@ def test_no_steps_and_columns_that_inputs_say():
 
 def test_an_input_that_is_not_given():
     Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
-    assert "the input u is not given" in invoke().stderr
+    assert "the input u is not set" in invoke().stderr
     assert "final state" in output_of("--input", "u=u.csv")
 
 

@@ -347,7 +347,7 @@ def test_all_functions_of_the_standard_are_there(fmu):
 def test_models_and_names_that_do_not_serve_are_refused(tmp_path):
     model = pushed()
     for wrong, words in (
-        (replace(model, h=None, tolerance=1e-6), "steps of one length"),
+        (replace(model, h=None, tolerance=1e-6), "fixed step size"),
         (replace(model, h=-0.1), "forward"),
         (replace(Model.from_problem(problem("kepler"), SVI(4)), monitor="distance"), "monitor"),
     ):

@@ -142,23 +142,23 @@ def test_an_index_means_one_thing() -> None:
         ('"svi:2"', '"svi:2"\nsolver = 2', "unknown solver 2 of an indexed system"),
         ("N = 3", "M = 3", r"unknown size 'M' in \[sizes\]"),
         ("N = 3", "N = 0", "N"),
-        ("N = 3", "", "nothing says how large N is"),
+        ("N = 3", "", "the size N is undefined"),
         ('"cos(2*pi*i/N)"', '"cos(2*pi*x/N)"', "x"),
         ('"cos(2*pi*i/N)"', "\"__import__('os')\"", "strings are not part of the grammar"),
         ('"cos(2*pi*i/N)", ', "", r"1 formulas: give one, or one for each component of r\[N, 2\]"),
         ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0], [1.0]]", "lists of one length"),
-        ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0]]", "N is 1 there, and 3 elsewhere"),
+        ('q = ["cos(2*pi*i/N)", "sin(2*pi*i/N)"]', "q = [[0.0, 1.0]]", "the size N is 1 here, but 3 elsewhere"),
         ("bonds.csv", "bonds.txt", "arrays must be in .npy, .npz, .csv files"),
         ("bonds.csv", "none.csv", "cannot be read"),
         ('file = "bonds.csv"', 'file = "bonds.csv", colum = "a"', "unknown key 'colum' in"),
         ('file = "bonds.csv"', "file = 3", "must be a file, .* with text between quotes"),
         ('{ file = "bonds.csv" }', "[[0.5, 1], [1, 2]]", "must be whole numbers"),
         ("steps = 4", "steps = 4\ntolerance = 1e-9", "step.*tolerance"),
-        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not for sums over indices"),
+        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not supported for indexed systems"),
         ("steps = 4", "", "span"),
         ("step = 0.1", "", "has steps but no step"),
         ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
-        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not for sums over indices"),
+        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not supported for indexed systems"),
     ],
 )
 def test_what_is_refused(net: Path, old: str, new: str, message: str) -> None:
@@ -176,7 +176,7 @@ def test_each_kind_has_its_reader(net: Path, tmp_path: Path) -> None:
     with pytest.raises(sc.ModelFileError, match="load_indexed_model"):
         sc.load_model(net)
     sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
-    with pytest.raises(sc.ModelFileError, match="read by load_model"):
+    with pytest.raises(sc.ModelFileError, match="use load_model"):
         sc.load_indexed_model(tmp_path / "kepler.toml")
 
 

@@ -158,7 +158,7 @@ def test_what_is_said_of_a_faulty_archive(file, arrays, said):
 
 
 def test_what_is_said_of_a_file_that_is_none(file):
-    for name, said in {"none.csv": "cannot be read", "u.txt": ".csv and .npz", "tables/u.npz": "no arrays"}.items():
+    for name, said in {"none.csv": "cannot be read", "u.txt": ".csv or .npz", "tables/u.npz": "no arrays"}.items():
         (file.parent / "tables" / "u.npz").write_text("not an archive")
         with pytest.raises(ModelFileError, match=f"u: {name}: .*{said}"):
             parse_model(MODEL.replace("tables/u.csv", name), folder=file.parent)
@@ -168,8 +168,8 @@ def test_what_is_said_of_a_file_that_is_none(file):
     ("entry", "said"),
     [
         ("3.0", "must be a table"),
-        ('{ file = "u.csv", values = [1.0] }', "give one of the two"),
-        ('{ kind = "linear" }', "give one of the two"),
+        ('{ file = "u.csv", values = [1.0] }', "must have either file, or t and values"),
+        ('{ kind = "linear" }', "must have either file, or t and values"),
         ("{ t = [0.0, 1.0] }", "u values must be a list of numbers"),
         ('{ t = [0.0, 1.0], values = [0.0, "a"] }', r"values\[1\] must be a number"),
         ("{ t = [0.0, 1.0, 0.5], values = [0.0, 1.0, 1.0] }", "do not ascend: 0.5 after 1"),
@@ -185,16 +185,16 @@ def test_what_is_said_of_an_entry(entry, said):
 
 
 def test_what_is_no_input_of_the_system():
-    with pytest.raises(ModelFileError, match="'v' is no input of 'pushed pendulum', which has u, w"):
+    with pytest.raises(ModelFileError, match="'v' is not an input of 'pushed pendulum', whose inputs are u, w"):
         parse_model(
             MODEL.replace('u = { file = "tables/u.csv", kind = "cubic" }', "v = { t = [0, 1], values = [0, 1] }")
         )
     system = LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + u*q", inputs=["u"])
     given = {"system": system, "method": "svi:2", "q": (0.0,), "p": (0.0,), "h": 0.1, "span": 1.0}
-    with pytest.raises(ModelFileError, match="is a table"):
+    with pytest.raises(ModelFileError, match="must be a table"):
         Model(**given, inputs={"u": np.sin})
     model = Model(**given)
-    with pytest.raises(ModelFileError, match=r"the input u is not given: .*--input u=FILE"):
+    with pytest.raises(ModelFileError, match=r"the input u is not set: .*--input u=FILE"):
         next(model.stretches(model.start(compile_stepper(system, "svi:2"))))
 
 

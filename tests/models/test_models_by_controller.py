@@ -186,10 +186,10 @@ def test_a_model_says_what_it_is_not(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):
         _ = model.step_count
-    with pytest.raises(ModelFileError, match="give one \(--step"):
+    with pytest.raises(ModelFileError, match="give one"):
         generate_package(replace(model, h=None, tolerance=1e-9), tmp_path / "none")
     stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
-    with pytest.raises(ModelFileError, match="not transformed"):
+    with pytest.raises(ModelFileError, match="without a time transformation"):
         sc.Model(system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, monitor="frequency")
     with pytest.raises(ModelFileError, match="controller is symplectic or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))

@@ -487,7 +487,7 @@ class TestCommandLine:
             ("kepler --ensemble grid.toml --plot a.png", "--plot is not available with --ensemble"),
             ("kepler --ensemble grid.toml --tolerance 1e-6", "--tolerance is not available with --ensemble"),
             ("kepler --ensemble grid.toml -o runs.txt", "written as .npz, .csv, .h5"),
-            ("planar-pendulum --ensemble grid.toml", "'q1' is no coordinate"),
+            ("planar-pendulum --ensemble grid.toml", "'q1' is not a coordinate"),
             (
                 "kepler --steps 1000000000000 --ensemble grid.toml",
                 "1000000000001 states of each of 6 trajectories need 4.08e+05 GB of memory: save fewer (--save-every ",
