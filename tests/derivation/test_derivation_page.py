@@ -205,7 +205,7 @@ class TestPage:
             name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p + q**2*p**2"
         )
         page = derivation_html(singular, sc.Gauss(2))
-        assert "one from the other until they rest" in page
+        assert "in turn to convergence" in page
 
     def test_an_entry_of_the_jacobian_says_its_number(self):
         pendulum, q, v, h = sc.problem("planar-pendulum").system.with_parameters(g=9.81), 0.5, 0.7, 0.1
@@ -257,9 +257,9 @@ class TestPage:
     @pytest.mark.parametrize(
         ("more", "said"),
         [
-            ({"forces": {"x": "-c*x_dot**3"}}, "Forces act beside it; where"),
+            ({"forces": {"x": "-c*x_dot**3"}}, "Generalised forces f; below"),
             ({"damping": "c"}, "Momenta are damped at one rate,"),
-            ({"constraints": ["x**2 + y**2 - 1"]}, "Constraints hold,"),
+            ({"constraints": ["x**2 + y**2 - 1"]}, "Constraints g = 0,"),
         ],
         ids=["forces", "damping", "constraints"],
     )
@@ -292,7 +292,7 @@ class TestPage:
         Page(page)
         assert re.search(r"The first \d of 18 equations\.", page)
         assert "144 rows and columns" in page
-        assert "they are left out here" in page
+        assert "they are omitted here" in page
         functions = functions_of(sc.generate_source(system, sc.SVI(8))[0].amalgamated().code)
         count = sum(len(functions[f"quadrature_slope{end}"].text.splitlines()) for end in ("_1", "_2", ""))
         assert count > 1000

@@ -120,7 +120,7 @@ def _(method: SVI) -> Iterator[Content]:
 def _(method: SpectralCollocation) -> Iterator[Content]:
     if method.form == "position":
         yield from _nodal(method.degree)
-        yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; node 0 carries no equation.")
+        yield Paragraph("It satisfies the Euler-Lagrange equations at nodes 1 to s; there is no equation at node 0.")
     else:
         yield _stages(method.form)
     yield from kronecker_form(method)
@@ -209,8 +209,8 @@ def _(method: SCVI) -> Iterator[Content]:
         i = Symbol("i", integer=True)
         terms = sympy.Sum(Symbol("lambda_i") * Symbol("E_i"), (i, 1, s))
         yield Paragraph(
-            "The curve depends on both ends. Multipliers carry that dependence, so that the discrete Lagrangian is "
-            "differentiated in full; stationary is"
+            "The curve depends on both ends. With multipliers for this dependence the discrete Lagrangian is "
+            "differentiated in full; the stationary function is"
         )
         yield Formula(Symbol("L_d") + terms, Symbol("G"))
     elif not method.variational:

@@ -48,17 +48,14 @@ def functions_section(
         if function.comment or function.name == start
     ]
     text = (
-        "Everything else is loops over tables, the same for every system: from the loop over the steps down, each "
-        "function once, in the order of the calls. The folded ones open when touched."
+        "Everything else consists of loops over tables, the same for every system: from the loop over the steps down, "
+        "each function once, in the order of the calls. Folded ones can be opened."
     )
     return Section(name="functions", title="The step: what the C does", contents=(Paragraph(text), *pairs))
 
 
 def _pair(function: Function, start: str, given: Iterator[Content]) -> Beside:
-    words = (
-        function.comment
-        or "The loop over the steps, with compensated sums: increments are added with what rounding cut off."
-    )
+    words = function.comment or "The loop over the steps, with compensated sums."
     return Beside(
         title=f"{function.name}({', '.join(function.arguments)})",
         left=(Paragraph(words if words.endswith(".") else f"{words}."), *given),
@@ -82,7 +79,7 @@ def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program:
 def _compiled(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
     yield Paragraph(
         "The stage equations as they are compiled: unknowns are velocities or accelerations times h in place of "
-        "positions, which would lose digits in differences."
+        "positions, whose differences would lose digits."
     )
     yield from families_contents(system, stages)
     for _, formula in row_formulas(system, stages):
@@ -92,10 +89,10 @@ def _compiled(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content
 
 def _newton() -> Iterator[Content]:
     R, J, z, change = Symbol("R"), Symbol("J"), Symbol("z"), Symbol("delta")
-    yield Paragraph("R the residuals of evaluate and J their Jacobian, factorised with exchanges of rows:")
+    yield Paragraph("R the residuals of evaluate and J their Jacobian, factorised with partial pivoting:")
     yield Formula(R, J * change)
     yield Formula(z - change, Symbol("z_new"))
-    yield Paragraph("until neither stages nor end momentum move by more than the tolerance, or rounding stops them.")
+    yield Paragraph("until the updates of stages and end momentum are below the tolerance, or at round-off level.")
 
 
 def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
@@ -104,27 +101,25 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
 
 SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
     SeparableSweep: (
-        Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; again until they rest:"),
+        Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; iterated to convergence:"),
         Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),
         Formula(q + h * v0 + h**2 * _sum("beta_j", inverse_mass * Symbol("F_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("b_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
     CoupledSweep: (
-        Paragraph("Velocities V_n at the points, corrected until they rest; M = L_vv there:"),
+        Paragraph("Velocities V_n at the points, corrected to convergence; M = L_vv there:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
         Formula(Symbol("V_n") + inverse_mass * (Symbol("P_n") - Symbol("L_v_n")), Symbol("V_n_new")),
         Paragraph(
-            "Where the masses of few coordinates depend on positions, V_n_new - V_n is corrected by what it changes of "
-            "P_n and L_v, to first order. In the end:"
+            "If the masses of few coordinates depend on positions, the correction includes its first-order effect on "
+            "P_n and L_v. After convergence:"
         ),
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),
     HamiltonianSweep: (
-        Paragraph(
-            "Positions, forces, momenta and velocities V_n = H_p at the points, one from the other until they rest:"
-        ),
+        Paragraph("Positions, forces, momenta and velocities V_n = H_p at the points, in turn to convergence:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(-Applied("H_q")(Symbol("q_n"), Symbol("P_n")), Symbol("F_n")),
         Formula(p + h * _sum("A_n_j", Symbol("F_j")), Symbol("P_n")),
@@ -135,14 +130,14 @@ SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
     ShootingSweep: (
         Paragraph(
             "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
-            "velocity v_0 at the start and the multipliers, in turn until all rest:"
+            "velocity v_0 at the start and the multipliers, in turn to convergence:"
         ),
         Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
     ),
     CollocationSweep: (
-        Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; again until they rest:"),
+        Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; iterated to convergence:"),
         Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(h * inverse_mass * Symbol("F_n"), Symbol("z_n")),

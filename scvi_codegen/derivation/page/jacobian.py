@@ -55,14 +55,14 @@ def jacobian_section(
     drawing = pattern_drawing(pattern, _titles(derived, pattern, numbers) if derived is not None and small else {})
     text = (
         f"Derivatives of the {pattern.size} equations with respect to the {pattern.size} unknowns: {pattern.entries} "
-        f"of {pattern.size**2} entries are not zero by structure. It is not written out but summed over the points "
-        "from the slopes of the kernels, the same expressions at every point."
+        f"of {pattern.size**2} entries are structurally nonzero. It is assembled by sums over the points "
+        "from the derivatives of the kernels, the same expressions at every point."
     )
     contents: list[Content] = [Paragraph(text)]
     contents += [] if drawing is None else [drawing]
     if numbers and start is not None:
         contents.append(
-            Paragraph(f"Pointed at, an entry shows its number at the first guess of a step h = {start.h:g}.")
+            Paragraph(f"The tooltip of an entry shows its value at the initial guess of a step h = {start.h:g}.")
         )
     if derived is not None and pattern.size <= LARGEST_SHOWN:
         entries = derived.jacobian.todok().items()
@@ -70,13 +70,15 @@ def jacobian_section(
     if program.newton:
         contents.append(
             Paragraph(
-                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations a "
-                f"coordinate, {program.unknowns} numbers. In the order chosen, coordinates that meet are at most "
-                f"{program.bandwidth} apart, and the matrix is the band that follows, or full if that is smaller."
+                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations per "
+                f"coordinate, {program.unknowns} numbers. In the chosen ordering, coupled coordinates are at most "
+                f"{program.bandwidth} apart, and the matrix is banded, or full if that is smaller."
             )
         )
     else:
-        contents.append(Paragraph("The step is explicit, or solved by sweeps alone: the C has no Jacobian."))
+        contents.append(
+            Paragraph("The step is explicit, or solved by fixed-point iteration alone: the C has no Jacobian.")
+        )
     return Section(name="jacobian", title="Jacobian", contents=tuple(contents))
 
 

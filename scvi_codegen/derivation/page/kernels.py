@@ -65,8 +65,8 @@ def kernels_section(system: MechanicalSystem, program: Program, functions: Mappi
     names = _names(system)
     pairs = tuple(_pair(program, kernel, functions, names) for kernel in kernels_of(program))
     text = (
-        "A kernel is all that depends on the system: arithmetic in a straight line, at one point. Those called _lanes "
-        "do the same for all points at once."
+        "Only the kernels depend on the system: straight-line arithmetic at one point. Those named _lanes "
+        "evaluate all points at once."
     )
     return Section(name="kernels", title="The kernels: formulas and C", contents=(Paragraph(text), *pairs))
 

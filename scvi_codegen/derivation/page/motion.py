@@ -30,7 +30,7 @@ def system_section(system: MechanicalSystem) -> Section:
     if system.forces:
         acting = [Formula(f, Symbol(f"f_{q.name}")) for q, f in zip(system.coordinates, system.forces, strict=True)]
         contents += [
-            Paragraph("Forces act beside it; where L_q stands below, L_q + f is meant:"),
+            Paragraph("Generalised forces f; below, L_q means L_q + f:"),
             *formulas(acting, "force"),
         ]
     if system.damping != 0:
@@ -44,8 +44,8 @@ def system_section(system: MechanicalSystem) -> Section:
     if system.constraints:
         contents += [
             Paragraph(
-                "Constraints hold, g = 0; their multipliers lambda act beside L_q as the forces G^T lambda, where G is "
-                "g_q, or g_v where velocities are held:"
+                "Constraints g = 0, with Lagrange multipliers lambda and constraint forces G^T lambda added to L_q; "
+                "G is g_q, or g_v for velocity constraints:"
             ),
             *formulas([Formula(g, Symbol(f"g_{k}")) for k, g in enumerate(system.constraints, 1)], "constraint"),
         ]

@@ -56,8 +56,8 @@ def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
     """Return the section on the implicit discrete Euler-Lagrange equations (5) and the end of the step."""
     rows = list(_rows(system, stages, {"IDEL"}))
     text = (
-        "The equations that hold the momenta p_k and p_(k+1) together with the curve, (5): p_k is known, p_(k+1) is "
-        "what the last one gives."
+        "The equations that relate the momenta p_k and p_(k+1) to the curve, (5): p_k is known, p_(k+1) "
+        "follows from the last one."
         if rows
         else "The end of the step:"
     )
@@ -93,12 +93,12 @@ def written_out_section(derived: StepEquations | None) -> Section:
     title, name = "Written out", "written-out"
     if derived is None:
         text = (
-            "Written out, the equations of this system and method have many thousand operations: they are left out "
+            "By components, the equations of this system and method have many thousand operations: they are omitted "
             "here. The command scvi-codegen derive without --html prints them."
         )
         return Section(name=name, title=title, contents=(Paragraph(text),))
     contents: list[Content] = [
-        Paragraph("The same equations component by component, positions and velocities put in, nothing simplified:")
+        Paragraph("The same equations by components, with positions and velocities substituted, not simplified:")
     ]
     for _, group in groupby(derived.equations, key=lambda equation: equation.kind):
         contents += formulas([_formula(equation) for equation in group], "equation", together=MOST_OPERATIONS)
@@ -109,7 +109,7 @@ def written_out_section(derived: StepEquations | None) -> Section:
         "end value",
         together=MOST_OPERATIONS,
     )
-    contents.append(Paragraph("Newton's iteration begins on the straight line with the velocity that belongs to p_k:"))
+    contents.append(Paragraph("Newton's method starts from uniform motion with the velocity that corresponds to p_k:"))
     contents += formulas([Formula(value, symbol) for symbol, value in derived.initial_guess.items()], "first value")
     return Section(name=name, title=title, contents=tuple(contents))
 
