@@ -259,11 +259,11 @@ def generate_source(
 
 def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
     if embedded not in (None, *EMBEDDED):
-        raise MethodError(f"there is no precision {embedded!r}; choose {' or '.join(EMBEDDED)}")
+        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
     if embedded and solver == "fixed-point":
-        raise MethodError("a fixed point needs vector registers: for a microcontroller choose 'newton' or 'explicit'")
+        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
     if embedded and functions:
-        raise MethodError("text for a microcontroller has no search for events: leave out one of the two")
+        raise MethodError("source for a microcontroller does not support events: omit events or embedded")
 
 
 def program_of(

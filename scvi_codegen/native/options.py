@@ -11,9 +11,18 @@ from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
 
-__all__ = ["FAILURES", "NOT_CONVERGED", "STATUS", "SolverOptions", "checked_options", "step_failure"]
+__all__ = ["FAILURES", "NOT_CONVERGED", "REASONS", "STATUS", "SolverOptions", "checked_options", "step_failure"]
 
 STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
+REASONS = {
+    1: "the iteration did not converge",
+    2: "a matrix is singular",
+    3: "a value is infinite or NaN",
+    4: "the step size is below machine precision",
+    5: "the iteration converged to a spurious solution",
+    6: "there is not enough memory",
+}
+"""Descriptions of the status of computations at a state."""
 NEEDED = 6
 """Status of a step that requires Newton's method (:mod:`scvi_codegen.native.binding`), or memory for it."""
 

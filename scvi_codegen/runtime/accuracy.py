@@ -33,7 +33,7 @@ __all__ = [
 TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 
-CONTROLLED: Final = ", or steps that choose their length (t_end= with a tolerance)"
+CONTROLLED: Final = ", or use adaptive steps (t_end= without h)"
 
 GROSS_ERROR: Final = 0.5
 """Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
@@ -42,12 +42,12 @@ MOST_ASKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
 
 MAGNIFIED: Final = (
-    "though each step was as accurate as wanted: the motion magnifies errors, as near collisions do; take a smaller "
-    "tolerance, or coordinates in which nothing collides"
+    "although every step met the tolerance: the motion amplifies errors, as close encounters do. Reduce the tolerance, "
+    "or use regularised coordinates"
 )
 MET: Final = (
-    "though the motion conserves it: steps are too long, perhaps where bodies nearly meet; take a shorter h, or an SVI "
-    "by steps that choose their length (t_end=)"
+    "although the system conserves it: h is too large, perhaps for a close encounter. Reduce h, or use an SVI with "
+    "adaptive steps (t_end=)"
 )
 
 Array = NDArray[np.float64]
@@ -119,8 +119,8 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
     if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
         return
     warn(
-        f"the step from t = {trajectory.worst_step_time:g} with h = {trajectory.h:g} is too long: the relative error "
-        f"of its end is about {error:.1e}; take a shorter h{remedy}",
+        f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
+        f"t = {trajectory.worst_step_time:g} is about {error:.1e}. Reduce h{remedy}",
         AccuracyWarning,
     )
 
@@ -161,7 +161,7 @@ def warn_of_energies(
         why: probable cause and remedy.
     """
     if lost_part(first, last, size) > tolerable and _heard.get():
-        warn(f"the energy{where} went from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
+        warn(f"the energy{where} changed from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
 
 
 def lost_part(first: float, last: float, size: float) -> float:

@@ -161,25 +161,27 @@ class CompiledMethod:
 
     def _linearised(self, source: Source | None, what: str) -> Binding:
         if source is None:
-            raise MethodError(f"there are no {what} of the steps of '{self.title}'{self._why_not()}")
+            raise MethodError(f"{what} of the steps are unavailable for '{self.title}'{self._why_not()}")
         binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
         return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
 
     def _why_not(self) -> str:
         if not self.interface.energy_parameter:
             return (
-                ": of systems with damping there are first derivatives alone, and a pickled stepper has second ones if "
-                "they were asked for (its second_derivatives) before it was pickled"
+                ": systems with damping have first derivatives only, and a pickled stepper has second derivatives only "
+                "if stepper.second_derivatives was used before pickling"
             )
         return (
-            ": in transformed time, whose steps begin on a level of the energy, there are first derivatives alone. "
-            "Compile the system itself, with monitor=.. or t_end=..: lengths of steps are then held"
+            ": in transformed time only first derivatives are available. Compile the original system with monitor=..., "
+            "or integrate it with t_end=..."
         )
 
     def _load_fallback(self) -> building.Library:
         source = self.fallback
         if source is None:
-            raise MethodError(f"'{self.title}' has no text with Newton's iteration, which its C text borrows")
+            raise MethodError(
+                f"the fallback source with Newton's iteration is missing for '{self.title}': recompile it"
+            )
         return building.load(source, flags=self.flags)
 
     @property
@@ -257,9 +259,9 @@ class CompiledMethod:
         source = self._controlled()
         if source is None:
             raise MethodError(
-                f"{self.interface.method} has no steps that choose their length for this system: they need a curve "
-                "of forces at two points or more, or of velocities that forces change along a step, which tells the "
-                "error of a step; give h and steps"
+                f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
+                "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
+                "step size)"
             )
         if source == self._plain:
             return self

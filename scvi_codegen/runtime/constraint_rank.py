@@ -62,10 +62,10 @@ def refusal(names: Sequence[str], q: Array, at: Linearised, *, nearest: bool = F
     rests = ", ".join(f"{g[k]:.3g}" for k in rows[:4])
     if nearest and np.abs(g).max() > CONTRADICTED * max(float(np.abs(q).max()), 1e-300):
         return (
-            f"the constraints {listed} contradict each other or are out of reach near there: at the nearest "
-            f"positions they are still {rests}, not 0; change or leave out one of them"
+            f"the constraints {listed} contradict each other or cannot be reached: at the nearest positions their "
+            f"values are {rests}, not 0. Change or remove one of them"
         )
     return (
-        f"the constraints {listed} depend on each other there (rank {rank} of {len(g)}), so that their multipliers are "
-        "undetermined; leave out one that follows from the others, or start from a state where they are independent"
+        f"the constraints {listed} are linearly dependent there (rank {rank} of {len(g)}), so their multipliers are "
+        "undetermined. Remove one that follows from the others, or start from a state where they are independent"
     )

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.native.options import STATUS
+from scvi_codegen.native.options import REASONS, STATUS
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
 from scvi_codegen.runtime.constraint_rank import Linearised, refusal
 from scvi_codegen.runtime.inputs import (
@@ -65,7 +65,7 @@ def projected(
     )
     if status:
         if wrong := refusal(stepper.constraints, q0, _linearised(stepper, t, parameters), nearest=True):
-            raise StateError(f"the constraints cannot be met near q = {_shown(q0)}: {wrong}")
+            raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
     status = binding.function("apart")(t, *map(binding.pointer, (q0, p0, q1, p1, values, apart)), binding.workspace())
@@ -95,10 +95,11 @@ def consistent(
         return q0, p0
     if moved <= TYPED:
         return q1, p1
-    said = f"the initial state is {moved:.1e} (relative) off the constraints: {_worst(stepper, q0, p0, t, parameters)}"
+    worst = _worst(stepper, q0, p0, t, parameters)
+    said = f"the initial state violates the constraints by {moved:.1e} (relative): {worst}"
     if moved > NEAR:
-        raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
-    warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning)
+        raise StateError(f"{said}. Use stepper.project(q, p) for the nearest consistent state")
+    warn(f"{said}. It was projected onto the constraints", AccuracyWarning)
     return q1, p1
 
 
@@ -128,14 +129,14 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
         g = constraint_values(stepper, q, p, t, parameters)[0, 0]
         k = int(np.abs(g).argmax())
         raise StateError(
-            f"at t = {t:g} the constraint {stepper.constraints[k]} jumps to {g[k]:.3g}, which positions cannot follow: "
-            "inputs and parameters of constraints of positions change without jumps, as 'linear' and 'cubic' inputs do"
+            f"at t = {t:g} the position constraint {stepper.constraints[k]} jumps to {g[k]:.3g}: inputs and parameters "
+            "in position constraints must be continuous, as 'linear' and 'cubic' inputs are"
         )
 
 
 def _of_constrained(stepper: Integrator, q: ArrayLike, p: ArrayLike, t: ArrayLike) -> tuple[Array, Array, Array]:
     if not stepper.constraints:
-        raise MethodError(f"{stepper.interface.system} has no constraints")
+        raise MethodError(f"'{stepper.interface.system}' has no constraints")
     return checked_states(stepper.interface, q, p, t)
 
 
@@ -172,6 +173,6 @@ def _shown(q: Array) -> str:
 
 
 def _refuse(stepper: Integrator, status: int, q: Array) -> None:
-    hint = "; do constraints say the same there, or contradict each other?" if "singular" in STATUS[status] else ""
+    hint = "; check for redundant or contradictory constraints" if "singular" in STATUS[status] else ""
     shown = ", ".join(stepper.constraints[:MOST_SHOWN]) + ", .." * (len(stepper.constraints) > MOST_SHOWN)
-    raise StateError(f"the constraints {shown} cannot be met near q = {_shown(q)} ({STATUS[status]}{hint})")
+    raise StateError(f"the constraints {shown} cannot be satisfied near q = {_shown(q)}: {REASONS[status]}{hint}")

@@ -144,7 +144,7 @@ def checked_times(t: ArrayLike, name: str) -> Array:
     """Return a copy of finite times of any shape."""
     times = real_array(t, name)
     if not np.isfinite(times).all():
-        checked_number(float(times[~np.isfinite(times)][0]), f"a number in {name}")
+        checked_number(float(times[~np.isfinite(times)][0]), f"a value in {name}")
     return times
 
 
@@ -152,11 +152,13 @@ def times_of_run(t_eval: ArrayLike, t: float, t_end: float) -> Array:
     """Return (n,) times within a run, sorted in its direction."""
     times = checked_times(t_eval, "t_eval")
     if times.ndim != 1:
-        raise StateError(f"t_eval is one list of times, not an array of shape {times.shape}")
+        raise StateError(f"t_eval must be a one-dimensional array of times, not of shape {times.shape}")
     if not times.size:
-        raise StateError("t_eval is empty: give the times at which states are wanted, or leave it out for every step")
+        raise StateError("t_eval is empty: give output times, or omit it to save every step")
     if (np.diff(times) * (t_end - t) < 0.0).any():
-        raise StateError("t_eval must be sorted as the run goes: ascending, descending for a run backward")
+        raise StateError(
+            "t_eval must be sorted in the direction of the run: ascending, or descending for a backward run"
+        )
     return within(times, t, t_end)
 
 
@@ -166,7 +168,7 @@ def within(times: Array, first: float, last: float) -> Array:
     slack = ROUNDINGS * np.finfo(float).eps * max(abs(first), abs(last))
     outside = times[(times < low - slack) | (times > high + slack)]
     if outside.size:
-        raise StateError(f"t = {outside[0]:.17g} is outside of the states, which go from {first:.17g} to {last:.17g}")
+        raise StateError(f"t = {outside[0]:.17g} is outside the trajectory from t = {first:.17g} to {last:.17g}")
     return np.clip(times, low, high)
 
 
@@ -190,6 +192,6 @@ def _check_on_grid(states: KeptStates) -> None:
     """Raise ``StateError`` unless all states but the last (an event may end it) are at whole steps from the first."""
     if np.isnan(states.step_sizes[:-1]).any():
         raise StateError(
-            "the states of this trajectory do not stand at whole steps (it was made with t_eval): "
-            "integrate without t_eval, then ask for states between"
+            "dense output and events require states at whole steps, but this trajectory was made with t_eval: "
+            "integrate without t_eval"
         )

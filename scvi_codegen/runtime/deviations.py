@@ -80,7 +80,9 @@ class ChaosIndicators:
         """Return (n,) natural logarithms of :meth:`gali`, also where GALI underflows."""
         most = self.lengths.shape[-1]
         if checked_count(k, "k", least=1) > most:
-            raise StateError(f"there are {most} changes here, and no generalized alignment index of {k}")
+            raise StateError(
+                f"k = {k} exceeds the number of tangent vectors, {most}: compute deviations with count={k}"
+            )
         volume: Array = (self.stretches - self.lengths)[..., :k].sum(axis=-1)
         return volume
 

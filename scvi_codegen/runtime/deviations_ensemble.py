@@ -58,13 +58,13 @@ class DeviationsEnsemble:
         parameters: EnsembleParameters,
         options: SolverOptions | None,
     ) -> None:
-        stepper._check_fixed_steps("a motion of an ensemble")
+        stepper._check_fixed_steps("chaos_indicators_ensemble")
         self.stepper, self.options = stepper, checked_options(options)
         self.h, steps = checked_step(h), checked_count(steps, "steps", least=1)
         self.save_every = steps if save_every is None else checked_count(save_every, "save_every", least=1)
         if steps % self.save_every:
             raise StateError(
-                f"steps={steps} is no multiple of save_every={self.save_every}: the last would not be kept"
+                f"steps={steps} must be a multiple of save_every={self.save_every}, so that the last value is saved"
             )
         start = checked_number(t, "the time t")
         self.t = times_after(start, self.h, np.arange(steps + 1))[0]
@@ -105,7 +105,7 @@ class DeviationsEnsemble:
                 runs[j] = record(memory, steps, save_every=steps)
         worst = max(runs, key=lambda j: np.nan_to_num(runs[j].step_error), default=None)
         if worst is not None:
-            warn_of_long_steps(runs[worst], remedy=f" (motion {worst} of {len(self.q)})")
+            warn_of_long_steps(runs[worst], remedy=f" (trajectory {worst} of {len(self.q)})")
 
     def _lanes(self) -> Binding | None:
         """Return the compiled ensemble library with tangent vectors, or ``None``."""

@@ -100,7 +100,7 @@ def _client(address: str | None) -> Iterator[Any]:
         import distributed
     except ImportError as error:
         raise ImportError(
-            "this needs dask.distributed, which is not installed: pip install 'scvi-codegen[distributed]'"
+            "ensembles on a cluster require dask.distributed: pip install 'scvi-codegen[distributed]'"
         ) from error
     if address is None:
         with (

@@ -84,12 +84,12 @@ def checked_inputs(
     """
     names, given = interface.inputs, dict(given or {})
     if interface.energy_parameter:
-        raise StateError("what moves in transformed time has no inputs: integrate(..., t_end=...) leads to a time")
+        raise StateError("inputs are not supported in transformed time: compile the original system")
     for name in given:
         if name not in names:
             raise no_input(name, names)
     if missing := [name for name in names if name not in given]:
-        raise StateError(f"the input {missing[0]} is not given: inputs={{'{missing[0]}': (t, values)}}")
+        raise StateError(f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}")
     return {name: input_of(name, value, trajectories) for name, value in given.items()}
 
 
@@ -99,23 +99,24 @@ def input_of(name: str, given: Any, trajectories: int | None = None) -> Input:
         return given
     if callable(given) and not hasattr(given, "c"):
         raise StateError(
-            f"the input {name} is a function of Python's, which C cannot call in the middle of a step: give values, "
-            f"{name}=(t, values) or scipy.interpolate.CubicSpline(t, values)"
+            f"the input '{name}' is a Python function, which the C code cannot call: sample it and pass (t, values) or "
+            "scipy.interpolate.CubicSpline(t, values)"
         )
     if hasattr(given, "c") and hasattr(given, "x"):
         return _from_pieces(name, *_powers(name, given), trajectories)
     if not isinstance(given, tuple) or len(given) not in (2, 3):
-        raise StateError(f"the input {name} is given as (t, values), or (t, values, 'cubic'), not {given!r:.60}")
+        raise StateError(f"the input '{name}' must be (t, values) or (t, values, 'cubic'), not {given!r:.60}")
     t, values = (
         checked_times(part, f"{what} of the input {name}") for part, what in zip(given, ("t", "values"), strict=False)
     )
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in list(KINDS):
-        raise StateError(f"the input {name} is {' or '.join(KINDS)} between its values, not {kind!r}")
+        raise StateError(f"the interpolation of the input '{name}' must be {' or '.join(KINDS)}, not {kind!r}")
     if t.ndim != 1 or len(t) < 2 or values.shape not in (t.shape, (trajectories, *t.shape)):
-        rows = "" if trajectories is None else f", values also for each of {trajectories} trajectories"
+        rows = "" if trajectories is None else f" (or one row of values for each of {trajectories} trajectories)"
         raise StateError(
-            f"the input {name} has times of shape {t.shape} and values of shape {values.shape}: two or more each{rows}"
+            f"the input '{name}' must have equally many times and values, at least two{rows}; got shapes {t.shape} and "
+            f"{values.shape}"
         )
     _check_ascending(name, t)
     return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
@@ -127,7 +128,7 @@ def _powers(name: str, given: Any) -> tuple[Array, Array]:
 
     if not isinstance(given, PPoly):
         raise StateError(
-            f"the input {name} is a {type(given).__name__}: give a PPoly, as PPoly.from_bernstein_basis of a BPoly"
+            f"the input '{name}' is a {type(given).__name__}: convert it to a PPoly, as by PPoly.from_bernstein_basis"
         )
     x, c = (checked_times(given.x, f"x of the input {name}"), checked_times(given.c, f"c of the input {name}"))
     long = np.diff(x) != 0.0
@@ -139,7 +140,7 @@ def _powers(name: str, given: Any) -> tuple[Array, Array]:
 def _check_ascending(name: str, t: Array) -> None:
     if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
         k = int(late[0])
-        raise StateError(f"the times of the input {name} do not ascend: {t[k + 1]:g} after {t[k]:g}")
+        raise StateError(f"the times of the input '{name}' must be ascending: {t[k + 1]:g} follows {t[k]:g}")
 
 
 def _constant(t: Array, values: Array) -> Array:
@@ -163,7 +164,7 @@ def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: 
     shaped = ascending.shape[1:-1] in ((), (trajectories,))
     if not shaped or len(ascending) > POWERS or not np.isfinite(ascending).all():
         raise StateError(
-            f"the pieces of the input {name} are polynomials of degree 3 at most, with finite coefficients"
+            f"the input '{name}' must be piecewise polynomial, of degree 3 at most, with finite coefficients"
         )
     pieces = np.zeros((ascending.shape[-1], *ascending.shape[1:-1], POWERS + 1))
     pieces[..., : len(ascending)] = ascending.T
@@ -314,7 +315,8 @@ def ends_on_the_way(t: float, t_end: float, inputs: Mapping[str, Input]) -> list
         slack = NEGLIGIBLE_STEP * (last - first)
         if low < first - slack or high > last + slack:
             raise StateError(
-                f"the input {name} is given from t = {first:g} to {last:g}; the run is from {low:g} to {high:g}"
+                f"the input '{name}' covers t = {first:g} to {last:g}, but the run goes from {low:g} to {high:g}: "
+                "extend the data, or shorten the run"
             )
         inner |= {float(x) for x in data.breakpoints if low < x < high}
     ends = sorted(inner, reverse=bool(t_end < t))
@@ -325,14 +327,16 @@ def end_of(t: float, h: float | None, steps: int | None, t_end: float | None) ->
     """Return the final time of a run with inputs, given by t_end or by h and steps."""
     t = checked_number(t, "the time t")
     if (t_end is None) == (steps is None):
-        raise StateError("a run with inputs leads to t_end or takes steps of h: give one of t_end and steps")
+        raise StateError(f"give either t_end or steps with inputs; got {'neither' if steps is None else 'both'}")
     if t_end is None:
         if h is None:
-            raise StateError("steps that choose their length have no number: give t_end, or h and steps")
+            raise StateError(
+                "steps requires h (fixed step size): give h, or t_end instead of steps (adaptive step size)"
+            )
         return float(times_after(t, checked_step(h), checked_count(steps, "steps", least=0))[0])
     end = checked_number(t_end, "t_end")
     if h is not None and (end - t) * checked_step(h) < 0.0:
-        raise StateError(f"steps of h = {h:g} do not lead from t = {t:g} to t_end = {end:g}")
+        raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}: use h = {-h:g}")
     return end
 
 

@@ -69,8 +69,8 @@ class DrivenTrajectory(NearbyDrivenMotions, Confirmed):
         first, last, stride = checked_rows(rows, len(self))
         if stride > 1:
             raise IndexError(
-                f"a slice of a run with inputs holds every state between its ends, unlike {rows}: leave out the "
-                "stride, or slice the arrays t, q and p"
+                f"a slice of a run with inputs must have stride 1, unlike {rows}: omit the stride, or slice the arrays "
+                "t, q and p"
             )
         chosen: list[Trajectory] = []
         start = 0

@@ -23,7 +23,7 @@ def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[A
     """Return validated (k, m) initial positions and momenta."""
     positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
     if positions.shape != momenta.shape:
-        raise StateError(f"q has shape {positions.shape}, p {momenta.shape}")
+        raise StateError(f"q and p must have equal shapes, not {positions.shape} and {momenta.shape}")
     return positions, momenta
 
 
@@ -41,7 +41,7 @@ def momenta_of_each(
         return given
     at, positions, velocities = checked_number(t, "the time t"), _states(stepper, q, "q"), _states(stepper, given, name)
     if positions.shape != velocities.shape:
-        raise StateError(f"q has shape {positions.shape}, velocity {velocities.shape}")
+        raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
     states = zip(positions, velocities, values, strict=True)
     return np.array([stepper.initial_momentum(position, v, at, value) for position, v, value in states])
@@ -69,7 +69,7 @@ def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
         raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
     if not np.isfinite(array).all():
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
-        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}")
+        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}: it must be finite")
     return array
 
 
@@ -81,7 +81,9 @@ def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: in
         for name, value in given.items():
             column = real_array(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
-                raise StateError(f"the parameter {name} must be one number or {count}, not of shape {column.shape}")
+                raise StateError(
+                    f"the parameter {name} must be one number or {count} numbers, not of shape {column.shape}"
+                )
             values[:, parameter_index(stepper.interface, name)] = column
     elif given is not None:
         array = real_array(given, "parameters")
@@ -90,5 +92,5 @@ def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: in
         values[:] = array
     if not np.isfinite(values).all():
         j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
-        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}")
+        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}: it must be finite")
     return values

@@ -75,7 +75,7 @@ class EnsembleToEnds:
         options: SolverOptions | None = None,
     ) -> None:
         if stepper.interface.energy_parameter:
-            raise StateError("in transformed time steps of tau have one length: give h and steps")
+            raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
         self.stepper, self.options = stepper._adaptive(), checked_options(options)
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
@@ -83,9 +83,7 @@ class EnsembleToEnds:
         self.t_eval = None
         if t_eval is not None:
             if self.save_every != 1:
-                raise StateError(
-                    f"states are kept at t_eval or every so many steps (save_every={save_every}), not both"
-                )
+                raise StateError(f"give either t_eval or save_every={save_every}, not both")
             farthest = max((goal.t_end for goal in self.goals), key=lambda end: abs(end - self.t0))
             self.t_eval = times_of_run(t_eval, self.t0, farthest)
         self.kept: dict[int, KeptLane] = {}
@@ -94,11 +92,11 @@ class EnsembleToEnds:
         """Return the step plan of each trajectory; all must run forward or all backward."""
         ends = real_array(t_end, "t_end")
         if ends.shape not in ((), (len(self.q),)):
-            raise StateError(f"t_end must be one time or {len(self.q)}, not of shape {ends.shape}")
+            raise StateError(f"t_end must be one time or {len(self.q)} times, not of shape {ends.shape}")
         goals = [Goal.checked(float(end), tolerance) for end in np.broadcast_to(ends, len(self.q))]
         signs = {np.sign(goal.t_end - self.t0) for goal in goals} - {0.0}
         if len(signs) > 1:
-            raise StateError(f"some t_end are before t = {self.t0:g} and some after it: make two ensembles of it")
+            raise StateError(f"t_end lies on both sides of t = {self.t0:g}: split the ensemble into two")
         return goals
 
     def __len__(self) -> int:

@@ -152,9 +152,9 @@ class EnsembleTrajectory:
             return
         write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
         if write is None:
-            raise StateError(f"an ensemble is saved as .npz, .csv, {', '.join(LABELLED)}, not as {str(path)!r}")
+            raise StateError(f"cannot save an ensemble as {str(path)!r}: use .npz, .csv, {', '.join(LABELLED)}")
         if known:
-            raise StateError(f"a file {suffix} has no place for units; {', '.join(LABELLED)} have")
+            raise StateError(f"{suffix} files cannot store units: use {', '.join(LABELLED)}, or omit units")
         write_atomically(path, write)
 
     def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
@@ -172,7 +172,7 @@ class EnsembleTrajectory:
 
     def _check_common_times(self) -> None:
         if self.stepper.interface.energy_parameter:
-            raise StateError("in transformed time trajectories have no common times: files of ensembles need them")
+            raise StateError("ensembles in transformed time cannot be saved: their trajectories have no common times")
 
     def _labelled(self, units: Mapping[str, str]) -> Labelled:
         """Return the arrays with named dimensions."""

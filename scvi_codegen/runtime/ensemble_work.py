@@ -51,7 +51,7 @@ def ensemble_work(
     """
     if inputs is not None:
         if t_eval is not None:
-            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+            raise StateError("t_eval is not supported with inputs: omit t_eval")
         way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
         return _driven_work(
             stepper, q, p, inputs=inputs, velocity=velocity, t=t, parameters=parameters, **way, **others
@@ -69,9 +69,9 @@ def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple
     """Return h and steps of a fixed-step ensemble; raise ``StateError`` for missing or contradictory arguments."""
     given = [name for name, value in others.items() if value is not None]
     if h is None or steps is None:
-        raise StateError("give h and steps, for steps of one length, or t_end, for steps that choose theirs")
+        raise StateError("give either h and steps (fixed step size) or t_end alone (adaptive step size)")
     if given:
-        raise StateError(f"{given[0]} is for steps that choose their length: give t_end, and neither h nor steps")
+        raise StateError(f"{given[0]} requires adaptive steps: give t_end without h and steps")
     return h, steps
 
 
@@ -98,15 +98,13 @@ def _driven_work(
     make: partial[DrivenEnsemble] | partial[DrivenToEnds]
     if h is not None:
         if tolerance is not None:
-            raise StateError("a tolerance is for steps that choose their length: give t_end, and neither h nor steps")
+            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
         if t_end is not None and np.ndim(t_end):
-            raise StateError("steps of h lead all trajectories to one t_end; leave out h for an end of each")
+            raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
         towards = end_of(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
         make = partial(DrivenEnsemble, h=h, t_end=towards)
     elif t_end is None or steps is not None:
-        raise StateError(
-            "give h and steps or t_end, for steps of h, or t_end alone, for steps that choose their length"
-        )
+        raise StateError("give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)")
     else:
         towards = float(real_array(t_end, "t_end").flat[0])
         make = partial(DrivenToEnds, t_end=t_end, tolerance=tolerance)
@@ -139,4 +137,4 @@ def _driven_start(
 
 def _refuse_monitors(stepper: Integrator) -> None:
     if stepper.interface.monitor:
-        raise StateError("there are no ensembles whose steps a monitor chooses: compile the method without one")
+        raise StateError("ensembles do not support monitor: compile the stepper without it")

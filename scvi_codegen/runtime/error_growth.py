@@ -77,8 +77,8 @@ class GrowthCheck:
         adaptive = run.goal is not None and not run.goal.tau
         if asked and not adaptive:
             raise StateError(
-                "check_growth=True needs adaptive steps, and these have a fixed size: give t_end without h, or leave "
-                "out check_growth"
+                "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
+                "check_growth"
             )
         self.run, self.asked, self.lead = run, asked, lead or self._to
         self.wanted = adaptive and asked is not False and warnings_wanted()
@@ -106,7 +106,7 @@ class GrowthCheck:
                 self.lead(float(states.t[k]))
                 apart = self._apart(states, k)
                 if not apart <= tolerable:
-                    self._report(nudge, f"is {apart:.1e} of its size away at t = {states.t[k]:g}")
+                    self._report(nudge, f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
                     return
         except StepFailedError as failure:
             self._report(nudge, f"fails at t = {failure.t:g}")
@@ -206,9 +206,9 @@ class GrowthCheck:
     @staticmethod
     def _report(nudge: float, said: str) -> None:
         warn(
-            f"the motion magnifies errors: a run from an initial state changed by {nudge:.1e} (relative) {said}, so "
-            "that a second run does not confirm this one; give error= for the time until which digits are confirmed, "
-            "or check_growth=False to leave this check out",
+            f"the motion amplifies errors: a run with the initial state perturbed by {nudge:.1e} (relative) {said}, so "
+            "later states are not reproducible. Use error= to find the time until which digits are confirmed, or "
+            "check_growth=False to skip this check",
             AccuracyWarning,
         )
 

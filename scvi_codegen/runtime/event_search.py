@@ -125,7 +125,7 @@ def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ..
     short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
     if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
         raise StateError(
-            "events are looked for between consecutive steps, but this trajectory has save_every > 1 or t_eval"
+            "events require all states, but this trajectory has save_every > 1 or t_eval: integrate with save_every=1"
         )
     lengths[:-1][short] = spans[short]  # an event ended the last step
     search = CrossingSearch(stepper)

@@ -20,9 +20,9 @@ __all__ = ["ACCUMULATED", "Crossings", "Event", "EventLike", "as_events"]
 Array = NDArray[np.float64]
 DIRECTIONS = (-1, 0, 1)
 ACCUMULATED = (
-    "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at a zero of it, "
-    "leaves and is back within a rounding error, as at the last of infinitely many bounces; end the motion here, or "
-    "go on with the state held by a constraint"
+    "the crossings of the terminal event '{function}' accumulate at t = {t:.17g}: the run starts at its zero and "
+    "returns within a rounding error (Zeno behaviour, as of infinitely many bounces). End the run here, or continue "
+    "with a constraint"
 )
 
 
@@ -48,9 +48,9 @@ class Event:
 
     def __post_init__(self) -> None:
         if not isinstance(self.function, str) and not hasattr(self.function, "free_symbols"):
-            raise EventError(f"the function of an event is text or a SymPy expression, not {self.function!r}")
+            raise EventError(f"the function of an event must be text or a SymPy expression, not {self.function!r}")
         if self.direction not in DIRECTIONS:
-            raise EventError(f"the direction of an event is 1, -1 or 0, not {self.direction!r}")
+            raise EventError(f"the direction of an event must be 1, -1 or 0, not {self.direction!r}")
         checked_count(int(self.terminal) if isinstance(self.terminal, bool) else self.terminal, "terminal", least=0)
 
 

@@ -159,7 +159,7 @@ def fit(
     )
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
-        raise FitError(f"{int(measurements.used.sum())} measurements do not tell {len(model.names)} unknowns")
+        raise FitError(f"{int(measurements.used.sum())} measurements do not determine {len(model.names)} unknowns")
     chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
     chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
@@ -181,7 +181,7 @@ def _solved(
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
     found = least_squares(chain.residuals, x, jac=chain.slopes, bounds=limits, x_scale="jac")
     if not found.success:
-        raise FitError(f"no least squares were found: {found.message} Give a nearer first guess")
+        raise FitError(f"least squares did not converge: {found.message} Give a better initial guess")
     held = found.active_mask != 0
     _check_told(model.names, found.jac, chain.typical_unknowns(found.x), held)
     if not several:
@@ -223,17 +223,20 @@ class _Model:
         wanted = tuple(own) if unknown is None else distinct(unknown, "unknown")
         for name in wanted:
             if name not in own:
-                raise StateError(f"there is no parameter '{name}' to find{closest(name, own)}")
+                raise StateError(f"there is no parameter '{name}' to estimate{closest(name, own)}")
         if p is None and not fit_initial_state:
             raise StateError(
-                "momenta follow from velocities by way of the parameters: give p, or let the state be found, too"
+                "velocity does not determine the initial momenta before the parameters are known: give p, or "
+                "fit_initial_state=True"
             )
         if not wanted and not fit_initial_state:
-            raise StateError("there is nothing to find: no parameter is unknown, and the initial state is known")
+            raise StateError(
+                "nothing to estimate: unknown is empty and fit_initial_state=False. Name parameters in unknown=[...]"
+            )
         if isinstance(parameters, Sequence) and any(isinstance(value, str) for value in parameters):
             raise StateError(
-                f"parameters must be values, as {{'{next(iter(parameters))}': 1.0}}, not names: the names of those to "
-                f"find go to unknown={list(parameters)}"
+                f"parameters must be values, as {{'{next(iter(parameters))}': 1.0}}, not names: name those to estimate "
+                f"in unknown={list(parameters)}"
             )
         values = checked_parameters(stepper.interface, parameters)
         momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
@@ -254,14 +257,12 @@ class _Model:
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for name, ends in given.items():
             if name not in self.names:
-                raise StateError(f"'{name}' is not among the unknowns, so has no bounds{closest(name, self.names)}")
+                raise StateError(f"bounds name '{name}', which is not an unknown{closest(name, self.names)}")
             pair, k = real_array(ends, f"the bounds of {name}"), self.names.index(name)
             if pair.shape != (2,) or np.isnan(pair).any():
-                raise StateError(
-                    f"the bounds of {name} are (least, greatest), infinite where there is none, not {ends}"
-                )
+                raise StateError(f"the bounds of {name} must be (lower, upper), infinite for no bound, not {ends}")
             if not pair[0] < self.guess[k] < pair[1]:
-                raise StateError(f"the first guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
+                raise StateError(f"the initial guess of {name}, {self.guess[k]:g}, is not between its bounds {ends}")
             low[k], high[k] = pair
         return low, high
 
@@ -313,8 +314,8 @@ def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_])
         ratios = moved / errors[told]
         name = [name for name, at in zip(fitted.names, told, strict=True) if at][int(np.argmax(ratios))]
         return (
-            f"h is too long for this fit: with steps half as long {name} is {ratios.max():.1f} standard errors "
-            "away. Take a shorter h, or a method of higher order"
+            f"h is too large for this fit: with half the step size {name} changes by {ratios.max():.1f} standard "
+            "errors. Reduce h, or use a method of higher order"
         )
     return ""
 
@@ -342,7 +343,7 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
     changes = lengths * sizes
     if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():
         name = free[nothing[0]]
-        raise FitError(f"these measurements do not tell {name}: they do not depend on it. {_as_known([name])}")
+        raise FitError(f"the measurements do not determine {name}: they do not depend on it. {_as_known([name])}")
     singular, directions = np.linalg.svd(slopes / lengths)[1:]
     if singular[-1] > SAME * singular[0]:
         return
@@ -350,19 +351,19 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
     told = [free[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist() if free[k]]
     if len(told) < 2:
         raise FitError(
-            f"these measurements do not tell {' '.join(told) or 'the states of segments'}: changed together with "
-            "states of later segments, it leaves all that is measured as it is. {_as_known([*told, ''])}"
+            f"the measurements do not determine {' '.join(told) or 'the states of segments'}: changed together with "
+            f"states of later segments, it leaves the computed values unchanged. {_as_known([*told, ''])}"
         )
     raise FitError(
-        f"these measurements do not tell {', '.join(told[:-1])} and {told[-1]} apart: changed together, they leave all "
-        f"that is measured as it is. {_as_known(told)}"
+        f"the measurements do not determine {', '.join(told[:-1])} and {told[-1]} separately: changed together, they "
+        f"leave the computed values unchanged. {_as_known(told)}"
     )
 
 
 def _as_known(names: Sequence[str]) -> str:
     """Return advice on treating an unknown as known."""
     return (
-        f"Take {names[0] if len(names) == 1 else 'one of them'} as known: list only the parameters to find in unknown=["
-        "...] (by default all are) and give values of the others in parameters={...}; fit_initial_state=False keeps "
-        "the initial state (with p) as given"
+        f"Treat {names[0] or 'them' if len(names) == 1 else 'one of them'} as known: name only the parameters to "
+        "estimate in unknown=[...] (by default all) and give values of the others in parameters={...}; "
+        "fit_initial_state=False fixes the initial state (with p)"
     )

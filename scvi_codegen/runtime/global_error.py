@@ -115,17 +115,17 @@ def checked_error(error: Any, others: Mapping[str, Any], *, monitored: bool = Fa
     """Return the requested global error as a number; raise StateError if combined with another step-size option."""
     wanted = checked_number(error, "the global error")
     if not 0.0 < wanted < 1.0:
-        raise StateError(f"error={wanted:g} is no bound for the relative global error: give a number between 0 and 1")
+        raise StateError(f"error={wanted:g} must be between 0 and 1: it bounds the relative global error")
     for name, value in others.items():
         if value is not None:
             raise StateError(
-                f"error={wanted:g} and {name}={value!r} both determine the step size: error= chooses the tolerances of "
-                f"adaptive steps; leave out {name} and give t_end"
+                f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
+                f"omit {name} and give t_end"
             )
     if monitored:
         raise StateError(
-            f"error={wanted:g} needs adaptive steps, and a time transformation has fixed steps of tau: leave out "
-            "error and compare with a run of half the step"
+            f"error={wanted:g} requires adaptive steps, but a time transformation has fixed steps in tau: omit error "
+            "and compare with a run of half the step size"
         )
     return wanted
 
@@ -189,9 +189,8 @@ def confirmed_run(
     if not result.confirmed:
         until = f"confirmed until t = {result.confirmed_until:.6g} only"
         warn(
-            f"the global error {wanted:g} is {until}: from there on runs of different steps, begun in states that "
-            f"differ in the last place, part, up to an error of about {result.estimate:.1e}; end the run there or "
-            "give a larger error",
+            f"the global error {wanted:g} is {until}: beyond it, runs with other steps and initial states perturbed in "
+            f"the last place differ by up to about {result.estimate:.1e}. End the run there, or give a larger error",
             AccuracyWarning,
         )
     return cast(Result, replace(cast(Any, found), confirmation=result))

@@ -39,10 +39,9 @@ class Goal:
         """Construct the step plan of a stepper with a monitor from user arguments."""
         if h is None or t_end is None or tolerance is not None:
             raise StateError(
-                f"the monitor {monitor} chooses how long steps are: give their length h in the time that it transforms "
-                "to, and t_end, where they lead"
+                f"a stepper with the monitor {monitor} requires h (constant step in tau) and t_end, and no tolerance"
             )
         tau = checked_step(h)
         if tau < 0.0:
-            raise StateError(f"steps of h = {h:g} in the time of a monitor are positive; t_end says where they lead")
+            raise StateError(f"h = {h:g} must be positive with a monitor: t_end determines the direction")
         return cls(t_end=checked_number(t_end, "t_end"), tau=tau)

@@ -87,7 +87,7 @@ def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
     size, given = 2 * stepper.dimension, stepper._input_size
     if directions.ndim not in (1, 2) or len(directions) not in (size, given):
         raise StateError(
-            f"directions have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
+            f"directions must have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
             f"parameters, t, h), not {directions.shape}"
         )
     changes = np.zeros((directions[0].size, given))
@@ -143,7 +143,7 @@ def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike)
     if slopes.ndim not in (2, 3) or slopes.shape[0] != count or slopes.shape[1] not in sizes:
         shape = f"({count}, {size})" + f", or ({count}, {size + 1}) with those by t," * (len(sizes) - 1)
         raise StateError(
-            f"cotangents, slopes by (q, p) of each state, have shape {shape} or (.., c), not {slopes.shape}"
+            f"cotangents, derivatives by (q, p) of each state, must have shape {shape} or (.., c), not {slopes.shape}"
         )
     return slopes
 
@@ -164,7 +164,7 @@ def finite(given: ArrayLike, name: str) -> Array:
     """Return a validated array of finite numbers."""
     array = real_array(given, name)
     if not np.isfinite(array).all():
-        raise StateError(f"there are {name} that are not finite")
+        raise StateError(f"{name} must be finite")
     return array
 
 

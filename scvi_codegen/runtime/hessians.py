@@ -38,7 +38,7 @@ def hessian_product(
     """
     slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
-    states.stepper._second_derivatives  # noqa: B018  (where there is none, it says why)
+    states.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
     changes = changes_of(states.stepper, given)
     found = bent_back(states, slopes, bends, changes, np.zeros((2, *changes.shape)))
     return gradient_of(states, found[1].T.reshape(states.stepper._input_size, *given.shape[1:]))
@@ -50,11 +50,11 @@ def checked_function(
     """Return validated (n, 2m) first and (n, 2m, 2m) second derivatives of one function of ``count`` states."""
     size, slopes = 2 * stepper.dimension, checked_slopes(stepper, count, cotangents)
     if slopes.ndim == 3:
-        raise StateError(f"cotangents are those of one function, ({count}, {size}), not {slopes.shape}")
+        raise StateError(f"cotangents of one function must have shape ({count}, {size}), not {slopes.shape}")
     shape = (count, size, size)
     bends = np.broadcast_to(0.0, shape) if curvatures is None else finite(curvatures, "curvatures")
     if bends.shape != shape:
-        raise StateError(f"curvatures, second slopes by (q, p) of each state, have shape {shape}, not {bends.shape}")
+        raise StateError(f"curvatures, Hessians by (q, p) of each state, must have shape {shape}, not {bends.shape}")
     return slopes, bends
 
 

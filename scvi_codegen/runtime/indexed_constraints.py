@@ -9,7 +9,7 @@ import numpy as np
 
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.indices import Loop
-from scvi_codegen.native.options import STATUS, SolverOptions
+from scvi_codegen.native.options import REASONS, STATUS, SolverOptions
 from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
 from scvi_codegen.runtime.constraint_rank import refusal
 from scvi_codegen.runtime.indexed_interface import Numbers
@@ -61,7 +61,7 @@ def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
     """Return the multipliers lambda of the forces G^T lambda of each constraint, as arrays over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
-        raise StateError(f"the constraints of {run.problem.interface.system} leave no forces here ({STATUS[status]})")
+        raise StateError(f"the multipliers of '{run.problem.interface.system}' are undefined here: {REASONS[status]}")
     return _apart(run, found)
 
 
@@ -81,12 +81,12 @@ def consistent(run: RunOfArrays) -> None:
         return
     largest = [max(float(np.abs(each).max(initial=0.0)) for each in values) for values in (g, rate)]
     said = (
-        f"the initial state is {max(moved):.1e} (relative) off the constraints: they are up to {largest[0]:.3g}, "
+        f"the initial state violates the constraints by {max(moved):.1e} (relative): they are up to {largest[0]:.3g}, "
         f"their rates up to {largest[1]:.3g}, not 0"
     )
     if max(moved) > NEAR:
-        raise StateError(f"{said}. The nearest state that meets them is stepper.project(q, p)")
-    warn(f"{said}; it was moved to the nearest one that meets them", AccuracyWarning)
+        raise StateError(f"{said}. Use stepper.project(q, p) for the nearest consistent state")
+    warn(f"{said}. It was projected onto the constraints", AccuracyWarning)
 
 
 def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
@@ -100,10 +100,10 @@ def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
     if status:
         if wrong := _dependent(run, nearest=True):
             raise StateError(wrong)
-        same = "do constraints say the same there, or contradict each other?"
-        hint = f"; {same if 'singular' in STATUS[status] else 'give positions that are nearer to them'}"
+        same = "check for redundant or contradictory constraints"
+        hint = f"; {same if 'singular' in STATUS[status] else 'give positions closer to them'}"
         raise StateError(
-            f"the constraints of {run.problem.interface.system} cannot be met near there ({STATUS[status]}{hint})"
+            f"the constraints of '{run.problem.interface.system}' cannot be satisfied: {REASONS[status]}{hint}"
         )
     half = len(before) // 2
     return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
@@ -115,8 +115,8 @@ def check_reachable(run: RunOfArrays) -> None:
     if moved > TYPED:
         run.state[:] = before
         raise StateError(
-            f"at t = {run.t:g} the constraints jump by {moved:.1e} (relative), which positions cannot follow: "
-            "parameters of constraints change without jumps"
+            f"at t = {run.t:g} the position constraints jump by {moved:.1e} (relative): parameters in position "
+            "constraints must be continuous in time"
         )
     run.state[: len(before) // 2] = before[: len(before) // 2]
 
@@ -151,7 +151,7 @@ def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
 
 def _count(run: RunOfArrays) -> int:
     if not run.problem.interface.constraints:
-        raise MethodError(f"{run.problem.interface.system} has no constraints")
+        raise MethodError(f"'{run.problem.interface.system}' has no constraints")
     return sum(int(np.prod(shape)) for shape in _shapes(run))
 
 

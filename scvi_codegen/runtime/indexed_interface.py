@@ -69,7 +69,7 @@ class IndexedInterface:
     conserves_energy: bool = False
     continued: bool = False
     energy_parameter = ""
-    """That of transformed time, which sums over indices do not have."""
+    """Name of the energy parameter of transformed time; indexed systems have none."""
 
     @property
     def integrator(self) -> str:
@@ -147,7 +147,7 @@ def field_values(
         _check_finite(values, array.name)
         shape = array.shape(sizes)
         if values.shape not in ((), shape):
-            raise StateError(f"'{array.name}' has the shape {values.shape}; {array} is {_text(shape)} here")
+            raise StateError(f"'{array.name}' must have the shape {_text(shape)} of {array}, not {values.shape}")
         found[array.name] = _kept(np.ascontiguousarray(np.broadcast_to(values, shape)))
     return found
 
@@ -161,17 +161,20 @@ def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | No
             values = np.asarray((given or {})[table.name])
         except (TypeError, ValueError, OverflowError) as error:
             raise StateError(
-                f"the table '{table.name}' is no array: its rows must have {table.axes[1].number} whole numbers each "
-                f"({error})"
+                f"the table '{table.name}' must be an array of whole numbers with {table.axes[1].number} columns: "
+                f"{error}"
             ) from error
         if values.size and values.dtype.kind not in "iu":
             raise StateError(f"the table '{table.name}' must be whole numbers, not {values.dtype.name}")
         if values.ndim == 1 and table.axes[1].number == 1:
             values = values[:, None]
         if values.ndim != 2 or values.shape[1] != table.axes[1].number:
-            raise StateError(f"the table '{table.name}' has the shape {values.shape}, not that of {table}")
+            raise StateError(f"the table '{table.name}' must have the shape of {table}, not {values.shape}")
         if values.size and not 0 <= values.min() <= values.max() < 2**31:
-            raise StateError(f"the table '{table.name}' has places from {values.min()} to {values.max()}")
+            raise StateError(
+                f"the indices in the table '{table.name}' must be from 0 to 2**31 - 1, "
+                f"not {values.min()} to {values.max()}"
+            )
         found[table.name] = _kept(np.array(values, dtype=np.int32, order="C"))
     return found
 
@@ -193,10 +196,12 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
         for axis, length in zip(array.axes, shape, strict=True):
             known, other = found.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
             if known != length:
-                raise StateError(f"{axis} is {length} in {array} and {known} in {other}")
+                raise StateError(
+                    f"{axis} must be the same in all arrays: it is {length} in {array}, {known} in {other}"
+                )
     for name in names:
         if name not in found:
-            raise StateError(f"nothing says how large {name} is: give the arrays that have it")
+            raise StateError(f"the size {name} is undetermined: pass an array that has an axis of this size")
     return {name: length for name, (length, _) in found.items()}
 
 
@@ -249,13 +254,15 @@ def _span(loop: Loop, sizes: Mapping[str, int]) -> tuple[int, int]:
 def _check_span(what: str, span: tuple[int, int], array: Array, axis: int, sizes: Mapping[str, int]) -> None:
     (low, high), length = span, array.axes[axis].at(sizes)
     if low < 0 or high >= length:
-        raise StateError(f"{what} goes from {low} to {high}, but {array} has {array.axes[axis]} = {length} places")
+        raise StateError(
+            f"the index of {what} runs from {low} to {high}, but {array} has {array.axes[axis]} = {length} entries"
+        )
 
 
 def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:
     literal = [(k, axis.number) for k, axis in enumerate(array.axes) if not axis.name]
     if values.ndim != len(array.axes) or any(values.shape[k] != number for k, number in literal):
-        raise StateError(f"{what}: '{array.name}' has the shape {values.shape}, which is not that of {array}")
+        raise StateError(f"{what}: '{array.name}' must have the shape of {array}, not {values.shape}")
     _check_finite(values, f"{what}: '{array.name}'")
     return values
 
@@ -263,18 +270,18 @@ def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:
 def _check_finite(values: Numbers, what: str) -> None:
     if not np.all(np.isfinite(values)):
         place = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
-        raise StateError(f"{what} is not finite at {[int(k) for k in place]}")
+        raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in place]}")
 
 
 def _check_named(given: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
     for name in given:
         if name not in names:
             raise StateError(
-                f"there is no '{name}' among {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
+                f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
             )
     for name in names:
         if whole and name not in given:
-            raise StateError(f"'{name}' is missing among {what}")
+            raise StateError(f"'{name}' is missing in {what}")
 
 
 def _text(shape: Sequence[int]) -> str:

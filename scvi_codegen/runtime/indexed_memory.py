@@ -39,7 +39,7 @@ def aligned(count: int) -> Numbers:
     try:
         memory = np.zeros(count + ALIGNMENT // 8)
     except (MemoryError, ValueError) as error:
-        raise StateError(f"{count} numbers do not fit into the memory") from error
+        raise StateError(f"there is not enough memory for {count} numbers") from error
     start = -memory.ctypes.data % ALIGNMENT // 8
     return memory[start : start + count]
 
@@ -55,7 +55,7 @@ def held_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, N
     binding.function("constraint_sizes")(problem, run)
     count, entries = run.constraints, run.entries
     if not 0 <= count <= entries < 2**31:
-        raise StateError(f"{count} constraints on {entries} coordinates: too many, or a loop ends early")
+        raise StateError(f"invalid constraints ({count} with {entries} coordinates): check the bounds of their loops")
     places = np.zeros(3 * (count + entries) + n + 3, dtype=np.int32)
     run.places = binding.pointer(places)
     run.pairs = binding.function("constraint_pairs")(run, problem)

@@ -33,8 +33,8 @@ FAILURES_BY_SOLVER = {
     | {
         NOT_CONVERGED: (
             "the fixed-point iteration did not converge",
-            "It converges while h times the highest frequency is less than about 1 to 3. Use a smaller h, or "
-            "solver='newton' where the fast motions are at rest (stiff bonds, short waves on a lattice)",
+            "It converges if h times the highest frequency is below about 1 to 3. Use a smaller h, or "
+            "solver='newton' if the fast modes are not excited (stiff bonds, short waves on a lattice)",
         )
     },
     "newton": FAILURES | {NOT_CONVERGED: ("Newton-GMRES did not converge", "Use a smaller h")},
@@ -113,7 +113,9 @@ class IndexedRun(OneThread):
             values = read_state(self.interface, given, what)
             for name, array in values.items():
                 if array.shape != state[name].shape:
-                    raise StateError(f"{what}: '{name}' has the shape {array.shape}, positions {state[name].shape}")
+                    raise StateError(
+                        f"{what}: '{name}' must have the shape of the positions, {state[name].shape}, not {array.shape}"
+                    )
             flat = self._flat(values)
             self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
@@ -128,7 +130,7 @@ class IndexedRun(OneThread):
         if self._binding.function("inverse_masses")(self.problem.struct, self._pointer("inverse_mass")):
             place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
             what = f"coordinate {place} of {len(inverse)}"
-            raise StateError(f"{what} has no positive mass: every one needs a kinetic energy")
+            raise StateError(f"{what} has no positive mass: add its kinetic energy to L, or check the parameters")
 
     @alone
     def update(
@@ -241,7 +243,7 @@ class IndexedRun(OneThread):
             StateError: if the system is defined by a Hamiltonian.
         """
         if self.interface.momenta:
-            raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
+            raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
 
     @property

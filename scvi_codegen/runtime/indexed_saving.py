@@ -51,19 +51,17 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) ->
         StateError: if the bytes are invalid or damaged or belong to another integrator or another kind of steps.
     """
     if not isinstance(saved, bytes):
-        raise StateError(f"a saved run is bytes, not {type(saved).__name__}")
+        raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
     with telling_of_damage():
         found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
         if str(found["integrator"]) != interface.integrator:
-            raise StateError(f"this is a run of '{found['integrator']}', not of '{interface.integrator}'")
+            raise StateError(f"the saved run is one of '{found['integrator']}', not of '{interface.integrator}'")
         if str(found.pop(CHECKSUM)) != _checksum(found):
-            raise StateError("these bytes are no saved run: their checksum differs. Save the run again")
+            raise StateError("invalid saved run: the checksum differs. Save the run again")
         if bool(found["to a goal"]) == to_a_goal:
             return found
     raise StateError(
-        "this is a saved run of fixed steps, which has no t_end: leave it out"
-        if to_a_goal
-        else "this is a saved run with adaptive steps: give its t_end"
+        "the saved run has fixed steps: omit t_end" if to_a_goal else "the saved run has adaptive steps: give t_end"
     )
 
 
@@ -114,7 +112,7 @@ def restore_memory(run: Any, arrays: Mapping[str, NDArray[Any]], saved: Mapping[
 
 
 def _not_saved(reason: object) -> StateError:
-    return StateError(f"these bytes are no saved run: {reason}")
+    return StateError(f"invalid saved run: {reason}")
 
 
 def _checksum(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -87,9 +87,9 @@ class IndexedStepper:
         source = self._controlled_text()
         if source is None:
             raise MethodError(
-                f"{self.interface.method} has no steps that choose their length for this system: they need a curve "
-                "of forces at two points or more, or of velocities that forces change along a step, which tells the "
-                "error of a step; give h and steps"
+                f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
+                "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
+                "step size)"
             )
         return Binding(load(source, flags=self.flags), self.interface.prefix, origin=(self, "_controlled"))
 
@@ -142,7 +142,7 @@ class IndexedStepper:
         """Return the number of threads; systems with constraints use one."""
         threads = checked_count(1 if given is None else given, "threads", least=1, most=MOST_THREADS)
         if threads > 1 and self.interface.constraints:
-            raise MethodError("steps that constraints hold are made by one thread: leave out threads")
+            raise MethodError("systems with constraints use one thread: omit threads")
         return threads
 
     def project(
@@ -162,7 +162,7 @@ class IndexedStepper:
             StateError: if the projection fails, or if the constraints are linearly dependent there.
         """
         if not self.interface.constraints:
-            raise MethodError(f"{self.interface.system} has no constraints")
+            raise MethodError(f"'{self.interface.system}' has no constraints")
         arrays, moving = self._given(q, p, velocity, parameters, tables)
         problem = IndexedProblem(self.interface, self._binding, arrays)
         run = IndexedRun(problem, arrays.state, moving, h=0.0, t=checked_number(t, "t"))
@@ -172,9 +172,9 @@ class IndexedStepper:
     def _given(self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any) -> tuple[RunArrays, tuple[Any, str]]:
         """Return the validated arrays of a run, and its initial momenta or velocities with their kind."""
         if velocity is not None and self.interface.momenta:
-            raise StateError("where a Hamiltonian is given, momenta p are the start, not the velocity")
+            raise StateError("the system is defined by a Hamiltonian: give momenta p instead of velocity")
         if p is not None and velocity is not None:
-            raise StateError("give momenta p or the velocity, not both")
+            raise StateError("give either p or velocity, not both")
         moving = (p, "momenta") if velocity is None else (velocity, "velocities")
         return read_arrays(self.interface, q, parameters, tables), moving
 
@@ -305,12 +305,12 @@ def _step_count(h: float | None, steps: int | None, t: float, t_end: float | Non
     """
     if h is not None and t_end is not None:
         if steps is not None:
-            raise StateError(f"the run ends after steps={steps} or at t_end={t_end:g}: give one of the two")
+            raise StateError(f"give either steps={steps} or t_end={t_end:g} with h, not both")
         steps_to(t, t_end, h)  # raises if h has the wrong sign
     elif h is not None and steps is None:
-        raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+        raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
     if h is None and steps is not None:
-        raise StateError("so many steps need their length h; those that choose theirs lead to t_end, alone")
+        raise StateError("steps requires h (fixed step size); give t_end alone for adaptive steps")
     return np.inf if steps is None else checked_count(steps, "steps", least=0)
 
 
@@ -325,12 +325,12 @@ def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal
     """Return the step plan of adaptive steps, ``None`` for fixed steps."""
     if (h is None) == (t_end is None):
         raise StateError(
-            "the step h, for steps of one length, or t_end, for those that choose theirs: give one of them"
+            f"give either h (fixed step size) or t_end (adaptive step size); got {'neither' if h is None else 'both'}"
         )
     if t_end is not None:
         return Goal.checked(t_end, tolerance)
     if tolerance is not None:
-        raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
+        raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
     return None
 
 

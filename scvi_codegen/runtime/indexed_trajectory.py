@@ -89,7 +89,7 @@ class IndexedTrajectory(Confirmed):
             StateError: if states were not saved.
         """
         if len(self.departures) < len(self.t):
-            raise StateError("states of an observed run are not kept: leave out observe, or index t and observed")
+            raise StateError("a run with observe saves no states: omit observe, or index t and observed")
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
             q, p = ({name: each[k].copy() for name, each in part.items()} for part in (self.q, self.p))
@@ -114,7 +114,7 @@ class IndexedTrajectory(Confirmed):
             StepFailedError: if such a step fails.
         """
         if len(self.departures) < len(self.t):
-            raise StateError("states between need all that were kept whole: leave out observe")
+            raise StateError("dense output requires all saved states in full: omit observe")
         return states_between(self.departures, self.t, self.q, self.p, checked_times(t, "t"))
 
     @property
@@ -125,7 +125,7 @@ class IndexedTrajectory(Confirmed):
             StateError: if the system is defined by a Hamiltonian.
         """
         if not self.inverse_masses:
-            raise StateError("where a Hamiltonian is given, a state is positions and momenta: velocities are not known")
+            raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
         return {name: p * self.inverse_masses[name] for name, p in self.p.items()}
 
     def energy(self) -> Numbers:
@@ -247,9 +247,11 @@ class IndexedRecord:
             self.departures.append(Departure.of(self.run))
 
     def _observed(self, given: ArrayLike) -> Numbers:
-        found, when = real_array(given, "what observe returns"), f"at t = {self.run.t:g}"
+        found, when = real_array(given, "the result of observe"), f"at t = {self.run.t:g}"
         if self.observed and found.shape != self.observed[0].shape:
-            raise StateError(f"observe returns the shape {found.shape} {when}, {self.observed[0].shape} at the start")
+            raise StateError(
+                f"the result of observe must keep its shape: {found.shape} {when}, {self.observed[0].shape} before"
+            )
         return found
 
     def trajectory(self) -> IndexedTrajectory:
@@ -279,4 +281,4 @@ class IndexedRecord:
 def check_npz(path: str | os.PathLike[str]) -> None:
     """Raise :class:`StateError` unless the suffix is ``.npz``."""
     if Path(path).suffix.lower() != ".npz":
-        raise StateError(f"trajectories of arrays are saved as .npz, not as {str(path)!r}")
+        raise StateError(f"cannot save a trajectory of arrays as {str(path)!r}: use .npz")

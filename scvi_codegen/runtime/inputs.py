@@ -60,7 +60,7 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
         raise StateError(f"{name} must have shape ({interface.dimension},) for ({names}), not {array.shape}")
     if not np.isfinite(array).all():
         worst = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}: a finite number is wanted")
+        raise StateError(f"{name}[{worst}] ({coordinates[worst]}) is {array[worst]}: it must be finite")
     return array
 
 
@@ -78,9 +78,9 @@ def checked_states(
     count = positions.size // interface.dimension
     times = real_array(t, "the time t")
     if not np.isfinite(times).all():
-        raise StateError("a time t is not finite")
+        raise StateError("the time t must be finite")
     if times.shape not in ((), (count,)):
-        raise StateError(f"there are {count} states, but the time has shape {times.shape}")
+        raise StateError(f"the time t must be one number or {count}, one for each state, not of shape {times.shape}")
     times = np.ascontiguousarray(np.broadcast_to(times, (count,)))
     return times, np.ascontiguousarray(positions), np.ascontiguousarray(momenta)
 
@@ -96,11 +96,13 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
     else:
         given = real_array(parameters, "parameters")
         if given.shape != values.shape:
-            raise StateError(f"there are {len(values)} parameters ({', '.join(names) or 'none'}), not {given.size}")
+            raise StateError(
+                f"parameters must have {len(values)} values ({', '.join(names) or 'none'}), not {given.size}"
+            )
         values = given
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise StateError(f"the parameter {names[worst]} is {values[worst]}")
+        raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")
     return values
 
 
@@ -121,24 +123,23 @@ def check_left_to_inputs(interface: TakesInputs, parameters: Any) -> None:
     """Raise :class:`StateError` if named parameters belong to inputs given as data."""
     for k in columns_of_inputs(interface):
         if isinstance(parameters, Mapping) and (name := interface.parameters[k]) in parameters:
-            raise StateError(f"{name} is a part of the input {name[:-2]}, which is given as data: leave it out")
+            raise StateError(f"the parameter {name} belongs to the input '{name[:-2]}', set by inputs=: omit it")
 
 
 def missing_input(name: str) -> StateError:
     """Return the error for an input that is not set."""
     return StateError(
-        f"the input {name} is not given: stepper.integrate(..., inputs={{'{name}': (t, values)}}) follows data, "
-        f"run.set_inputs({name}=...) holds it between samples, parameters={{'{name}_0': ...}} for good"
+        f"the input '{name}' is not set: pass inputs={{'{name}': (t, values)}} to stepper.integrate, call "
+        f"run.set_inputs({name}=...), or give parameters={{'{name}_0': ...}} for a constant"
     )
 
 
 def no_input(name: str, inputs: Collection[str]) -> StateError:
     """Return the error for an unknown input name."""
     if inputs:
-        return StateError(f"{name!r} is no input of this system, which has {', '.join(inputs)}{closest(name, inputs)}")
+        return StateError(f"{name!r} is not an input; the system has {', '.join(inputs)}{closest(name, inputs)}")
     return StateError(
-        f"{name!r} is no input of this system, which has none: its definition declares them, inputs=['{name}'], beside "
-        f"formulas with {name} in them"
+        f"{name!r} is not an input: the system has none. Declare it by inputs=['{name}'] in the system definition"
     )
 
 
@@ -155,6 +156,6 @@ def parameter_index(interface: Interface, name: str) -> int:
     folded = {parameter.lower(): parameter for parameter in names}
     near = [folded[key] for key in difflib.get_close_matches(str(name).lower(), folded, 1)]
     if not names:
-        raise StateError(f"there is no parameter {name!r}: {interface.system} has none; its definition declares them")
+        raise StateError(f"there is no parameter {name!r}: '{interface.system}' has none. Declare it in its definition")
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise StateError(f"there is no parameter {name!r} among {', '.join(names)}{hint}")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
+from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -114,7 +114,7 @@ class Integrator(LinearisedMethod):
         values = self.binding.pointer(self._parameters(parameters))
         pointers = map(self.binding.pointer, (positions, momenta))
         if self.binding.function("rates")(len(found), *pointers, values, self.binding.pointer(found)):
-            raise StateError("the rate of time, the monitor, is not a positive number at a state")
+            raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
         return found
 
     def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
@@ -160,9 +160,9 @@ class Integrator(LinearisedMethod):
         name = self.coordinates[i]
         raise StateError(
             f"the velocity {name}_dot = {v.ravel()[i]:g} at q = {np.asarray(q)} has no momentum: the mass matrix is "
-            f"singular there in the direction of '{name}', which leaves the motion undetermined; start from a state "
-            f"where the kinetic energy depends on {name}_dot, or choose coordinates that are regular there (Cartesian "
-            "ones in place of polar ones at their origin)"
+            f"singular there in the direction of '{name}', so the motion is undetermined. Start from a state where the "
+            f"kinetic energy depends on {name}_dot, or use coordinates that are regular there (Cartesian instead of "
+            "polar coordinates at the origin)"
         )
 
     def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
@@ -175,7 +175,7 @@ class Integrator(LinearisedMethod):
             return "p", p
         if velocity is not None and p is None:
             return "velocity", velocity
-        raise StateError(f"give p or velocity, {'one' if p is None else 'not both'} of them, beside q")
+        raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
 
     def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
         """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
@@ -200,7 +200,7 @@ class Integrator(LinearisedMethod):
             self.binding.workspace(),
         )
         if status:
-            raise StateError(f"the energy of a state cannot be computed ({STATUS[status]})")
+            raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
         if name := self.interface.energy_parameter:
             result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
         return result
@@ -235,7 +235,7 @@ class Integrator(LinearisedMethod):
             self.binding.pointer(sizes),
         )
         if status:
-            raise StateError(f"the momentum maps of a state cannot be computed ({STATUS[status]})")
+            raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
         return values, sizes
 
     def discrete_lagrangian(
@@ -304,8 +304,8 @@ class Integrator(LinearisedMethod):
         """
         if not self.interface.exchange_names:
             raise MethodError(
-                f"{self.interface.method} keeps no account of forces on {self.interface.system}: SVI, SCVI and Gauss "
-                "methods do, and StoermerVerlet with the solver 'newton', where forces act"
+                f"work and impulses are unavailable for {self.interface.method} and '{self.interface.system}': they "
+                "require forces, and SVI, SCVI, a Gauss method, or StoermerVerlet with solver='newton'"
             )
         check_inputs_given(self.interface, parameters)
         state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
@@ -341,8 +341,8 @@ class Integrator(LinearisedMethod):
     ) -> tuple[Array, Array, float]:
         if not self.interface.has_action:
             raise MethodError(
-                f"{self.interface.method} has no discrete Lagrangian for {self.interface.system}; "
-                "SVI, SCVI and Gauss methods have, where no forces act"
+                f"{self.interface.method} has no discrete Lagrangian for '{self.interface.system}': this requires SVI, "
+                "SCVI or a Gauss method, and no forces"
             )
         check_inputs_given(self.interface, parameters)
         ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
@@ -373,7 +373,7 @@ class Integrator(LinearisedMethod):
         rate = self.rates(q, np.zeros_like(q), values)
         p = self._called(name, t, q, other * rate, values)
         if self.rates(q, p, values) != rate:
-            raise StateError("the rate of time depends on momenta, so that velocities do not give them: give p")
+            raise StateError("dt/dtau depends on the momenta, so velocity does not determine them: give p")
         return p
 
     def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
@@ -387,8 +387,8 @@ class Integrator(LinearisedMethod):
             self.binding.workspace(),
         )
         if status:
-            hint = "; does this Hamiltonian determine momenta by velocities? Give p" if name == "momentum" else ""
-            raise StateError(f"the {name} at q = {q} and {other} cannot be computed ({STATUS[status]}{hint})")
+            hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
         return result
 
     def _vector(self, value: ArrayLike, name: str) -> Array:

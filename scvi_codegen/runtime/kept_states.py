@@ -27,10 +27,10 @@ def checked_row(row: Any, count: int) -> int:
         TypeError: if the index is not a whole number.
     """
     if isinstance(row, bool) or not hasattr(row, "__index__"):
-        raise TypeError(f"states are indexed by whole numbers and slices, as in run[-1] and run[10:], not by {row!r}")
+        raise TypeError(f"the index of a state must be a whole number or a slice (run[-1], run[10:]), not {row!r}")
     number = operator.index(row)
     if not -count <= number < count:
-        raise IndexError(f"there is no state {number} among {count}")
+        raise IndexError(f"the index {number} is out of range: the trajectory has {count} states")
     return number % count
 
 
@@ -38,7 +38,7 @@ def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
     """Return first, end and stride of a slice of ``count`` states; raise IndexError if it is empty or descending."""
     first, last, stride = rows.indices(count)
     if stride < 0 or first >= last:
-        raise IndexError(f"a slice of a trajectory goes forward and holds at least one state, unlike {rows}")
+        raise IndexError(f"a slice of a trajectory must be ascending and not empty, unlike {rows} of {count} states")
     return first, last, stride
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
-from scvi_codegen.native.options import STATUS, SolverOptions, step_failure
+from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
 from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_vector
 
@@ -119,15 +119,15 @@ class LinearisedMethod(CompiledMethod):
     def _check_fixed_steps(self, what: str) -> None:
         """Raise :class:`MethodError` for steppers whose step size is not the fixed h."""
         if self.interface.monitor:
-            raise MethodError(f"{what} has steps of h, not of lengths that a monitor chooses: compile without one")
+            raise MethodError(f"{what} requires fixed steps h: compile the stepper without monitor")
         self._check_physical_time(what)
 
     def _check_physical_time(self, what: str) -> None:
         """Raise :class:`MethodError` in transformed time."""
         if self.interface.energy_parameter:
             raise MethodError(
-                f"{what} is told in the time of the motion, not in transformed time: compile the system itself, for "
-                "steps of h, or with monitor=.. or t_end=.. for runs whose steps have their own lengths"
+                f"{what} is unavailable in transformed time: compile the original system, with fixed steps h, or with "
+                "monitor=... or t_end=..."
             )
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
@@ -144,7 +144,7 @@ class LinearisedMethod(CompiledMethod):
         binding, values = self.tangent, self._parameters_at(q, p, others)
         status = binding.function("level")(*map(binding.pointer, (q, p, values, found)), binding.workspace())
         if status:
-            raise StateError(f"how the energy of q = {q}, p = {p} changes cannot be computed ({STATUS[status]})")
+            raise StateError(f"the energy gradient at q = {q}, p = {p} cannot be computed: {REASONS[status]}")
         return found
 
     def jacobian(

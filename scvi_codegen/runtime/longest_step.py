@@ -62,7 +62,7 @@ def longest_step(
     """
     length, wanted = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0 or not 0.0 <= wanted < 1.0:
-        raise StateError(f"a span of {length:g} with a tolerance of {wanted:g}: the one is not 0, the other in [0, 1)")
+        raise StateError(f"span = {length:g} must not be 0, and tolerance = {wanted:g} must be in [0, 1)")
     check_inputs_given(stepper.interface, parameters)
     monitored, end = bool(stepper.interface.monitor), t + length
     start = partial(stepper.start, q, p, t=t, t_end=end if monitored else None, options=options)
@@ -97,7 +97,7 @@ def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> floa
         else:
             h, found = h / 2.0, pilot(h / 2.0)
     else:
-        raise StateError(f"no step of tau keeps an error of {allowed:.1e}: is the monitor fit for this motion?")
+        raise StateError(f"no step of tau has an error below {allowed:.1e}: use another monitor or a larger tolerance")
     between = (h * 2.0 ** (k / RUNGS) for k in range(RUNGS - 1, 0, -1))
     return next((longest for longest in between if pilot(longest).error <= allowed), h)
 
@@ -113,7 +113,7 @@ def _pilot(run: Run, end: float) -> _Pilot:
         except StepFailedError:
             return _Pilot(math.inf, done + 1)
         if math.isnan(error):
-            raise MethodError(f"{run.stepper.interface.title}: steps have no estimate of their error, give a step h")
+            raise MethodError(f"{run.stepper.interface.title} has no error estimate: give h")
         done = run.steps
     return _Pilot(error, done)
 
@@ -124,6 +124,6 @@ def too_wrong(step_error: float, t: float, tolerance: float) -> str | None:
     if step_error <= ALLOWED * allowed:
         return None
     return (
-        f"the step from t = {t:g} has a relative error of about {step_error:.1e}, where {allowed:.1e} was wanted: the "
-        "monitor does not fit the whole motion, give a shorter step of tau"
+        f"the step from t = {t:g} has a relative error of about {step_error:.1e}, but {allowed:.1e} was requested: "
+        "give a smaller step of tau, or use another monitor"
     )

@@ -60,25 +60,25 @@ class Measurements:
         inputs: Mapping[str, Input],
     ) -> Measurements:
         """Construct from validated arguments of :func:`~scvi_codegen.fit`."""
-        stepper._check_fixed_steps("a motion that is fitted")
+        stepper._check_fixed_steps("fit")
         if stepper.constraints:
-            raise MethodError("motions with constraints are not fitted: an initial state does not vary freely on them")
+            raise MethodError("fit does not support constraints: use independent coordinates")
         times, values = checked_times(t, "t"), real_array(measured, "measured")
         if times.ndim != 1 or not len(times) or (np.diff(times) <= 0.0).any():
-            raise StateError("t is a list of ascending times")
+            raise StateError("t must be a one-dimensional array of ascending times")
         names = distinct(observed or stepper.coordinates, "observed")
         if np.isinf(values).any():
-            raise StateError("a value in measured is infinite: where nothing was measured it is not a number")
+            raise StateError("a value in measured is infinite: use NaN for missing measurements")
         values = values[:, np.newaxis] if values.ndim == 1 and len(names) == 1 else values
         if values.shape != (len(times), len(names)):
             wanted = f"({len(times)}, {len(names)}) for {', '.join(names)}"
-            raise StateError(f"measured has shape {wanted}, not {values.shape}; observed=[..] names its columns")
+            raise StateError(f"measured must have shape {wanted}, not {values.shape}; observed=[..] names its columns")
         sizes = np.ones(len(names)) if deviations is None else real_array(deviations, "deviations")
         if sizes.shape not in ((), (len(names),)) or not ((sizes > 0.0) & np.isfinite(sizes)).all():
-            raise StateError(f"deviations are a positive number, or one for each of {', '.join(names)}")
+            raise StateError(f"deviations must be a positive number, or one for each of {', '.join(names)}")
         first = float(times[0]) if start is None else checked_number(start, "the time start")
         if first > times[0]:
-            raise StateError(f"the initial state, at t = {first:g}, is that before the first measurement")
+            raise StateError(f"start = {first:g} must not be after the first measurement, at t = {times[0]:g}")
         pieces, places = _steps(first, times, checked_step(h), inputs)
         columns = np.array([_column(stepper, name) for name in names])
         sizes = np.broadcast_to(sizes, (len(names),)).copy()

@@ -111,19 +111,19 @@ class Memory(OneThread):
         memory = stepper.binding.new("run *")
         buffer = stepper.binding.buffer(memory)
         if not isinstance(saved, bytes):
-            raise StateError(f"a saved run is bytes, not {type(saved).__name__}")
+            raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
         if len(saved) != len(buffer):
-            raise StateError(f"{len(saved)} bytes are not a saved run of this stepper, which has {len(buffer)}")
+            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
         buffer[:] = saved
         _check_memory(memory)
         if (memory.h == 0.0) != (goal is not None):
             raise StateError(
-                "these bytes are not a saved run of fixed steps: one whose steps choose their length goes on to a t_end"
+                "the saved run has adaptive steps: give t_end"
                 if goal is None
-                else "these bytes are not a saved run whose steps choose their length: one of fixed steps has no t_end"
+                else "the saved run has fixed steps: omit t_end"
             )
         if not stepper._has_energy(parameters):
-            raise StateError("a saved run in transformed time goes on with its own energy: give its run.parameters")
+            raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
         values, awaited = (
             checked_parameters(stepper.interface, parameters),
             inputs_not_given(stepper.interface, parameters),
@@ -345,4 +345,4 @@ def _check_memory(memory: Any) -> None:
     rungs = {name: getattr(memory, name) for name in RUNGS if hasattr(memory, name)}
     sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
     if not sound or memory.guess > 2 or any(abs(rung) > MOST_RUNGS for rung in rungs.values()):
-        raise StateError(f"these bytes are not a saved run: h = {memory.h:g}, {counts | rungs}")
+        raise StateError(f"invalid saved run: h = {memory.h:g}, {counts | rungs}")

@@ -99,7 +99,7 @@ class NearbyMotions(KeptStates):
             StateError: if the run has no steps, a shape is another, or the states are not at whole steps.
         """
         if len(self) < 2:
-            raise StateError("what nearby motions do takes a time that passes: this run has no steps")
+            raise StateError("deviations require a run of at least one step")
         return along(self, Changes.checked(self.stepper, count, directions))
 
     @takes(StateError, history=SWITCH)

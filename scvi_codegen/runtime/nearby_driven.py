@@ -124,7 +124,7 @@ class NearbyDrivenMotions:
         """Return (k, given) initial variations; raise ``StateError`` if they vary inputs or h."""
         changes = changes_of(self._stepper, directions)
         if changes[:, [*self._columns, -1]].any():
-            raise StateError("inputs and the lengths of steps are data of a driven run: directions are 0 there")
+            raise StateError("directions must be 0 for the parameters of inputs and for h, which are fixed with inputs")
         return changes
 
     def _back(self, along: Array) -> list[tuple[KeptStates, Array]]:

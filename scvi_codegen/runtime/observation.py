@@ -215,8 +215,8 @@ def observed_until(
     """Return the trajectory of a run with fixed steps to t_end, with the requested output."""
     end = checked_number(t_end, "the time t_end")
     if steps is not None:
-        raise StateError(f"the run ends after steps={steps} or at t_end={end:g}: give one of the two")
+        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
     if (end - run.t) * run.h < 0.0:
-        raise StateError(f"steps of h = {run.h:g} do not lead from t = {run.t:g} to t_end = {end:g}")
+        raise StateError(f"h = {run.h:g} has the wrong sign for a run from t = {run.t:g} to t_end = {end:g}")
     times = None if t_eval is None else times_of_run(t_eval, run.t, end)
     return Observation(run, save_every=save_every, times=times, end=end).advance(None, progress)

@@ -18,8 +18,8 @@ Called = TypeVar("Called", bound=Callable[..., Any])
 def in_use() -> StateError:
     """Return the error for a second thread."""
     return StateError(
-        "this run is being used by another thread: a run belongs to one thread at a time. Start a run for each thread "
-        "(stepper.start(...), copy.copy(run)); the stepper itself may be shared"
+        "this run is in use by another thread: only one thread may use a run at a time. Start a run for each thread "
+        "(stepper.start(...), copy.copy(run)); the stepper may be shared"
     )
 
 

@@ -150,19 +150,21 @@ class _OrbitSearch:
     ) -> _OrbitSearch:
         """Construct from validated arguments of :func:`periodic_orbit`."""
         interface, names = stepper.interface, state_names(stepper)
-        stepper._check_fixed_steps("a periodic orbit")
+        stepper._check_fixed_steps("periodic_orbit")
         check_inputs_given(interface, parameters)
         if interface.constraints:
-            raise MethodError("periodic orbits are found without constraints: take coordinates that need none")
+            raise MethodError("periodic_orbit does not support constraints: use independent coordinates")
         if energy is not None and interface.exchange_names:
-            raise MethodError(f"forces act on '{interface.system}', so an orbit has no energy to be given")
+            raise MethodError(f"energy cannot be prescribed, because forces act on '{interface.system}': omit energy")
         if (period := checked_number(period, "the period")) <= 0.0:
-            raise StateError(f"a period is positive, not {period:g}")
+            raise StateError(f"the period must be positive, not {period:g}")
         if (steps is None) == (h is None):
-            raise StateError("the number of steps of a period, or h, the longest of them: give one of them")
+            raise StateError(
+                f"give either steps (of a period) or h (largest); got {'neither' if h is None else 'both'}"
+            )
         for name in fixed:
             if name not in names:
-                raise StateError(f"the state has no '{name}' to keep fixed{closest(name, names)}")
+                raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
         return cls(
             stepper=stepper,
             period=period,
@@ -188,7 +190,7 @@ class _OrbitSearch:
             )
         self._check_energy(found, allowed * size)
         if np.linalg.norm(motion.by_period) * z[-1] <= RESTING * size:
-            raise OrbitError("the iteration ended in a state at rest, which every period closes: give a nearer guess")
+            raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
         if motion.by_time.any():
             self._check_repeats(z, found, allowed * size)
         return PeriodicOrbit(
@@ -242,8 +244,8 @@ class _OrbitSearch:
         away, slopes = float(found.defects[-1]), found.slopes[-1]
         if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
             raise OrbitError(
-                f"the orbit that closes near here has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
-                "fix fewer components of the state, or give a nearer guess"
+                f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
+                "fix fewer entries of the state, or give a better initial guess"
             )
 
     def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:
@@ -251,15 +253,15 @@ class _OrbitSearch:
         period = float(z[-1])
         if -1 not in self.held:
             raise MethodError(
-                f"'{self.stepper.interface.system}' depends on time, and orbits close after a period of what it "
-                "depends on: give that as period, with fixed_period=True"
+                f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
+                "with fixed_period=True"
             )
         later = replace(self, t=self.t + period)._closing(z)
         away = max(float(np.abs(later.motion.states[-1] - found.motion.states[-1]).max()), later.error)
         if not away <= allowed:
             raise OrbitError(
-                f"what closes from t = {self.t:g} ends {away:.1e} from there after another period: what "
-                f"'{self.stepper.interface.system}' depends on is not the same {period:.10g} later"
+                f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
+                f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
             )
 
     def _nearer(self, z: Array, found: _Closing) -> tuple[Array, _Closing] | None:

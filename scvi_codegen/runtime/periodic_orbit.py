@@ -100,7 +100,9 @@ class PeriodicOrbit:
             MethodError: if the steps are not symplectic.
         """
         if self.symplectic_error > SYMPLECTIC:
-            raise MethodError(f"multipliers are no pairs: the steps of '{self.stepper.title}' are not symplectic here")
+            raise MethodError(
+                f"stability indices are undefined: steps of '{self.stepper.title}' are not symplectic; use multipliers"
+            )
         left = list(np.linalg.eigvals(self.monodromy + _inverse(self.monodromy)).astype(complex) / 2.0)
         indices = []
         while left:

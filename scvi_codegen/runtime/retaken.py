@@ -52,10 +52,10 @@ def retaken(
 def steps_between(length: float, span: float) -> int:
     """Return the number of steps in a span; 1 for a last, shorter step."""
     if np.isnan(length):
-        raise StateError("this is known of whole steps: integrate without t_eval, and with save_every=1")
+        raise StateError("this requires states at whole steps: integrate without t_eval and with save_every=1")
     count = int(whole_steps(np.array([span]), np.array([length]), slack=ON_GRID)[0])
     if count > 1 and abs(span - count * length) > ON_GRID * abs(length):
-        raise StateError("this is known of whole steps: keep all states (save_every=1)")
+        raise StateError("this requires states at whole steps: save all states (save_every=1)")
     return max(1, count)
 
 
@@ -77,7 +77,7 @@ def refuse_strays(t: Array, found: Array, known: Array, before: Array) -> None:
     strays = rows[~(np.abs(apart[rows]).max(axis=1) <= SAME_STATE * sizes)]
     if strays.size:
         raise StateError(
-            f"what begins at t = {t[strays[0]]:g}, taken again, does not lead where it led in the run: the equations "
-            "of a step have several solutions (take shorter steps), or the motion is too sensitive between the kept "
-            "states (keep all, save_every=1)"
+            f"the steps from t = {t[strays[0]]:g}, computed again, end in another state than in the run: the stage "
+            "equations have several solutions (use a smaller step size), or the motion is too sensitive between saved "
+            "states (use save_every=1)"
         )

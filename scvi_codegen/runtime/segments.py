@@ -231,7 +231,7 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
         near = jump < NEAR and moved < NEAR
         part = 1.0 if near else _part_of(whole, x, update, 2.0 * float(np.abs(multipliers).max()))
         x = np.clip(x + part * update, low, high)
-    raise FitError(f"the segments do not join within {MOST} iterations: give a nearer first guess, or more of them")
+    raise FitError(f"the segments do not join within {MOST} iterations: give a better initial guess, or more segments")
 
 
 def _within(slopes: Array, found: Array, rows: int, limits: Limits) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -277,8 +277,8 @@ def _part_of(chain: Chain, x: Array, update: Array, weight: float) -> float:
         part /= 2.0
         if part < LEAST_PART:
             raise FitError(
-                "the segments do not come to join: give a nearer first guess, or more of them, or take as known what "
-                "fewer unknowns show the measurements not to tell"
+                "the segments do not join, as no step reduces the residuals: give a better initial guess or more "
+                "segments, or treat poorly determined parameters as known"
             )
     return part
 

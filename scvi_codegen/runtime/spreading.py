@@ -57,17 +57,17 @@ class Changes:
         """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
         size = 2 * stepper.dimension
         if directions is None:
-            wanted = None if count is None else checked_count(count, "the number of changes", least=1, most=size)
+            wanted = None if count is None else checked_count(count, "count", least=1, most=size)
             return cls(stepper, wanted, None)
         given = real_array(directions, "directions")
         columns = given[:, np.newaxis] if given.ndim == 1 else given
         if columns.ndim != 2 or len(columns) != size or not 0 < columns.shape[1] <= size:
-            raise StateError(f"directions have shape ({size},) or ({size}, k), k <= {size}, not {given.shape}")
+            raise StateError(f"directions must have shape ({size},) or ({size}, k), k <= {size}, not {given.shape}")
         if count is not None:
-            raise StateError("a number of changes, or directions: give one of them")
+            raise StateError("give either count or directions, not both")
         lengths = np.linalg.norm(columns, axis=0)
         if not np.isfinite(lengths).all() or not lengths.all():
-            raise StateError("directions are finite, and not 0")
+            raise StateError("directions must be finite and not 0")
         return cls(stepper, None, columns / lengths)
 
     def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
@@ -81,10 +81,10 @@ class Changes:
         frame = allowed[:, sizes > NOTHING * sizes[0]]
         if given is not None:
             if np.abs(given - frame @ (frame.T @ given)).max() > OFF:
-                raise StateError("directions change a state to one that the constraints do not allow")
+                raise StateError("directions must be tangent to the constraints")
             return given
         if self.count is not None and self.count > frame.shape[1]:
-            raise StateError(f"constraints leave {frame.shape[1]} independent changes of the state, not {self.count}")
+            raise StateError(f"count={self.count} exceeds the {frame.shape[1]} directions that the constraints allow")
         mixed, _ = np.linalg.qr(np.random.default_rng(SEED).normal(size=2 * frame.shape[1:]))
         changes: Array = (frame @ mixed)[:, : self.count]
         return changes
@@ -105,7 +105,7 @@ def along(states: KeptStates, changes: Changes) -> ChaosIndicators:
     def carried(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
         carry(states, steps, numbers, vectors, back=False)
 
-    states.stepper._check_physical_time("what nearby motions do")
+    states.stepper._check_physical_time("the growth of tangent vectors")
     first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
     spreading = _Spreading(changes.at(*first, states.parameters, states.options), states.stepper._input_size, states.t)
     spreading.follow((starts_of(states, first, last) for first, last in pieces(states)), carried)

@@ -47,7 +47,7 @@ class Watch:
         self.slow = self.slow + steps if pace < SLOW * self.best and left > MOST_STEPS * pace else 0
         if self.slow < ENOUGH:
             return None
-        return _halt(self.stepper, t, number, f"{steps} steps took {passed:.1e} of it, {left:.3g} is left")
+        return _halt(self.stepper, t, number, f"{steps} steps advanced t by {passed:.1e}, {left:.3g} is left")
 
 
 def lost_level(states: Trajectory, longest: float) -> StepFailedError | None:
@@ -67,7 +67,7 @@ def lost_level(states: Trajectory, longest: float) -> StepFailedError | None:
     if not len(wrong):
         return None
     first = int(wrong[0])
-    evidence = f"there the energy is {energies[first]:g}, not {level:g}"
+    evidence = f"the energy there is {energies[first]:g}, not {level:g}"
     return _halt(stepper, float(states.t[short][first]), states.steps - len(states) + 1 + int(short[first]), evidence)
 
 

@@ -45,9 +45,9 @@ def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited
         tau: whether steps are of transformed time.
         awaited: inputs that are not set.
     """
-    goal = "" if run.goal is None else f" on the way to {run.goal.t_end:g}"
+    goal = "" if run.goal is None else f", t_end = {run.goal.t_end:g}"
     solved = f", solver {solver}" if solver else ""
-    waits = f", waits for {', '.join(awaited)}" if awaited else ""
+    waits = f", inputs not set: {', '.join(awaited)}" if awaited else ""
     steps = f"{run.steps} steps{lengths_of(run.h, run.goal, tau=tau)}"
     return f"<{type(run).__name__} of {title}; t = {run.t:g} after {steps}{goal}{solved}{waits}>"
 
@@ -62,4 +62,4 @@ def lengths_of(h: float, goal: Goal | None, *, tau: bool) -> str:
     """Describe the step size of a run."""
     if goal is None:
         return f" of {h:g}{' in tau' * tau}"
-    return f" of {goal.tau:g} in tau" if goal.tau else " of their own lengths"
+    return f" of {goal.tau:g} in tau" if goal.tau else " of adaptive size"

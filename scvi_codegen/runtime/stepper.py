@@ -141,10 +141,10 @@ class Stepper(Ensembles):
         """
         stepper = self if events is None else self.with_events(events)
         if t_eval is not None and save_every != 1:
-            raise StateError(f"states are kept at t_eval or every so many steps (save_every={save_every}), not both")
+            raise StateError(f"give either t_eval or save_every={save_every}, not both")
         data = None if inputs is None else checked_inputs(self.interface, inputs)
         if data is not None and t_eval is not None:
-            raise StateError("states of runs with inputs are kept at their steps: leave out t_eval")
+            raise StateError("t_eval is not supported with inputs: omit t_eval")
         common: dict[str, Any] = {"t": t, "options": options}
         if error is not None:
             return confirmed_run(
@@ -199,16 +199,17 @@ class Stepper(Ensembles):
             goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
             return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
-            raise StateError("in transformed time steps of tau have one length: give h")
+            raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
         if t_end is not None and h is None:
             goal = Goal.checked(t_end, tolerance)
             return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
         if t_end is not None or h is None:
             raise StateError(
-                "the step h, for steps of one length, or t_end, for steps that choose theirs: give one of them"
+                "give either h (fixed step size) or t_end (adaptive step size); got "
+                f"{'neither' if h is None else 'both'}"
             )
         if tolerance is not None:
-            raise StateError("a tolerance is for steps that choose their length: give t_end instead of h and steps")
+            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
         return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
 
     def from_checkpoint(
@@ -229,7 +230,7 @@ class Stepper(Ensembles):
             goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
             return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, goal=goal)
         if h is not None:
-            raise StateError("the bytes of a run hold its h: leave it out")
+            raise StateError("omit h: the saved run contains its step size")
         if t_end is None:
             return Run.restored(self, saved, parameters=parameters, options=options)
         goal = Goal.checked(t_end, tolerance)
@@ -261,7 +262,7 @@ def _recorded(
             warn_of_long_steps(found)
         return found
     if clocked:
-        raise StateError("the time of so many steps of tau is not known before: with t_eval give t_end, not steps")
+        raise StateError("t_eval requires t_end instead of steps in transformed time")
     times = times_of_run(t_eval, run.t, _end_of(run, steps))
     return _said(Observation(run, times=times).advance(steps, progress))
 
@@ -269,9 +270,9 @@ def _recorded(
 def _check_number(run: Run, steps: int | None) -> None:
     """Raise ``StateError`` for fixed steps without their number, and for adaptive steps with one."""
     if run.goal is None and steps is None:
-        raise StateError("steps of h need their number: give steps, or t_end for steps that choose their length")
+        raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
     if run.goal is not None and steps is not None:
-        raise StateError(f"steps that choose their length go to t_end={run.goal.t_end:g}: leave out steps={steps}")
+        raise StateError(f"adaptive steps end at t_end={run.goal.t_end:g}: omit steps={steps}, or give h and steps")
 
 
 def _said(trajectory: Trajectory) -> Trajectory:

@@ -39,7 +39,7 @@ def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
     with np.errstate(over="ignore"):
         counts = np.maximum(1.0, np.ceil(np.asarray(spans) / abs(h) - WHOLE))
     if not counts.sum() <= MOST_STEPS:
-        raise StateError(f"steps of h = {h:g} would be {counts.sum():.0e} of them: give a longer one")
+        raise StateError(f"h = {h:g} requires {counts.sum():.0e} steps: give a larger h")
     return counts.astype(np.intp)
 
 
@@ -51,9 +51,9 @@ def steps_to(t: float, t_end: float, h: float) -> int | None:
     """
     span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
     if span < 0.0:
-        raise StateError(f"steps of h = {h:g} do not lead from t = {t:g} to t_end = {t_end:g}: give h the other sign")
+        raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {t_end:g}: use h = {-h:g}")
     if not span <= MOST_STEPS:
-        raise StateError(f"steps of h = {h:g} from t = {t:g} to t_end = {t_end:g} are {span:.0e}: give a larger h")
+        raise StateError(f"h = {h:g} requires {span:.0e} steps from t = {t:g} to t_end = {t_end:g}: give a larger h")
     return round(span) if abs(span - round(span)) <= WHOLE else None
 
 

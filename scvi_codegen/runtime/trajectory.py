@@ -216,7 +216,7 @@ class Trajectory(NearbyMotions, Confirmed):
             events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
         """
         if not (asked := as_events(events)):
-            raise EventError("events to look for are wanted, as 'q' or Event('q', direction=1)")
+            raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
         return crossings_of(self.stepper.with_events(asked), self)
 
     def _repr_html_(self) -> str:
@@ -239,14 +239,14 @@ class Trajectory(NearbyMotions, Confirmed):
 
     def _steps(self) -> str:
         if self.goal:
-            return f"{self.steps} steps of their own lengths, {self.rejected_steps} rejected"
+            return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
         return f"h = {self.h:g}"
 
     def _worst(self) -> str:
         if math.isnan(self.step_error):
-            return "not known: nothing tells it here"
+            return "unknown: the method has no error estimate here"
         said = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
-        return f"{said}; too long" if self.step_error > TOLERABLE_ERROR else said
+        return f"{said}; h is too large" if self.step_error > TOLERABLE_ERROR else said
 
     def _energies(self, save_every: int) -> Array | None:
         """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""

@@ -61,7 +61,7 @@ def chunk_paths(folder: Path) -> list[Path]:
     numbers = sorted(int(match[1]) for path in folder.iterdir() if (match := NAME.fullmatch(path.name)))
     for expected, number in enumerate(numbers):
         if number != expected:
-            raise RecordingError(f"'{chunk_path(folder, expected)}' is missing: the files after it are not continued")
+            raise RecordingError(f"'{chunk_path(folder, expected)}' is missing: restore it, later files depend on it")
     return [chunk_path(folder, number) for number in numbers]
 
 

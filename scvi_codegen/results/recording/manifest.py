@@ -202,7 +202,7 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         return Manifest.from_json(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise RecordingError(f"'{folder}' holds no recorded run: there is no file '{path}'") from error
+        raise RecordingError(f"'{folder}' contains no recorded run: there is no file '{path}'") from error
     except OSError as error:
         raise RecordingError(f"'{path}' cannot be read: {error.strerror or error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:

@@ -63,7 +63,7 @@ class RecordedRun:
         except OSError as error:
             raise RecordingError(f"'{folder}' cannot be read: {error.strerror or error}") from error
         if not self._paths:
-            raise RecordingError(f"'{folder}' holds no states, not even the first: record it again")
+            raise RecordingError(f"'{folder}' contains no states, not even the first: record the run again")
         self._last = self._read(self._paths[-1])
         self._recent: tuple[tuple[int, Piece], ...] = ()
         self.t, self.q, self.p, self.iterations = (LazyArray(self, i) for i in range(len(COLUMNS)))
@@ -155,7 +155,7 @@ class RecordedRun:
         """Read a file that is followed by others."""
         chunk = self._read(path)
         if len(chunk) != self.manifest.rows:
-            raise RecordingError(f"'{path}' has {len(chunk)} states, and the manifest says {self.manifest.rows}")
+            raise RecordingError(f"'{path}' has {len(chunk)} states, but the manifest requires {self.manifest.rows}")
         return chunk.piece
 
     def piece(self, number: int) -> Piece:
@@ -174,13 +174,13 @@ class RecordedRun:
         numbers = np.asarray(rows)
         if numbers.dtype == bool:
             if numbers.shape != (len(self),):
-                raise IndexError(f"there are {len(self)} rows, but truth values of shape {numbers.shape}")
+                raise IndexError(f"a boolean mask of rows must have shape ({len(self)},), not {numbers.shape}")
             return np.flatnonzero(numbers)
         if not np.issubdtype(numbers.dtype, np.integer) and numbers.size:
-            raise IndexError(f"rows are chosen by numbers, slices or truth values, not by {rows!r}")
+            raise IndexError(f"rows must be whole numbers, a slice or a boolean mask, not {rows!r}")
         outside = (numbers < -len(self)) | (numbers >= len(self))
         if outside.any():
-            raise IndexError(f"there is no row {int(numbers[outside].flat[0])} among {len(self)}")
+            raise IndexError(f"the row {int(numbers[outside].flat[0])} is out of range: the run has {len(self)} states")
         return np.where(numbers < 0, numbers + len(self), numbers).astype(np.int64)
 
     def gather(self, rows: NDArray[np.int64], columns: Sequence[int]) -> list[NDArray[Any]]:
@@ -299,7 +299,7 @@ class LazyArray:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
         if copy is False:
-            raise ValueError("the states are in files: they cannot be an array without a copy")
+            raise ValueError("the states are in files: an array of them requires a copy")
         return np.asarray(self[:], dtype=dtype)
 
     def __getitem__(self, index: Any) -> Any:

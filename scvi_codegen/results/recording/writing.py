@@ -85,7 +85,7 @@ def record_run(
     """
     target = Path(folder)
     if run.steps:
-        raise StateError(f"a run is recorded from its start, but this one has {run.steps} steps: start another")
+        raise StateError(f"record_run requires a run at its start, but this run has {run.steps} steps: start a new one")
     _check_inputs(run)
     check_flags(run.stepper.flags, StateError)
     manifest = Manifest(
@@ -277,10 +277,10 @@ class _Recorder:
     def _where_it_stands(self, error: OSError) -> str:
         problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
         if self.written < 0:
-            return f"{problem}; nothing was recorded"
+            return f"{problem}. Nothing was recorded"
         return (
-            f"{problem}. It holds the run whole up to step {self.written} (t = {self.written_t:g}); "
-            f"{self.run.steps - self.written} steps done since are not in it. Once it can be written, go on with "
+            f"{problem}. It contains the run up to step {self.written} (t = {self.written_t:g}); "
+            f"{self.run.steps - self.written} later steps are not saved. When it can be written, continue with "
             f"'scvi-codegen run --resume {shlex.quote(str(self.folder))}' or resume_run"
         )
 
@@ -291,8 +291,8 @@ def _check_inputs(run: Run) -> None:
         run.check_inputs()
     except StateError as error:
         raise StateError(
-            f"{error}. A folder records a run whose inputs are held at numbers; one that follows data is kept in "
-            "memory and written to a file: stepper.integrate(..., inputs=...).save('run.npz')"
+            f"{error}. record_run supports only constant inputs; for inputs given as data use "
+            "stepper.integrate(..., inputs=...).save('run.npz')"
         ) from error
 
 
@@ -301,7 +301,7 @@ def _checked_steps(run: Run, steps: int | None) -> int | None:
     if run.goal is None:
         return checked_count(steps, "steps", least=0)
     if steps is not None:
-        raise StateError(f"steps that choose their length go to t_end={run.goal.t_end:g}: leave out steps={steps}")
+        raise StateError(f"adaptive steps end at t_end={run.goal.t_end:g}: omit steps={steps}")
     return None
 
 
@@ -309,13 +309,13 @@ def _further(manifest: Manifest, run: Run, steps: int | None, t_end: float | Non
     """Return the manifest and the step plan of a run with a new end."""
     if run.goal is None:
         if t_end is not None:
-            raise StateError(f"this run makes steps of h = {run.h:g}: give their number, steps, and no t_end")
+            raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
         wanted = manifest.steps if steps is None else steps
         return replace(manifest, steps=checked_count(wanted, "steps", least=0)), None
     _checked_steps(run, steps)
     goal = run.goal if t_end is None else replace(run.goal, t_end=checked_number(t_end, "t_end"))
     if (goal.t_end - run.t) * (run.goal.t_end - manifest.t) < 0.0:
-        raise StateError(f"the run stands at t = {run.t:g} already, beyond t_end = {goal.t_end:g}")
+        raise StateError(f"the run is at t = {run.t:g}, already beyond t_end = {goal.t_end:g}: give a later t_end")
     return replace(manifest, goal=goal), goal
 
 
@@ -326,7 +326,7 @@ def _piece(trajectory: Trajectory, first: int) -> Piece:
 
 def _pace(seconds: float, steps: int | None) -> tuple[float, int | None]:
     if not seconds >= 0.0:
-        raise StateError(f"checkpoint_seconds must be a number of seconds, not {seconds!r}")
+        raise StateError(f"checkpoint_seconds must be at least 0, not {seconds!r}")
     return seconds, None if steps is None else checked_count(steps, "checkpoint_steps", least=1)
 
 
@@ -348,7 +348,7 @@ def _prepare(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     if (folder / MANIFEST).exists():
         raise RecordingError(
-            f"'{folder}' holds a run already: go on with it ('scvi-codegen run --resume "
+            f"'{folder}' already contains a run: continue it ('scvi-codegen run --resume "
             f"{shlex.quote(str(folder))}', resume_run), or choose another folder"
         )
     own = {*chunk_paths(folder), *unfinished(folder), folder / LOCK}
@@ -360,7 +360,7 @@ def _prepare(folder: Path) -> None:
 def _clear(folder: Path) -> None:
     """Remove the files of a process that was killed before it wrote a manifest."""
     if (folder / MANIFEST).exists():
-        raise RecordingError(f"'{folder}' was given a run by another process just now: choose another folder")
+        raise RecordingError(f"another process has just started a run in '{folder}': choose another folder")
     _remove([*chunk_paths(folder), *unfinished(folder)])
 
 
@@ -392,8 +392,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _warn_of_another_build(before: Build, now: Build) -> None:
     warn(
-        f"from step {now.step} on other code runs than before ({now.compiler}; before: {before.compiler}): another "
-        "compiler, processor or Python. States may differ in the last bits from those of a run that was never "
-        "interrupted; the manifest keeps this",
+        f"from step {now.step} on another build is used ({now.compiler}; before: {before.compiler}): another compiler, "
+        "processor or Python. States may differ in the last bits from those of an uninterrupted run; the manifest "
+        "records this",
         RecordingWarning,
     )
