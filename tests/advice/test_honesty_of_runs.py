@@ -38,10 +38,12 @@ def run(words: str) -> Result:
 
 class TestLongSteps:
     def test_the_worst_is_named_with_what_to_do(self, kepler):
-        with pytest.warns(sc.AccuracyWarning, match=r"step from t = \S+ with h = 1 is too long.*t_end= with a tol"):
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"h = 1 is too large: .* step from t = \S+ is about .*t_end= without h"
+        ):
             trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=1.0, steps=10)
         assert trajectory.step_error > 1e-3
-        assert "too long" in trajectory._repr_html_()
+        assert "too large" in trajectory._repr_html_()
 
     def test_short_ones_are_not(self, kepler):
         assert kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.05, steps=100).step_error < 1e-3
@@ -101,20 +103,20 @@ class TestLongSteps:
         blow = sc.LagrangianSystem.from_text(
             name="blow", coordinates=["x"], lagrangian="x_dot**2/2 + x*exp(-(t/0.03)**2)"
         )
-        with pytest.warns(sc.AccuracyWarning, match="from t = 0 with h = 0.1 is too long"):
+        with pytest.warns(sc.AccuracyWarning, match="h = 0.1 is too large: .* from t = 0 is"):
             run = sc.compile_stepper(blow, method).integrate([0.0], [0.0], h=0.1, steps=200)
         assert abs(run.p[-1, 0] / (0.03 * math.sqrt(math.pi) / 2) - 1.0) > 1e-3
 
     @pytest.mark.parametrize("steps", [3, 30])
     def test_a_motion_that_grows_from_the_origin_by_steps_too_long_is_said(self, steps):
         unstable = sc.LagrangianSystem.from_text(name="unstable", coordinates=["x"], lagrangian="x_dot**2/2 + x**2/2")
-        with pytest.warns(sc.AccuracyWarning, match="too long"):
+        with pytest.warns(sc.AccuracyWarning, match="too large"):
             sc.compile_stepper(unstable, "svi:1").integrate([0.0], [1e-6], h=1.0, steps=steps)
 
     def test_a_near_meeting_of_bodies_from_far_is_said(self):
         """There positions are a fortieth of those before; momenta are the largest of all."""
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
-        with pytest.warns(sc.AccuracyWarning, match="from t = 3.14 with h = 0.02 is too long"):
+        with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
 
     @pytest.mark.filterwarnings("error")
@@ -133,7 +135,7 @@ class TestLongSteps:
         verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
         trajectory = verlet.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=3)
         assert math.isnan(trajectory.step_error)
-        assert "not known" in trajectory._repr_html_()
+        assert "unknown: the method has no error estimate" in trajectory._repr_html_()
         assert "largest local error: unknown" in run("kepler --method stoermer-verlet --step 0.1 --steps 3").output
 
 
@@ -177,7 +179,9 @@ def pair():
 class TestLostEnergy:
     def test_of_a_near_collision_is_said(self, kepler):
         """Each step keeps its tolerance; at the pericentre, 5e-7 from the centre, the speed is a thousandfold."""
-        with pytest.warns(sc.AccuracyWarning, match=r"energy went from -1 to \S+ though each step.*smaller tolerance"):
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"energy changed from -1 to \S+ although every step.*Reduce the tolerance"
+        ):
             far = kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0, tolerance=1e-6)
         energy = far.energy()
         assert abs(energy[-1] - energy[0]) > 1e-3
@@ -195,19 +199,21 @@ class TestLostEnergy:
     def test_of_a_trajectory_of_many_is_said(self, kepler):
         """Of the one whose orbit is nearly a line; the other keeps its energy."""
         starts = [[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1e-3]]
-        with pytest.warns(sc.AccuracyWarning, match=r"energy of trajectory 1 went from -1 to \S+ though each step"):
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"energy of trajectory 1 changed from -1 to \S+ although every step"
+        ):
             kepler.integrate_ensemble(*starts, t_end=3.0, tolerance=1e-6)
 
     @pytest.mark.parametrize(
         ("method", "steps", "message"),
         [
-            ("svi:8", {"t_end": 4.0, "tolerance": 1e-6}, "though each step was as accurate"),
-            ("stoermer-verlet", {"h": 0.01, "steps": 400}, "though the motion conserves it.* shorter h"),
+            ("svi:8", {"t_end": 4.0, "tolerance": 1e-6}, "although every step met the tolerance"),
+            ("stoermer-verlet", {"h": 0.01, "steps": 400}, "although the system conserves it.* Reduce h"),
         ],
     )
     def test_of_sums_over_indices_is_said(self, pair, method, steps, message):
         """Two bodies that fall onto each other: the step jumps over where they meet."""
-        with pytest.warns(sc.AccuracyWarning, match=rf"energy went from -0.5\d* to \S+ {message}"):
+        with pytest.warns(sc.AccuracyWarning, match=rf"energy changed from -0.5\d* to \S+ {message}"):
             run = sc.compile_indexed(pair, method).integrate([[-0.987, 0.0], [1.0, 0.0]], **steps)
         assert abs(run.energy()[-1] - run.energy()[0]) > 10
 
@@ -306,7 +312,7 @@ class TestKnownDigits:
         error = np.abs(trajectory.q[-1] - [math.cos(t), math.sin(t)])
         assert np.all(error <= 1.01 * known.q + 1e-14)
         assert np.all(known.q < 100.0 * np.linalg.norm(error))
-        assert not known.chaotic
+        assert unknown: the method has no error estimate.chaotic
 
     def test_chaos_is_seen(self):
         problem = sc.problem("double-pendulum")

@@ -89,7 +89,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
         (["--input", "v=u.csv"], "'v' is not an input of 'pushed pendulum', whose inputs are u"),
         (["--input", "u=u.csv:quintic"], "constant or linear or cubic"),
         (["--input", "u=none.csv"], "none.csv: it cannot be read"),
-        (["--span", "4"], "the input u is given from t = 0 to 3; the run is from 0 to 4"),
+        (["--span", "4"], "the input 'u' covers t = 0 to 3, but the run goes from 0 to 4"),
         (["-o", "long.run"], "-o NAME.npz"),
         (["--advise", "1e-9"], "use --tolerance"),
         (["--parameter", "u_0=1"], "no parameter 'u_0'"),

@@ -112,7 +112,7 @@ def test_a_run_that_fails_tells_how_far_it_came():
     assert "step" in found["failure"]
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
     far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
-    assert "monitor does not fit" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["broken"]
+    assert "use another monitor" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["broken"]
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
 
 

@@ -246,7 +246,7 @@ def test_what_there_is_not_is_refused():
     with pytest.raises(MethodError, match="monitor"):
         jax_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
     clocked = compile_stepper(reparametrise(problem("kepler").system, "q1**2 + q2**2"), SVI(2))
-    with pytest.raises(MethodError, match="a flow is told in the time of the motion"):
+    with pytest.raises(MethodError, match="a flow is unavailable in transformed time"):
         jax_flow(clocked, steps=3)(q, p, h=H)
 
 

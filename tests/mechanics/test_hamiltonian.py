@@ -261,7 +261,7 @@ def test_methods_that_need_a_lagrangian_say_so(method) -> None:
 def test_a_singular_hamiltonian_has_no_momenta_of_velocities_and_no_discrete_lagrangian() -> None:
     stepper = compile_stepper(hyperbolic(), SVI(2), flags=QUICK)
     assert stepper.velocity([2.0], [5.0]) == 2.0
-    with pytest.raises(StateError, match="Give p"):
+    with pytest.raises(StateError, match="give p instead of velocity"):
         stepper.momentum([1.0], [1.0])
     with pytest.raises(MethodError, match="no discrete Lagrangian"):
         stepper.discrete_lagrangian([1.0], [1.1], 0.1)

@@ -129,7 +129,7 @@ def test_one_file_holds_several_inputs(file):
         ("t,u\n0,0\n1,inf\n", "line 3, u: inf is not a finite number"),
         ("time,u\n0,0\n1,1\n", "no column t among time, u"),
         ("t,a,b\n0,0,0\n1,1,1\n", "no column u or value among t, a, b"),
-        ("t,u\n0,0\n", "the input u has times of shape"),
+        ("t,u\n0,0\n", "the input 'u' must have equally many times and values"),
         ("t,u\n", "at least one line of numbers"),
     ],
 )
@@ -172,7 +172,7 @@ def test_what_is_said_of_a_file_that_is_none(file):
         ('{ kind = "linear" }', "must have either file, or t and values"),
         ("{ t = [0.0, 1.0] }", "u values must be a list of numbers"),
         ('{ t = [0.0, 1.0], values = [0.0, "a"] }', r"values\[1\] must be a number"),
-        ("{ t = [0.0, 1.0, 0.5], values = [0.0, 1.0, 1.0] }", "do not ascend: 0.5 after 1"),
+        ("{ t = [0.0, 1.0, 0.5], values = [0.0, 1.0, 1.0] }", "must be ascending: 0.5 follows 1"),
         ("{ t = [0.0, 1.0], values = [0.0, 1.0], kind = 3 }", "kind must be text"),
         ('{ t = [0.0, 1.0], values = [0.0, 1.0], kind = "quintic" }', "constant or linear or cubic"),
         ("{ t = [0.0, 1.0], values = [0.0, 1.0], order = 3 }", "unknown key 'order'"),

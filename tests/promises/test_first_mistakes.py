@@ -38,17 +38,17 @@ def stepper():
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"q": [1.0]}, "give p or velocity, one of them, beside q"),
+        ({"q": [1.0]}, "give either p or velocity with q; got neither"),
         ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
         ({"q": [1.0], "velocity": [0.0, 0.0]}, "velocity must have shape (1,) for (q), not (2,)"),
         ({"q": ["1.0"], "p": [0.0]}, "q must be real numbers, not text: ['1.0'], write it without quotes"),
         ({"q": {"q": 1.0}, "p": [0.0]}, "q must be real numbers, not {'q': 1.0}"),
-        ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: a finite number is wanted"),
+        ({"q": [math.nan], "p": [0.0]}, "q[0] (q) is nan: it must be finite"),
         ({"q": [1.0], "p": [0.0], "h": 0.0}, "the step size h is 0: it must be positive, or negative to integrate"),
         ({"q": [1.0], "p": [0.0], "h": math.nan}, "the step size h is nan: it must be finite"),
         ({"q": [1.0], "p": [0.0], "h": "0.1"}, "the step size h must be real numbers, not text: '0.1'"),
         ({"q": [1.0], "p": [0.0], "steps": -3}, "steps must be at least 0, not -3"),
-        ({"q": [1.0], "p": [0.0], "parameters": {"g": 9.8}}, "no parameter 'g': swing has none; its definition"),
+        ({"q": [1.0], "p": [0.0], "parameters": {"g": 9.8}}, "no parameter 'g': 'swing' has none. Declare it"),
     ],
     ids=lambda part: part if isinstance(part, str) else None,
 )

@@ -99,9 +99,9 @@ def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):
         "svi:2",
         flags=QUICK_FLAGS,
     )
-    with pytest.raises(StateError, match=r"'u' is no input of this system, which has none: .* inputs=\['u'\]"):
+    with pytest.raises(StateError, match=r"'u' is not an input: the system has none. .* inputs=\['u'\]"):
         free.integrate([0.2], [0.0], h=0.1, steps=3, inputs=DATA)
-    with pytest.raises(StateError, match=r"'u1' is no input of this system, which has u; did you mean 'u'\?"):
+    with pytest.raises(StateError, match=r"'u1' is not an input; the system has u; did you mean 'u'\?"):
         stepper.integrate([0.2], [0.0], h=0.1, steps=3, inputs={"u1": DATA["u"]})
-    with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
+    with pytest.raises(StateError, match="'w' is not an input; the system has u"):
         chain.start(np.zeros(3), h=0.1).set_inputs(w=1.0)

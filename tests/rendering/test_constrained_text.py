@@ -107,7 +107,7 @@ def test_generated_folders_meet_constraints_and_compute_what_python_does(precisi
     near = [0.001, 1.0, 1.94, 1.5]
     states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
     stepper = compile_stepper(LINKAGE, "svi:3", solver="newton")
-    with pytest.warns(AccuracyWarning, match="moved to the nearest"):
+    with pytest.warns(AccuracyWarning, match="projected onto the constraints"):
         run = stepper.integrate(near, [0.0] * 4, h=0.05, steps=40, save_every=2)
     assert "violates the constraints" in found.stderr
     assert len(states) == len(run)

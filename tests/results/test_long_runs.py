@@ -110,8 +110,8 @@ def test_a_file_that_may_not_grow_is_told_with_where_the_run_stands(kepler):
         _, stderr = process.communicate(timeout=600)
     last, steps = stderr.splitlines()[-1], load_run("a.run").steps
     assert "RecordingError: 'a.run' cannot be written: File too large. " in last
-    assert f"It holds the run whole up to step {steps} (t = {steps * H:g})" in last
-    assert "go on with 'scvi-codegen run --resume a.run' or resume_run" in last
+    assert f"It contains the run up to step {steps} (t = {steps * H:g})" in last
+    assert "continue with 'scvi-codegen run --resume a.run' or resume_run" in last
     assert steps > 0
     assert_whole(kepler)
 
@@ -133,7 +133,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
 
 def test_a_full_disk_loses_nothing_and_the_run_goes_on_when_there_is_room(kepler, small_disk):
     folder = small_disk / "a.run"
-    with pytest.raises(RecordingError, match=r"No space left on device\. It holds the run whole up to step") as error:
+    with pytest.raises(RecordingError, match=r"No space left on device\. It contains the run up to step") as error:
         recorded(kepler, 10**9, folder=str(folder), rows=2000)
     steps = load_run(folder).steps
     assert f"up to step {steps} " in str(error.value)
@@ -175,7 +175,7 @@ def test_a_folder_that_cannot_be_written_is_told_at_once(kepler, tmp_path):
     finally:
         for folder in (tmp_path, tmp_path / "a.run"):
             folder.chmod(0o755)
-    assert "'a.run' cannot be written: Permission denied. It holds the run whole up to step 100 (t = 5)" in stderr
+    assert "'a.run' cannot be written: Permission denied. It contains the run up to step 100 (t = 5)" in stderr
     assert digests("a.run") == before
 
 
@@ -228,7 +228,7 @@ class TestCommandLine:
         assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states saved in 'a.run'" in text
         assert "relative energy error" in text
         assert "wrote a.run" in text
-        assert "holds a run already" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
+        assert "already contains a run" in self.invoke("run kepler --method stoermer-verlet -o a.run", 1)
         text = self.invoke("run --resume a.run --span 20")
         assert "2000 steps (all)" in text
         self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 2000 --save-every 10 -o whole/")
@@ -241,14 +241,14 @@ class TestCommandLine:
         ("words", "message", "status"),
         [
             ("run", "Missing argument 'MODEL', or --resume FOLDER", 2),
-            ("run --resume none.run", "'none.run' holds no recorded run", 1),
+            ("run --resume none.run", "'none.run' contains no recorded run", 1),
             ("run kepler --resume none.run", "MODEL is not allowed with --resume", 2),
             ("run --resume none.run --step 0.1", "--step is not allowed with --resume", 2),
             ("run kepler -o a.run --plot a.png", "--plot is not available for a run recorded in a folder", 2),
             ("run kepler -o a.npz --checkpoint 3", "--checkpoint requires a run recorded in a folder", 2),
             ("run kepler -o a.run --certificate none.json", "the certificate 'none.json' cannot be read", 2),
             ("run kepler -o no/a.run", "'no/a.run' cannot be written", 1),
-            ("export none.run", "holds no recorded run", 1),
+            ("export none.run", "contains no recorded run", 1),
             ("export none.run -o a.xls", "not as 'a.xls'", 2),
         ],
     )

@@ -79,7 +79,7 @@ def test_an_input_that_is_no_number_changes_none(pushed):
     for wrong in (float("nan"), "1", [0.1]):
         with pytest.raises(StateError, match="the input u"):
             run.set_inputs(u=wrong)
-    with pytest.raises(StateError, match="'w' is no input of this system, which has u"):
+    with pytest.raises(StateError, match="'w' is not an input; the system has u"):
         run.set_inputs(u=0.1, w=0.2)
     assert np.array_equal(run.parameters, before)
 

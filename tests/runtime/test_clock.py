@@ -222,7 +222,7 @@ def test_runs_are_saved_recorded_and_pickled(tmp_path: Any) -> None:
     other = pickle.loads(pickle.dumps(run))
     expected = run.record(20)
     assert all(np.array_equal(x.record(20).t, expected.t) for x in (copy, other))
-    with pytest.raises(StateError, match="its own energy"):
+    with pytest.raises(StateError, match="requires its energy"):
         made.from_checkpoint(run.checkpoint())
     recorded = sc.record_run(made.start(*START, h=0.1), tmp_path / "run", steps=40)
     assert np.array_equal(np.asarray(recorded.t), made.integrate(*START, h=0.1, steps=40).t)
@@ -246,17 +246,17 @@ def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
 
 def test_what_is_not_possible_is_refused() -> None:
     made = stepper()
-    with pytest.raises(StateError, match="give one of the two"):
+    with pytest.raises(StateError, match="give either steps=3 or t_end=1"):
         made.integrate(*START, h=0.1, steps=3, t_end=1.0)
-    with pytest.raises(StateError, match="steps of h need their number"):
+    with pytest.raises(StateError, match="h requires steps or t_end"):
         made.integrate(*START, h=0.1)
-    with pytest.raises(StateError, match="do not lead from t = 0 to t_end = -1"):
+    with pytest.raises(StateError, match="wrong sign for a run from t = 0 to t_end = -1"):
         made.integrate(*START, h=0.1, t_end=-1.0)
-    with pytest.raises(StateError, match="give t_end, not steps"):
+    with pytest.raises(StateError, match="requires t_end instead of steps"):
         made.integrate(*START, h=0.1, steps=10, t_eval=[0.1])
-    with pytest.raises(StateError, match="steps of tau have one length: give h"):
+    with pytest.raises(StateError, match="adaptive steps are unavailable in transformed time: give h"):
         made.integrate(*START, t_end=1.0)
-    with pytest.raises(StateError, match="depends on momenta"):
+    with pytest.raises(StateError, match="depends on the momenta"):
         stepper("K, momenta").momentum(START[0], [0.0, 1.0])
     for method in (sc.SCVI(4), sc.SpectralCollocation(4)):
         with pytest.raises(MethodError, match="time of 'Kepler in transformed time'"):
@@ -266,7 +266,7 @@ def test_what_is_not_possible_is_refused() -> None:
 def test_a_rate_that_is_not_positive_is_refused() -> None:
     oscillator = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
     made = sc.compile_stepper(sc.reparametrise(oscillator, "q"), sc.SVI(4))
-    with pytest.raises(StateError, match="not a positive number"):
+    with pytest.raises(StateError, match="must be positive at every state"):
         made.integrate([-1.0], [0.0], h=0.1, steps=3)
     with pytest.raises(sc.StepFailedError, match="infinite or NaN"):
         made.step([-1.0], [0.0], 0.1, parameters={"E": 0.5})

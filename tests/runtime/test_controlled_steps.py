@@ -218,7 +218,7 @@ def test_a_run_goes_on_bit_for_bit(kepler):
     assert np.array_equal(np.concatenate([first.t, rest.t[1:]]), whole.t)
     assert np.array_equal(rest.q[-1], whole.q[-1])
     assert np.array_equal(pickled.q, rest.q)
-    with pytest.raises(StateError, match="not a saved run"):
+    with pytest.raises(StateError, match="invalid saved run"):
         kepler.from_checkpoint(run.checkpoint())
 
 
@@ -243,11 +243,11 @@ def test_what_rests_or_moves_freely_needs_few_steps():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({}, "step h"),
-        ({"h": 0.1}, "number"),
+        ({}, "either h .fixed step size. or t_end"),
+        ({"h": 0.1}, "h requires steps or t_end"),
         ({"h": 0.1, "steps": 3, "t_end": 1.0}, "t_end"),
         ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance"),
-        ({"t_end": 1.0, "steps": 3}, "leave out steps"),
+        ({"t_end": 1.0, "steps": 3}, "omit steps"),
         ({"t_end": math.nan}, "t_end is nan"),
         (
             {"t_end": 1.0, "tolerance": 0.0},
@@ -266,7 +266,7 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(4, space="trigonometric:0.5")])
 def test_methods_without_a_polynomial_curve_say_so(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method)
-    with pytest.raises(MethodError, match="tells the error of a step"):
+    with pytest.raises(MethodError, match="the error estimate requires"):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
 
 
@@ -305,7 +305,7 @@ def test_velocities_that_forces_leave_alike_at_both_points_tell_no_error(name, s
     else:
         stepper = sc.compile_stepper(system, method, solver=solver)
         start = ([0.5] * system.dimension, [0.3] * system.dimension)
-    with pytest.raises(MethodError, match="tells the error of a step"):
+    with pytest.raises(MethodError, match="the error estimate requires"):
         stepper.integrate(*start, t_end=2.0, tolerance=1e-6)
     assert math.isnan(stepper.integrate(*start, h=0.1, steps=2).step_error)
 
@@ -531,10 +531,10 @@ def test_states_at_times_are_kept_up_to_an_end_that_h_does_not_divide(oscillator
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"h": 0.1, "t_end": -1.0}, "do not lead from t = 0 to t_end = -1"),
-        ({"h": 0.1, "t_end": 1.0, "steps": 3}, "give one of the two"),
-        ({"h": 0.1, "t_end": 1.0, "tolerance": 1e-3}, "a tolerance is for"),
-        ({"h": 1e-12, "t_end": 1.0}, r"are 1e\+12: give a larger h"),
+        ({"h": 0.1, "t_end": -1.0}, "wrong sign for a run from t = 0 to t_end = -1"),
+        ({"h": 0.1, "t_end": 1.0, "steps": 3}, "give either steps=3 or t_end=1"),
+        ({"h": 0.1, "t_end": 1.0, "tolerance": 1e-3}, "tolerance requires adaptive steps"),
+        ({"h": 1e-12, "t_end": 1.0}, r"requires 1e\+12 steps .*: give a larger h"),
     ],
 )
 @pytest.mark.parametrize("name", ["q", "q[0]"])

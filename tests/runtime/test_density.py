@@ -159,7 +159,7 @@ def test_ways_of_driven_runs():
     assert there.q[-1, 0] == pytest.approx(2.5, abs=1e-14)
     back = stepper.integrate(there.q[-1], there.p[-1], **given, t=2.0, t_end=0.0)
     assert np.abs([back.q[-1], back.p[-1]]).max() < 1e-14
-    with pytest.raises(StateError, match="have no number: give t_end"):
+    with pytest.raises(StateError, match="steps requires h"):
         stepper.integrate([0.0], [0.0], **given, steps=10)
 
 
@@ -226,8 +226,8 @@ def test_a_fallback_is_borrowed_here_too():
         (lambda s: s.integrate(*START, t_end=1.0), "and t_end"),
         (lambda s: s.integrate(*START, h=0.1, t_end=1.0, tolerance=1e-9), "and t_end"),
         (lambda s: s.integrate(*START, h=-0.1, t_end=1.0), "positive"),
-        (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "leave out steps"),
-        (lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0), "no ensembles"),
+        (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "omit steps"),
+        (lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0), "ensembles do not support monitor"),
         (lambda s: s.from_checkpoint(b"", t_end=1.0), "and t_end"),
     ],
 )

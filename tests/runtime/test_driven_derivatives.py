@@ -102,7 +102,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
 
 def test_data_have_no_directions(stepper):
     run = run_from(stepper, START)
-    with pytest.raises(StateError, match="inputs and the lengths of steps are data"):
+    with pytest.raises(StateError, match="directions must be 0 for the parameters of inputs"):
         run.tangent(np.ones(stepper._input_size))
-    with pytest.raises(StateError, match="cotangents, slopes by"):
+    with pytest.raises(StateError, match="cotangents, derivatives by"):
         run.pullback(np.zeros((3, 2)))

@@ -274,7 +274,7 @@ class TestArguments:
         ("changes", "message"),
         [
             ({"q": np.ones((3, 3))}, r"q must have shape \(k, 2\), not \(3, 3\)"),
-            ({"q": np.ones((2, 2))}, r"q has shape \(2, 2\), p \(3, 2\)"),
+            ({"q": np.ones((2, 2))}, r"equal shapes, not \(2, 2\) and \(3, 2\)"),
             ({"q": np.ones((0, 2))}, "q must have shape"),
             ({"q": 1.0}, "q must have shape"),
             ({"p": [[1.0, 0.0], [1.0, np.nan], [0.0, 0.0]]}, r"p\[1, 1\] \(q2\) is nan"),
@@ -289,7 +289,10 @@ class TestArguments:
             ({"threads": -1}, "threads must be at least 1"),
             ({"threads": 1.5}, "threads must be a whole number"),
             ({"parameters": {"nu": 1.0}}, "there is no parameter 'nu'"),
-            ({"parameters": {"mu": [1.0, 2.0]}}, r"the parameter mu must be one number or 3, not of shape \(2,\)"),
+            (
+                {"parameters": {"mu": [1.0, 2.0]}},
+                r"the parameter mu must be one number or 3 numbers, not of shape \(2,\)",
+            ),
             ({"parameters": {"mu": "heavy"}}, "the parameter mu must be real numbers"),
             ({"parameters": np.ones((3, 2))}, r"parameters must have shape \(3, 1\), not \(3, 2\)"),
             ({"parameters": ["heavy"]}, "parameters must be real numbers"),
@@ -330,7 +333,7 @@ class TestFiles:
             assert set(rows[:, 1]) == {result.parameters[j, 0]}
 
     def test_other_suffixes(self, result: EnsembleTrajectory, tmp_path):
-        with pytest.raises(StateError, match=r"saved as \.npz, \.csv, \.h5"):
+        with pytest.raises(StateError, match=r"use \.npz, \.csv, \.h5"):
             result.save(tmp_path / "runs.txt")
 
 

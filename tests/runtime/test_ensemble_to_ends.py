@@ -97,11 +97,11 @@ def test_an_interruption_keeps_what_was_done(kepler):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({}, "give h and steps"),
-        ({"h": 0.1, "steps": 3, "t_end": 1.0}, "t_end is for"),
-        ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance is for"),
+        ({}, "give either h and steps"),
+        ({"h": 0.1, "steps": 3, "t_end": 1.0}, "t_end requires adaptive steps"),
+        ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance requires adaptive steps"),
         ({"t_end": [1.0, 2.0]}, "one time or 4"),
-        ({"t_end": [1.0, 2.0, -1.0, 3.0]}, "two ensembles"),
+        ({"t_end": [1.0, 2.0, -1.0, 3.0]}, "split the ensemble"),
         ({"t_end": 1.0, "tolerance": 2.0}, "must be positive and below 1"),
         ({"t_end": 1.0, "t_eval": [0.5, 1.5]}, "outside"),
         ({"t_end": 1.0, "t_eval": [0.5], "save_every": 2}, "not both"),

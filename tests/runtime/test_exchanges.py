@@ -97,10 +97,10 @@ def test_steps_between_and_steps_that_choose_their_length(thrown):
 
 def test_who_keeps_no_account(thrown):
     free = LagrangianSystem.from_text(name="oscillator", lagrangian="x_dot**2/2 - x**2/2", coordinates=["x"])
-    with pytest.raises(MethodError, match="no account of forces"):
+    with pytest.raises(MethodError, match="work and impulses are unavailable"):
         compile_stepper(free, SVI(2)).integrate([1.0], [0.0], h=0.1, steps=2).work()
     stepper = compile_stepper(thrown, RadauIIA(2))
-    with pytest.raises(MethodError, match="SVI, SCVI and Gauss"):
+    with pytest.raises(MethodError, match="SVI, SCVI"):
         stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
 
 

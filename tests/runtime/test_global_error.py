@@ -310,7 +310,9 @@ class TestChaos:
 
     @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
     def test_a_default_run_warns(self, burrau_stepper, more):
-        with pytest.warns(sc.AccuracyWarning, match="magnifies errors: a run from an initial state changed by 8.9e-16"):
+        with pytest.warns(
+            sc.AccuracyWarning, match="amplifies errors: a run with the initial state perturbed by 8.9e-16"
+        ):
             burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
 
     @pytest.mark.filterwarnings("error")
@@ -339,7 +341,7 @@ class TestChaos:
             warnings.simplefilter("error")
             run = stepper.integrate([0.1], [0.3], t_end=1300.0)
         assert run.steps > 2048
-        with pytest.warns(sc.AccuracyWarning, match="magnifies errors"):
+        with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
             stepper.integrate([0.1], [0.3], t_end=1300.0, check_growth=True)
 
 
@@ -359,10 +361,10 @@ class TestWhatIsRefused:
         [
             ({"h": 0.1, "steps": 10}, "error=1e-06 and h=0.1 both determine the step size"),
             ({"t_end": 1.0, "tolerance": 1e-9}, "and tolerance=1e-09 both determine the step size"),
-            ({"t_end": 1.0, "error": 0.0}, "error=0 is no bound .* give a number between 0 and 1"),
+            ({"t_end": 1.0, "error": 0.0}, "error=0 must be between 0 and 1"),
             ({"t_end": 1.0, "error": math.nan}, "it must be finite"),
             ({}, "t_end"),
-            ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "needs adaptive steps"),
+            ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "requires adaptive steps"),
         ],
     )
     def test_what_does_not_go_together(self, kepler_stepper, given, message):
@@ -371,7 +373,7 @@ class TestWhatIsRefused:
 
     def test_a_time_transformation(self):
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:2", monitor="frequency")
-        with pytest.raises(sc.StateError, match="a time transformation has fixed steps of tau"):
+        with pytest.raises(sc.StateError, match="a time transformation has fixed steps in tau"):
             stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0, error=1e-6)
 
 
@@ -462,7 +464,7 @@ class TestOtherRuns:
         )
         stepper = sc.compile_indexed(system, "svi:8")
         for more in ({}, {"save_every": 5}):
-            with pytest.warns(sc.AccuracyWarning, match="magnifies errors"):
+            with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
                 stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -567,7 +569,7 @@ class TestCommandLine:
             ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
             ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
             ("error = 2.0", [], "between 0 and 1"),
-            ("error = 1e-9", ["--monitor", "frequency"], "needs adaptive steps"),
+            ("error = 1e-9", ["--monitor", "frequency"], "requires adaptive steps"),
         ],
     )
     def test_files_that_are_refused(self, tmp_path, run, words, message):

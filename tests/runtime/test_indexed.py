@@ -145,11 +145,11 @@ def test_a_hamiltonian_as_written_out(method: str) -> None:
     assert run.energy() == pytest.approx(other.energy(), abs=1e-13)
     assert stepper.momentum_map_names == ("norm of q",)
     assert np.ptp(run.momentum_maps()) < 1e-14
-    with pytest.raises(sc.StateError, match="momenta p are the start"):
+    with pytest.raises(sc.StateError, match="give momenta p"):
         stepper.start(q, velocity=p, h=0.05, tables=bonds)
-    with pytest.raises(sc.StateError, match="velocities are not known"):
+    with pytest.raises(sc.StateError, match="velocities are unavailable"):
         stepper.start(q, p, h=0.05, tables=bonds).velocity  # noqa: B018  (the access is the point)
-    with pytest.raises(sc.StateError, match="velocities are not known"):
+    with pytest.raises(sc.StateError, match="velocities are unavailable"):
         run.velocity  # noqa: B018  (the access is the point)
 
 
@@ -238,7 +238,7 @@ def test_a_saved_run_goes_on(method: str) -> None:
     for wrong in (b"", b"no run", run.checkpoint()[:200]):
         with pytest.raises(sc.StateError, match="no saved run"):
             stepper.from_checkpoint(wrong)
-    with pytest.raises(sc.StateError, match="this is a run of"):
+    with pytest.raises(sc.StateError, match="the saved run is one of"):
         sc.compile_indexed(each.system, "svi:2").from_checkpoint(run.checkpoint())
 
 
@@ -257,8 +257,8 @@ def test_observed_runs_keep_what_is_asked_for() -> None:
 @pytest.mark.parametrize(
     ("observe", "message"),
     [
-        (lambda run: None, "what observe returns must be real numbers, not None"),
-        (lambda run: {"a": 1.0}, "what observe returns must be real numbers"),
+        (lambda run: None, "the result of observe must be real numbers, not None"),
+        (lambda run: {"a": 1.0}, "the result of observe must be real numbers"),
         (lambda run: np.zeros(run.steps), r"the shape \(1,\) at t = 0.1, \(0,\) at the start"),
     ],
 )
@@ -314,7 +314,7 @@ def test_energies_are_drawn() -> None:
 @pytest.mark.parametrize(
     ("q", "given", "message"),
     [
-        (np.zeros((3, 3)), {}, "'bonds' is missing among tables"),
+        (np.zeros((3, 3)), {}, "'bonds' is missing in tables"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 3]]}}, r"goes from 3 to 3, but r\[N, 3\] has N = 3 places"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, -1]]}}, "places from -1 to 0"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0.0, 1.0]]}}, "must be whole numbers"),

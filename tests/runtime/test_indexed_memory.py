@@ -204,11 +204,11 @@ class TestDamage:
         for spoiled in (b"", b"x", whole[:-1], whole[:100], np.zeros(3).tobytes()):
             with pytest.raises(StateError, match="no saved run"):
                 chain.from_checkpoint(spoiled)
-        with pytest.raises(StateError, match="is bytes, not int"):
+        with pytest.raises(StateError, match="must be bytes, not int"):
             chain.from_checkpoint(3)
 
     def test_a_run_of_the_other_kind_of_steps(self, chain: Any) -> None:
-        with pytest.raises(StateError, match="give its t_end"):
+        with pytest.raises(StateError, match="give t_end"):
             chain.from_checkpoint(start(chain, h=None, t_end=2.0).checkpoint())
         with pytest.raises(StateError, match="leave it out"):
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
@@ -223,6 +223,6 @@ def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
         for value in (-(2**63), 2**63 - 1, 2**20):
             before = getattr(run._memory, name)
             setattr(run._memory, name, value)
-            with pytest.raises(StateError, match=f"not a saved run.*{name}"):
+            with pytest.raises(StateError, match=f"invalid saved run.*{name}"):
                 stepper.from_checkpoint(run.checkpoint(), t_end=5.0, tolerance=1e-6)
             setattr(run._memory, name, before)

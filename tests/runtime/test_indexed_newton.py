@@ -90,7 +90,7 @@ def test_saved_runs_go_on_with_it_alone():
         each.advance(3)
     assert (run.q["q"] == again.q["q"]).all()
     assert run.iterations == again.iterations
-    with pytest.raises(sc.StateError, match=r"a run of '.*, newton', not of '.*, fixed-point'"):
+    with pytest.raises(sc.StateError, match=r"one of '.*, newton', not of '.*, fixed-point'"):
         other.from_checkpoint(saved)
 
 

@@ -75,7 +75,7 @@ def entries(run: Any) -> dict[str, Callable[[], Any]]:
 
 def check_refused(run: Any) -> None:
     for enter in entries(run).values():
-        with pytest.raises(StateError, match=r"used by another thread.*Start a run for each thread"):
+        with pytest.raises(StateError, match=r"in use by another thread.*Start a run for each thread"):
             enter()
 
 

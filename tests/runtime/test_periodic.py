@@ -171,25 +171,25 @@ def test_a_driven_oscillator_answers_in_its_period():
     assert_allclose([orbit.q[0], orbit.p[0]], [answer.real, (1.5j * answer).real], atol=1e-10)
     assert_allclose(np.abs(orbit.multipliers), np.exp(-0.1 * period), rtol=1e-9)
     assert orbit.stable
-    with pytest.raises(MethodError, match="not symplectic here"):
+    with pytest.raises(MethodError, match="not symplectic"):
         orbit.stability_indices  # noqa: B018  (the access is the point)
-    with pytest.raises(MethodError, match="no energy to be given"):
+    with pytest.raises(MethodError, match="energy cannot be prescribed"):
         periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
 
 
 def test_what_is_no_orbit(galaxy):
-    with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
+    with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
     with pytest.raises(OrbitError, match="no orbit closes near here"):
         periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, fixed=["x", "y", "p_x", "p_y"])
     losing = compile_stepper(problem("harmonic-oscillator").system, ExplicitEuler())
-    with pytest.raises(OrbitError, match=r"a state at rest|no orbit closes"):
+    with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
-    with pytest.raises(StateError, match="no 'p_z' to keep fixed; did you mean"):
+    with pytest.raises(StateError, match="fixed names 'p_z', .*; did you mean"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
     with pytest.raises(StateError, match="give one of them"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
-    with pytest.raises(StateError, match="a period is positive"):
+    with pytest.raises(StateError, match="the period must be positive"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
 
 
@@ -204,9 +204,9 @@ def test_what_depends_on_time_returns_with_it():
         dissipation="x_dot**2/20",
     )
     stepper, period = compile_stepper(system, SVI(3)), 2 * np.pi / 1.3
-    with pytest.raises(MethodError, match="give that as period, with fixed_period=True"):
+    with pytest.raises(MethodError, match="give the period of .*, with fixed_period=True"):
         periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40)
-    with pytest.raises(OrbitError, match=r"depends on is not the same 4\.7 later"):
+    with pytest.raises(OrbitError, match=r"is not periodic in time with the period 4\.7"):
         periodic_orbit(stepper, [0.0], [0.1], period=4.7, steps=40, fixed_period=True)
     twice = periodic_orbit(stepper, [0.0], [0.1], period=2 * period, steps=80, fixed_period=True)
     once = periodic_orbit(stepper, [0.0], [0.1], period=period, steps=40, fixed_period=True)
@@ -229,9 +229,9 @@ def test_no_input_is_taken_for_nothing_and_no_monitor_for_steps_of_one_length():
     with pytest.raises(StateError, match="the input u is not given"):
         periodic_orbit(compile_stepper(pushed, SVI(2)), [1.0], [0.0], period=6.28, steps=20)
     watched = compile_stepper(problem("kepler").system, SVI(2), monitor="frequency")
-    with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
+    with pytest.raises(MethodError, match="requires fixed steps h"):
         periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
-    with pytest.raises(MethodError, match="not of lengths that a monitor chooses"):
+    with pytest.raises(MethodError, match="requires fixed steps h"):
         watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 
@@ -252,5 +252,5 @@ def test_names_of_a_state_are_each_its_own():
 def test_a_state_at_rest_is_named_as_such(q):
     """Every period closes it."""
     own = compile_stepper(problem("planar-pendulum").system, SVI(4))
-    with pytest.raises(OrbitError, match="a state at rest"):
+    with pytest.raises(OrbitError, match="an equilibrium"):
         periodic_orbit(own, [q], [0.0], period=2.0, steps=40)

@@ -244,7 +244,9 @@ def test_the_energy_at_the_end_of_a_run_does_not_depend_on_time():
 
 def test_what_has_no_gradient():
     _, run = driven()
-    with pytest.raises(StateError, match=r"cotangents, slopes by \(q, p\) of each state, have shape \(61, 2\)"):
+    with pytest.raises(
+        StateError, match=r"cotangents, derivatives by \(q, p\) of each state, must have shape \(61, 2\)"
+    ):
         run.pullback(np.zeros((60, 2)))
     with pytest.raises(StateError, match="cotangents that are not finite"):
         run.pullback(np.full((61, 2), np.nan))
@@ -255,5 +257,5 @@ def test_what_has_no_gradient():
 def test_a_state_that_the_steps_do_not_lead_to_is_no_base_of_derivatives():
     _, run = driven()
     run.q[30] += 1e-3
-    with pytest.raises(StateError, match=r"begins at t = 3\.2, taken again, does not lead"):
+    with pytest.raises(StateError, match=r"from t = 3\.2, computed again, end in another state"):
         run.sensitivity()

@@ -30,9 +30,9 @@ def test_a_run_and_what_it_kept(stepper):
 def test_steps_that_choose_their_length(stepper):
     run = stepper.start([1.0], [0.0], t_end=2.0)
     run.advance(1)
-    assert repr(run).endswith("after 1 steps of their own lengths on the way to 2, solver fixed-point>")
+    assert repr(run).endswith("after 1 steps of adaptive size, t_end = 2, solver fixed-point>")
     kept = stepper.integrate([1.0], [0.0], t_end=2.0)
-    assert repr(kept).endswith(f"{len(kept.t)} states from t = 0 to 2, {kept.steps} steps of their own lengths>")
+    assert repr(kept).endswith(f"{len(kept.t)} states from t = 0 to 2, {kept.steps} steps of adaptive size>")
 
 
 def test_steps_of_tau():
@@ -56,7 +56,7 @@ def test_the_solver_is_named(method, solver):
 def test_inputs_that_are_missing():
     stepper = sc.compile_stepper(PUSHED, "svi:2", flags=QUICK_FLAGS)
     run = stepper.start([1.0], [0.0], h=0.1)
-    assert repr(run).endswith("waits for u>")
+    assert repr(run).endswith("inputs not set: u>")
     run.set_inputs(u=0.0)
     assert "waits" not in repr(run)
     driven = stepper.integrate([1.0], [0.0], h=0.1, steps=10, inputs={"u": ([0.0, 0.5, 2.0], [0.0, 1.0, 0.0])})
@@ -73,4 +73,4 @@ def test_runs_of_sums():
     )
     run = sc.compile_indexed(chain, "svi:2").start(np.zeros(5), h=0.1)
     assert "degree 2, gauss-legendre:2, N = 5; t = 0 after 0 steps of 0.1, solver" in repr(run)
-    assert repr(run).endswith("waits for u>")
+    assert repr(run).endswith("inputs not set: u>")

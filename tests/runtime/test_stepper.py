@@ -169,7 +169,7 @@ def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
 
 
 def test_bytes_of_another_length_are_refused(kepler):
-    with pytest.raises(StateError, match="3 bytes are not a saved run"):
+    with pytest.raises(StateError, match="invalid saved run: it has 3 bytes"):
         kepler.from_checkpoint(b"abc")
 
 
