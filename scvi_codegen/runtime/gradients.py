@@ -79,7 +79,7 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
 
 
 def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
-    """Return (k, given) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
+    """Return (k, variables) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
 
     Raises:
         StateError: if the directions have another shape.
@@ -110,7 +110,7 @@ def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
 
 
 def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
-    """Return (n, c, given) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
+    """Return (n, c, variables) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
     size = slopes.shape[1]
     seeds = np.zeros((len(slopes), slopes[0].size // size, stepper._input_size))
     seeds[:, :, stepper._output_indices[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
@@ -118,7 +118,7 @@ def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
 
 
 def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
-    """Return (c, given) adjoints at the start, from the seeds of each state and the adjoints ``now`` after the last."""
+    """Return (c, variables) adjoints at the start, from the seeds of each state and those ``now`` after the last."""
     time = time_of(states)
     states, by_ends = time.states, time.seeded(seeds)
     for first, last in reversed(list(pieces(states))):
@@ -149,7 +149,7 @@ def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike)
 
 
 def gradient_of(states: KeptStates, found: Array) -> Gradient:
-    """Construct from (given, ..) derivatives."""
+    """Construct from (variables, ..) derivatives."""
     m = states.stepper.dimension
     return Gradient(
         q=found[:m],
@@ -169,7 +169,7 @@ def finite(given: ArrayLike, name: str) -> Array:
 
 
 def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
-    """Return (n, told, count) tangent vectors at the states, and (count, given) at the end, from (count, given)."""
+    """Return (n, outputs, count) tangent vectors at the states and (count, variables) at the end of the run."""
     time, told = time_of(states), states.stepper._output_indices
     states, now = time.states, time.begun(changes)
     found = np.empty((len(states), len(told), len(now)))

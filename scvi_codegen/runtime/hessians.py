@@ -59,12 +59,12 @@ def checked_function(
 
 
 def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, now: Array) -> Array:
-    """Return (2, k, given) adjoints at the start and their tangents, from those ``now`` after the last state.
+    """Return (2, k, variables) adjoints at the start and their tangents, from those ``now`` after the last state.
 
     Args:
         slopes, bends: (n, 2m) and (n, 2m, 2m) derivatives of the function.
-        changes: (k, given) tangent vectors at the start.
-        now: (2, k, given) adjoints and their tangents after the last state.
+        changes: (k, variables) tangent vectors at the start.
+        now: (2, k, variables) adjoints and their tangents after the last state.
     """
     between = list(pieces(states))
     at_starts = _changes_at_starts(states, between, changes)
@@ -96,7 +96,7 @@ def _changes_at_starts(states: KeptStates, between: list[tuple[int, int]], chang
 
 
 def _seeds(slopes: Array, bends: Array, moved: Array) -> Array:
-    """Return (n, 2, k, given) derivatives of F with respect to n states, and their tangents."""
+    """Return (n, 2, k, variables) derivatives of F with respect to n states, and their tangents."""
     size = slopes.shape[1]
     seeds = np.zeros((len(slopes), 2, *moved.shape[1:]))
     seeds[:, 0, :, :size] = slopes[:, np.newaxis]

@@ -35,19 +35,19 @@ class OwnTime:
     states: KeptStates
 
     def begun(self, changes: Array) -> Array:
-        """Return (k, given) variations of the variables of the first step, from those of the initial data."""
+        """Return (k, variables) variations of the variables of the first step, from those of the initial data."""
         return changes
 
     def ended(self, found: Array, now: Array, changes: Array) -> tuple[Array, Array]:
-        """Return (n, told, k) variations of all states and (k, given) at the end, from those of the steps."""
+        """Return (n, outputs, k) variations of all states and (k, variables) at the end, from those of the steps."""
         return found, now
 
     def seeded(self, seeds: Array) -> Array:
-        """Return (n, k, given) cotangents of the step ends from those of the states: the transpose of :meth:`ended`."""
+        """Return (n, k, variables) cotangents of step ends from those of the states: the transpose of :meth:`ended`."""
         return seeds
 
     def pulled(self, slopes: Array, seeds: Array) -> Array:
-        """Return (k, given) cotangents of the initial data: the transpose of :meth:`begun`."""
+        """Return (k, variables) cotangents of the initial data: the transpose of :meth:`begun`."""
         return slopes
 
 
@@ -72,13 +72,13 @@ class TransformedTime(OwnTime):
 
     @cached_property
     def level(self) -> Array:
-        """(given,) gradient of the energy with respect to the initial data."""
+        """(variables,) gradient of the energy with respect to the initial data."""
         states = self.states
         return states.stepper._energy_gradient(states.q[0], states.p[0], states.parameters)
 
     @cached_property
     def last_step(self) -> Array:
-        """(given,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
+        """(variables,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
         states, given = self.states, self.states.stepper._input_size
         if not self.ends_at_a_time or len(states) < 2:
             return np.zeros(given)

@@ -42,7 +42,7 @@ class Sensitivity:
 
     @classmethod
     def of(cls, columns: Array, dimension: int, *, stretched: bool = True) -> Sensitivity:
-        """Construct from (..., told, 2m + k + 2) derivatives of outputs with respect to all variables."""
+        """Construct from (..., outputs, 2m + k + 2) derivatives of outputs with respect to all variables."""
         size = 2 * dimension
         states, times = columns[..., :size, :], columns[..., size:, :]
         told = cls._of(states, size, stretched=stretched)
@@ -131,7 +131,7 @@ class LinearisedMethod(CompiledMethod):
             )
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:
-        """Return the (given,) gradient of the energy of a state by all variables; 0 if time is not transformed.
+        """Return the (variables,) gradient of the energy of a state by all variables; 0 if time is not transformed.
 
         Raises:
             StateError: if the gradient is undefined.
@@ -252,7 +252,7 @@ class LinearisedMethod(CompiledMethod):
         *,
         transpose: bool = False,
     ) -> Array:
-        """Return (count, given) products of the derivative of a step, or its transpose, and (count, ..) vectors.
+        """Return (count, variables) products of the derivative of a step, or its transpose, and (count, ..) vectors.
 
         Entries of the vectors that are left out are 0. In transformed time an energy that is not given depends on the
         initial state.

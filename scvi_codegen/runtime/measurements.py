@@ -117,8 +117,8 @@ class Measurements:
         """Integrate and return the computed measurements and the final state, with derivatives.
 
         Returns:
-            (n, c) computed values, (n, c, k) their derivatives along the (k, given) initial variations, (2m,) final
-            state, (k, given) final variations.
+            (n, c) computed values, (n, c, k) their derivatives along the (k, variables) initial variations, (2m,) final
+            state, (k, variables) final variations.
         """
         m, done = self.stepper.dimension, 0
         values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows

@@ -121,7 +121,7 @@ class NearbyDrivenMotions:
         return [2 * self._stepper.dimension + k for k in columns_of_inputs(self._stepper.interface)]
 
     def _changes(self, directions: Array) -> Array:
-        """Return (k, given) initial variations; raise ``StateError`` if they vary inputs or h."""
+        """Return (k, variables) initial variations; raise ``StateError`` if they vary inputs or h."""
         changes = changes_of(self._stepper, directions)
         if changes[:, [*self._columns, -1]].any():
             raise StateError("directions must be 0 for the parameters of inputs and for h, which are fixed with inputs")
@@ -144,7 +144,7 @@ class NearbyDrivenMotions:
         return kept
 
     def _gradient(self, by_pieces: Sequence[Array], shape: tuple[int, ...]) -> DrivenGradient:
-        """Construct from (k, given) adjoints at the start of each piece."""
+        """Construct from (k, variables) adjoints at the start of each piece."""
         stepper, m = self._stepper, self._stepper.dimension
         found = by_pieces[0].T.copy()
         found[self._columns] = np.nan

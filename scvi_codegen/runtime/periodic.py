@@ -185,8 +185,8 @@ class _OrbitSearch:
         allowed = CLOSED * max(1.0, float(np.linalg.norm(motion.monodromy, 2)))
         if not found.error <= allowed * size:
             raise OrbitError(
-                f"no orbit closes near here: after {iterations} iterations it ends {found.error:.1e} from where it "
-                "began. Give a nearer guess, or more steps"
+                f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
+                f"{found.error:.1e}. Give a better initial guess, or more steps"
             )
         self._check_energy(found, allowed * size)
         if np.linalg.norm(motion.by_period) * z[-1] <= RESTING * size:

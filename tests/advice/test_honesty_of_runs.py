@@ -135,7 +135,7 @@ class TestLongSteps:
         verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
         trajectory = verlet.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=3)
         assert math.isnan(trajectory.step_error)
-        assert "unknown: the method has no error estimate" in trajectory._repr_html_()
+        assert "unknown: the method" in trajectory._repr_html_()
         assert "largest local error: unknown" in run("kepler --method stoermer-verlet --step 0.1 --steps 3").output
 
 
@@ -312,7 +312,7 @@ class TestKnownDigits:
         error = np.abs(trajectory.q[-1] - [math.cos(t), math.sin(t)])
         assert np.all(error <= 1.01 * known.q + 1e-14)
         assert np.all(known.q < 100.0 * np.linalg.norm(error))
-        assert unknown: the method has no error estimate.chaotic
+        assert not known.chaotic
 
     def test_chaos_is_seen(self):
         problem = sc.problem("double-pendulum")

@@ -202,7 +202,7 @@ def test_inputs_that_are_held_are_parameters():
     start = {"q": jnp.zeros(1), "p": jnp.zeros(1)}
     slope = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
     assert_allclose(slope, 2.0, rtol=1e-13)  # t^2 / 2
-    with pytest.raises(StateError, match="input u is not given"):
+    with pytest.raises(StateError, match="input 'u' is not set"):
         flow(**start, h=0.2)
 
 

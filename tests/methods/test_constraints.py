@@ -345,7 +345,7 @@ def test_positions_do_not_follow_constraints_that_jump():
         stepper.start(given["q"], velocity=given["velocity"], h=0.05)
     run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})
     for go_on in (lambda: run.set_inputs(u=0.3), lambda: run.update(parameters={"u_0": 0.3})):
-        with pytest.raises(StateError, match=r"at t = 0 the constraint .* jumps"):
+        with pytest.raises(StateError, match=r"at t = 0 the position constraint .* jumps"):
             go_on()
         assert run.parameters[0] == 0.0
 

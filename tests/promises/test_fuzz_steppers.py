@@ -209,7 +209,7 @@ def test_damaged_bytes_of_a_run_are_refused_or_continued_within_bounds(method):
     run.record(3)
     saved, random = run.checkpoint(), Random(5)
     for byte in (b"\0", b"\xff", b"\x7f"):
-        with pytest.raises(StateError, match="invalid saved run|the saved run has adaptive steps"):
+        with pytest.raises(StateError, match=r"invalid saved run|the saved run has adaptive steps"):
             stepper.from_checkpoint(byte * len(saved))
     for _ in range(300):
         damaged = bytearray(saved)

@@ -236,7 +236,7 @@ def test_a_saved_run_goes_on(method: str) -> None:
     assert np.array_equal(run.p["q"], again.p["q"])
     assert (run.t, run.steps, run.iterations, run.energy) == (again.t, again.steps, again.iterations, again.energy)
     for wrong in (b"", b"no run", run.checkpoint()[:200]):
-        with pytest.raises(sc.StateError, match="no saved run"):
+        with pytest.raises(sc.StateError, match="invalid saved run"):
             stepper.from_checkpoint(wrong)
     with pytest.raises(sc.StateError, match="the saved run is one of"):
         sc.compile_indexed(each.system, "svi:2").from_checkpoint(run.checkpoint())
@@ -259,7 +259,7 @@ def test_observed_runs_keep_what_is_asked_for() -> None:
     [
         (lambda run: None, "the result of observe must be real numbers, not None"),
         (lambda run: {"a": 1.0}, "the result of observe must be real numbers"),
-        (lambda run: np.zeros(run.steps), r"the shape \(1,\) at t = 0.1, \(0,\) at the start"),
+        (lambda run: np.zeros(run.steps), r"keep its shape: \(1,\) at t = 0.1, \(0,\) before"),
     ],
 )
 def test_observations_that_cannot_be_kept_are_refused(observe: Any, message: str) -> None:
@@ -315,23 +315,31 @@ def test_energies_are_drawn() -> None:
     ("q", "given", "message"),
     [
         (np.zeros((3, 3)), {}, "'bonds' is missing in tables"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 3]]}}, r"goes from 3 to 3, but r\[N, 3\] has N = 3 places"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, -1]]}}, "places from -1 to 0"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 3]]}}, r"runs from 3 to 3, but r\[N, 3\] has N = 3 entries"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, -1]]}}, "not -1 to 0"),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0.0, 1.0]]}}, "must be whole numbers"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [0, 1]}}, r"has the shape \(2,\)"),
-        (np.zeros((3, 2)), {"tables": {"bonds": [[0, 1]]}}, r"has the shape \(3, 2\), which is not that of r\[N, 3\]"),
-        (np.full((3, 3), np.nan), {"tables": {"bonds": [[0, 1]]}}, r"is not finite at \[0, 0\]"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [1, 2]}}, "B is 2 in k"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [0, 1]}}, r"not \(2,\)"),
+        (np.zeros((3, 2)), {"tables": {"bonds": [[0, 1]]}}, r"must have the shape of r\[N, 3\], not \(3, 2\)"),
+        (np.full((3, 3), np.nan), {"tables": {"bonds": [[0, 1]]}}, r"is not at the index \[0, 0\]"),
+        (
+            np.zeros((3, 3)),
+            {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [1, 2]}},
+            "B must be the same in all arrays: it is 2 in k",
+        ),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"kk": 1}}, "did you mean 'k'"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": np.inf}}, "is not finite"),
-        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "velocity": np.zeros((2, 3))}, r"positions \(3, 3\)"),
+        (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": np.inf}}, "must be finite"),
+        (
+            np.zeros((3, 3)),
+            {"tables": {"bonds": [[0, 1]]}, "velocity": np.zeros((2, 3))},
+            r"shape of the positions, \(3, 3\)",
+        ),
         (
             np.zeros((3, 3)),
             {"tables": {"bonds": [[0, 1]]}, "parameters": {"k": [[1.0]]}},
-            r"'k' has the shape \(1, 1\)",
+            r"'k' must have the shape .*, not \(1, 1\)",
         ),
         (np.zeros((3, 3)), {"tables": {"bonds": [[0, 1]]}, "h": 0.0}, "the step size h is 0"),
-        ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' among positions"),
+        ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' in positions"),
     ],
 )
 def test_what_does_not_fit_is_refused(q: Any, given: dict[str, Any], message: str) -> None:
@@ -372,7 +380,7 @@ def test_an_index_leaves_no_table() -> None:
         tables=["bonds[B, 2]"],
         lagrangian="sum(i in N, q_dot[i]**2/2 - q[bonds[i, 0]]**2)",
     )
-    message = r"bonds\[i, 0\] goes from 0 to 4, but bonds\[B, 2\] has B = 1 places"
+    message = r"bonds\[i, 0\] runs from 0 to 4, but bonds\[B, 2\] has B = 1 entries"
     with pytest.raises(sc.StateError, match=message):
         sc.compile_indexed(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
     with pytest.raises(sc.SystemDefinitionError, match="out of bounds"):

@@ -120,7 +120,7 @@ class TestPickles:
     def test_an_input_is_still_awaited(self, chain: Any) -> None:
         run = start(chain, parameters={"k": K})
         for other in (copy.copy(run), chain.from_checkpoint(run.checkpoint())):
-            with pytest.raises(StateError, match="the input F is not given"):
+            with pytest.raises(StateError, match="the input 'F' is not set"):
                 other.advance(1)
 
     def test_a_trajectory_keeps_its_states_between(self, chain: Any) -> None:
@@ -202,7 +202,7 @@ class TestDamage:
             except StateError:
                 continue
         for spoiled in (b"", b"x", whole[:-1], whole[:100], np.zeros(3).tobytes()):
-            with pytest.raises(StateError, match="no saved run"):
+            with pytest.raises(StateError, match="invalid saved run"):
                 chain.from_checkpoint(spoiled)
         with pytest.raises(StateError, match="must be bytes, not int"):
             chain.from_checkpoint(3)
@@ -210,7 +210,7 @@ class TestDamage:
     def test_a_run_of_the_other_kind_of_steps(self, chain: Any) -> None:
         with pytest.raises(StateError, match="give t_end"):
             chain.from_checkpoint(start(chain, h=None, t_end=2.0).checkpoint())
-        with pytest.raises(StateError, match="leave it out"):
+        with pytest.raises(StateError, match="omit t_end"):
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
