@@ -259,7 +259,7 @@ def test_what_is_not_possible_is_refused() -> None:
     with pytest.raises(StateError, match="depends on the momenta"):
         stepper("K, momenta").momentum(START[0], [0.0, 1.0])
     for method in (sc.SCVI(4), sc.SpectralCollocation(4)):
-        with pytest.raises(MethodError, match="time of 'Kepler in transformed time'"):
+        with pytest.raises(MethodError, match="time transformation of 'Kepler in transformed time'"):
             sc.compile_stepper(FORMS["L"], method)
 
 

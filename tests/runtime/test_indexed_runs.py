@@ -122,10 +122,10 @@ class TestControlledSteps:
         with pytest.raises(MethodError, match="adaptive steps are unavailable"):
             sc.compile_indexed(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
         for given, message in (
-            ({}, "give one of them"),
+            ({}, "give either h .fixed step size. or t_end"),
             ({"h": 0.1}, "h requires steps or t_end"),
             ({"steps": 3}, "steps requires h"),
-            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give one of the two"),
+            ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give either steps=3 or t_end=1"),
             ({"h": 0.1, "t_end": -1.0}, "wrong sign for a run from t = 0 to t_end = -1"),
             ({"h": 0.1, "steps": 3, "tolerance": 1e-3}, "tolerance requires adaptive steps"),
             ({"t_end": 1.0, "tolerance": 2.0}, "positive and below 1"),

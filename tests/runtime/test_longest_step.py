@@ -73,9 +73,9 @@ def test_what_is_said_of_a_too_wrong() -> None:
 
 def test_what_has_no_longest_step_is_refused() -> None:
     for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
-        with pytest.raises(StateError, match="tolerance = 1e-09 must be"):
+        with pytest.raises(StateError, match=r"span = \S+ must not be 0, and tolerance"):
             longest_step(stepper(), *START, span, tolerance)
     verlet = sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.StoermerVerlet())
     if np.isnan(verlet.integrate(*START, h=0.1, steps=3).step_error):
-        with pytest.raises(MethodError, match="give a step h"):
+        with pytest.raises(MethodError, match="no error estimate: give h"):
             longest_step(verlet, *START, 1.0, 1e-3)

@@ -180,14 +180,14 @@ def test_a_driven_oscillator_answers_in_its_period():
 def test_what_is_no_orbit(galaxy):
     with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
-    with pytest.raises(OrbitError, match="no orbit closes near here"):
+    with pytest.raises(OrbitError, match="no periodic orbit was found"):
         periodic_orbit(galaxy, [0.0, 0.2], [0.3, 0.1], period=4.0, steps=40, fixed=["x", "y", "p_x", "p_y"])
     losing = compile_stepper(problem("harmonic-oscillator").system, ExplicitEuler())
     with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
     with pytest.raises(StateError, match=r"fixed names 'p_z', .*; did you mean"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
-    with pytest.raises(StateError, match="give one of them"):
+    with pytest.raises(StateError, match="give either steps .of a period. or h"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
     with pytest.raises(StateError, match="the period must be positive"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)

@@ -81,5 +81,5 @@ def test_spans_are_made_of_equal_steps_none_of_them_longer():
     assert steps_within([2.1, 5.4], -0.3).tolist() == [7, 18]  # the quotients are more, by rounding alone
     with pytest.raises(StateError, match=r"h = 1e-12 requires 1e\+12 steps"):
         steps_within(1.0, 1e-12)
-    with pytest.raises(StateError, match="would be inf of them"):
+    with pytest.raises(StateError, match="requires inf steps"):
         steps_within(1e300, 1e-300)
