@@ -187,7 +187,7 @@ def test_what_is_no_orbit(galaxy):
         periodic_orbit(losing, [1.0], [0.0], period=6.0, steps=40, fixed=["q"])
     with pytest.raises(StateError, match=r"fixed names 'p_z', .*; did you mean"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5, h=0.1, fixed=["p_z"])
-    with pytest.raises(StateError, match="give either steps .of a period. or h"):
+    with pytest.raises(StateError, match=r"give either steps .of a period. or h"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=6.5)
     with pytest.raises(StateError, match="the period must be positive"):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
