@@ -377,7 +377,7 @@ def test_what_is_refused(galaxy):
         run.chaos_indicators(directions=np.zeros(4))
     with pytest.raises(StateError, match="k = 3 exceeds the number of tangent vectors, 2"):
         run.chaos_indicators(2).gali(3)
-    with pytest.raises(StateError, match="no multiple of save_every=3"):
+    with pytest.raises(StateError, match="must be a multiple of save_every=3"):
         galaxy.chaos_indicators_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
 
 
