@@ -259,7 +259,7 @@ class TestPage:
         [
             ({"forces": {"x": "-c*x_dot**3"}}, "Generalised forces f; below"),
             ({"damping": "c"}, "Momenta are damped at one rate,"),
-            ({"constraints": ["x**2 + y**2 - 1"]}, "Constraints g = 0,"),
+            ({"constraints": ["x**2 + y**2 - 1"]}, "with Lagrange multipliers"),
         ],
         ids=["forces", "damping", "constraints"],
     )
