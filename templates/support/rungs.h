@@ -5,7 +5,7 @@ enum {
   OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* levels per factor of two */
   MOST_UP = 4 * OCTAVE, /* levels, while the first step size is determined */
   MOST_DOWN = 2 * OCTAVE, /* after a step whose error was too large, or a first step that failed */
-  DOWN_FAILED = 3, /* after a step whose iteration failed */
+  DOWN_FAILED = OCTAVE, /* after a step whose iteration failed */
   AVOIDED = 32 /* steps after it that stay below its size */
 };
 
