@@ -407,7 +407,7 @@ class TestEnsembleFiles:
             ),
             ("a.toml", "[grid]\nq1 = []", r"\[grid\] q1 is an empty list"),
             ("a.toml", "[grid]\nq1 = ['x']", r"\[grid\] q1 must be a number, not 'x'"),
-            ("a.toml", "[grid]\nq1 = nan", r"\[grid\] q1 is nan: a finite number is wanted"),
+            ("a.toml", "[grid]\nq1 = nan", r"\[grid\] q1 is nan: it must be a finite number"),
             ("a.toml", "[grid]\nq1 = {from = 1, to = 2}", "must have from, to and count, not from, to"),
             (
                 "a.toml",
