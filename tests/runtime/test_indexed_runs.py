@@ -192,7 +192,7 @@ class TestEvents:
     def test_what_is_no_event(self, steppers):
         stepper, _ = steppers
         for function, message in (
-            ("x[0]", "no array"),
+            ("x[0]", "not an array"),
             ("q[N]", "q\\[N\\] is behind the last|N is"),
             ("q[9]", "runs from 9 to 9"),
             ("1/(q[0] - q[0])", "not finite|division|infinit"),
