@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.advice.pilot import STEEP, Pilot, launch
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.given.kinds import SWITCH, TEXT, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -90,6 +91,8 @@ class Advice:
     evidence: tuple[Evidence, ...]
     message: str
     warnings: tuple[str, ...]
+
+    __repr__ = summary("h", "steps", "method", "expected_error")
 
     def _repr_html_(self) -> str:
         facts = [

@@ -14,6 +14,7 @@ from sympy import Expr
 from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.promise import broken_promise
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
 from scvi_codegen.given.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.reparametrisation import with_monitor
@@ -62,6 +63,8 @@ class OdeResult:
     status: int
     message: str
     trajectory: Trajectory
+
+    __repr__ = summary("t", "y", "status", "message")
 
     @property
     def success(self) -> bool:

@@ -23,6 +23,7 @@ from scvi_codegen.derivation.entries import entries
 from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
 from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, html, latex, text_lines
 from scvi_codegen.display.cards import card, listed, plain
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.writing import format_expression
@@ -141,7 +142,7 @@ class StepEquations:
 
     def __repr__(self) -> str:
         count = len(self.equations)
-        return f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>"
+        return clipped(f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>", LONGEST)
 
     def _repr_latex_(self) -> str | None:
         """LaTeX of all equations, nothing if a notebook could not show them."""

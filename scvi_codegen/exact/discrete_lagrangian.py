@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.motion import ExactMotion
@@ -59,6 +60,8 @@ class ExactStep:
     v1: Vector
     action: Number
     error: Number
+
+    __repr__ = summary("action", "error")
 
 
 @takes(system=LAGRANGIAN, parameters=VALUES)

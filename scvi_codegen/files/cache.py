@@ -22,6 +22,7 @@ from pathlib import Path
 
 import platformdirs
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import BuildError, CacheWarning, warn
 from scvi_codegen.files.atomic import remove
 
@@ -132,6 +133,8 @@ class CacheInfo:
     references: int
     size: int
     limit: int
+
+    __repr__ = summary("folder", "integrators", "size", "limit")
 
     def __str__(self) -> str:
         limit = f"of {_readable(self.limit)}" if self.limit else "without a limit"

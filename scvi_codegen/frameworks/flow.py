@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MissingLibraryError, StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.rendering.source import Source
@@ -51,7 +52,7 @@ class Flow:
         return (type(self), (self.stepper, self.steps, self.save_every))  # without cached libraries
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>"
+        return clipped(f"<{type(self).__name__} of {self.steps} steps: {self.stepper.title}>", LONGEST)
 
     @property
     def spacing(self) -> int:

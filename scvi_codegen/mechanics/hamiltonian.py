@@ -15,6 +15,7 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
@@ -52,6 +53,8 @@ class HamiltonianSystem(MechanicalSystem):
 
     momenta: tuple[Symbol, ...]
     hamiltonian: Expr
+
+    __repr__ = summary("name", "coordinates", "momenta")
 
     def __post_init__(self) -> None:
         if len(self.momenta) != len(self.coordinates):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import sympy
 from sympy import Expr, Symbol
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import hessian
 from scvi_codegen.formulas.grammar import parse_expression
@@ -56,6 +57,8 @@ class LagrangianSystem(MechanicalSystem):
     """
 
     lagrangian: Expr
+
+    __repr__ = summary("name", "coordinates")
 
     def __post_init__(self) -> None:
         self._check("Lagrangian", self.velocities, "a velocity")

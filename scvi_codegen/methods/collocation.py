@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from scvi_codegen.display.number_tables import Part
+from scvi_codegen.display.summary import summary
 from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import VELOCITY_BLOCK, position_system, residual_family, single_point
@@ -50,6 +51,8 @@ class SpectralCollocation(Method):
     degree: int
     nodes: Nodes | str | None = None
     form: str = "position"
+
+    __repr__ = summary("degree")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", degree_count(self.degree, "the degree of spectral collocation"))

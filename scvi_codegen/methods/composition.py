@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.forms import forms_of
@@ -97,6 +98,8 @@ class Composition(Method):
 
     composition_order: int
     sequence: str = KICK_DRIFT_KICK
+
+    __repr__ = summary("composition_order", "sequence")
 
     def __post_init__(self) -> None:
         check_sequence(self.sequence)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import (
@@ -69,6 +70,8 @@ class SVI(Method):
     quadrature: Quadrature | str | None = None
     nodes: Nodes | str | None = None
     space: CurveSpace | str | None = None
+
+    __repr__ = summary("degree", "quadrature", "space")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", degree_count(self.degree, "the degree of a spectral variational integrator"))

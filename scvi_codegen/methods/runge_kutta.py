@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.given.kinds import NUMBERS, check_kind, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -74,6 +75,8 @@ class RungeKutta(Method):
 
     tableau: Tableau
     form: str = "phase-space"
+
+    __repr__ = summary("tableau", "form")
 
     def __post_init__(self) -> None:
         check_kind(of("a tableau", Tableau), self.tableau, "tableau", MethodError)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scvi_codegen.display.number_tables import Part
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.given.kinds import NUMBERS, check_kind
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -68,6 +69,8 @@ class SCVI(Method):
     nodes: Nodes | str | None = None
     variational: bool = True
     abscissae: Sequence[Any] | str | None = None
+
+    __repr__ = summary("degree", "quadrature")
 
     def __post_init__(self) -> None:
         object.__setattr__(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import check_kind
@@ -96,7 +97,7 @@ class IndexedModel:
 
     def __repr__(self) -> str:
         steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"
-        return f"<IndexedModel of {self.system.name}: {self.method.name}, {steps}>"
+        return clipped(f"<IndexedModel of {self.system.name}: {self.method.name}, {steps}>", LONGEST)
 
     @property
     def step(self) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.given.counts import LARGEST_COUNT, check_tolerance, checked_count
@@ -86,6 +87,8 @@ class Model:
     save_every: int = 1
     t: float = 0.0
     inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
+
+    __repr__ = summary("system", "method", "h", "span", "steps")
 
     def __post_init__(self) -> None:
         check_kind(SYSTEM, self.system, "system", ModelFileError)

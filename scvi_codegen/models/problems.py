@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from scvi_codegen.display.cards import Html, card, listed, plain
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.given.kinds import TEXT, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -55,6 +56,8 @@ class Problem:
     step: float
     span: float
     reference: str
+
+    __repr__ = summary("name", "system", "step")
 
     def _repr_html_(self) -> str:
         state = [("q", self.q), ("velocity", self.velocity), ("p", self.p)]

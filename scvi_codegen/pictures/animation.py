@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, takes
@@ -83,6 +84,8 @@ class Film:
     trajectory: DrawnMotion
     shape: MovingPoints
     seconds: float
+
+    __repr__ = summary("seconds", "trajectory")
 
     @cached_property
     def frames(self) -> Any:

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from scvi_codegen.display.cards import card, listed, plain
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
@@ -71,7 +72,7 @@ class CompiledMethod:
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.title}>"
+        return f"<{type(self).__name__} {clipped(self.title, LONGEST - 20)}>"
 
     def _repr_html_(self) -> str:
         interface = self.interface

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.runtime.growth import SERIES
@@ -43,6 +44,8 @@ class ChaosIndicators:
     rates: Array
     mean_rates: Array
     status: NDArray[np.str_] | None = None
+
+    __repr__ = summary("t", "lengths")
 
     @classmethod
     def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> ChaosIndicators:

@@ -11,6 +11,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.display.summary import one_line
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
@@ -20,6 +21,7 @@ from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.standing import short_title
 from scvi_codegen.runtime.trajectory import relative_changes
 
 if TYPE_CHECKING:
@@ -68,7 +70,7 @@ class EnsembleTrajectory:
 
     def __repr__(self) -> str:
         states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
-        return f"<EnsembleTrajectory of {self.stepper.title}; {states}>"
+        return one_line(self, short_title(self.stepper.interface), states)
 
     @property
     def ok(self) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import EventError
 from scvi_codegen.given.counts import checked_count
 
@@ -75,6 +76,8 @@ class Crossings:
     t: Array
     q: Array
     p: Array
+
+    __repr__ = summary("event", "t")
 
     def __len__(self) -> int:
         return len(self.t)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import MAPPING, NAMES, SWITCH, of, takes
@@ -73,6 +74,8 @@ class Fit:
     deviations: Array
     evaluations: int
     jumps: Array
+
+    __repr__ = summary("names", "values", "evaluations")
 
     @property
     def standard_errors(self) -> dict[str, float]:

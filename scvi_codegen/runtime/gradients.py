@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
@@ -62,6 +63,8 @@ class Gradient:
     parameters: Array
     t: Array
     h: Array | None
+
+    __repr__ = summary("q", "p", "parameters")
 
 
 def carried(states: KeptStates, directions: ArrayLike | None) -> Array:

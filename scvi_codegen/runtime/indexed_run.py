@@ -24,7 +24,7 @@ from scvi_codegen.runtime.indexed_saving import read_saved, restore_memory, save
 from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.one_thread import OneThread, alone
 from scvi_codegen.runtime.portions import SLICE_SECONDS
-from scvi_codegen.runtime.standing import stands
+from scvi_codegen.runtime.standing import short_title, stands
 
 __all__ = ["IndexedRun"]
 
@@ -88,7 +88,9 @@ class IndexedRun(OneThread):
 
     def __repr__(self) -> str:
         sizes = "".join(f", {name} = {size}" for name, size in self.sizes.items())
-        return stands(f"{self.interface.title}{sizes}", self.interface.solver, self, awaited=self.problem.awaited)
+        return stands(
+            f"{short_title(self.interface)}{sizes}", self.interface.solver, self, awaited=self.problem.awaited
+        )
 
     @property
     def interface(self) -> IndexedInterface:

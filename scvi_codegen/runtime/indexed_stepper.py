@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
@@ -70,7 +71,7 @@ class IndexedStepper:
         return (_rebuild, (self.source, self.interface, self._controlled_text(), self.flags))
 
     def __repr__(self) -> str:
-        return f"IndexedStepper({self.interface.title})"
+        return clipped(f"IndexedStepper({self.interface.title})", LONGEST)
 
     @property
     def momentum_map_names(self) -> tuple[str, ...]:

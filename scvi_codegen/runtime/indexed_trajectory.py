@@ -11,6 +11,7 @@ from typing import Self, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
@@ -70,7 +71,7 @@ class IndexedTrajectory(Confirmed):
     def __repr__(self) -> str:
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
         lengths = "" if self.goal else f" of {self.h:g}"
-        return f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>"
+        return clipped(f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>", LONGEST)
 
     def __len__(self) -> int:
         return len(self.t)

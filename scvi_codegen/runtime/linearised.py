@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
@@ -39,6 +40,8 @@ class Sensitivity:
     t: Array
     h: Array | None
     times: Sensitivity | None = None
+
+    __repr__ = summary("state", "parameters")
 
     @classmethod
     def of(cls, columns: Array, dimension: int, *, stretched: bool = True) -> Sensitivity:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.inputs import Array
@@ -49,6 +50,8 @@ class PeriodicOrbit:
     parameters: Array
     stepper: Stepper = field(repr=False)
     options: SolverOptions | None = field(default=None, repr=False)
+
+    __repr__ = summary("q", "p", "period", "steps")
 
     def run(self, *, save_every: int = 1) -> Trajectory:
         """Return the trajectory of one period, every ``save_every``-th state."""

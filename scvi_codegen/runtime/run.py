@@ -14,7 +14,7 @@ from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.one_thread import alone
 from scvi_codegen.runtime.portions import record
-from scvi_codegen.runtime.standing import stands
+from scvi_codegen.runtime.standing import short_title, stands
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Run"]
@@ -26,7 +26,7 @@ class Run(Memory):
     def __repr__(self) -> str:
         interface = self.stepper.interface
         tau = bool(interface.energy_parameter)
-        return stands(interface.title, interface.solver, self, tau=tau, awaited=self._awaited)
+        return stands(short_title(interface), interface.solver, self, tau=tau, awaited=self._awaited)
 
     def __reduce__(self) -> tuple[Any, ...]:
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from scvi_codegen.display.summary import one_line
 from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["holds", "lengths_of", "stands"]
+__all__ = ["holds", "lengths_of", "short_title", "stands"]
 
 
 class Standing(Protocol):
@@ -22,6 +23,15 @@ class Standing(Protocol):
     def h(self) -> float: ...
     @property
     def steps(self) -> int: ...
+
+
+class Titled(Protocol):
+    """Interface required of the description of an integrator."""
+
+    @property
+    def system(self) -> str: ...
+    @property
+    def method(self) -> str: ...
 
 
 class StandingStates(Protocol):
@@ -49,13 +59,18 @@ def stands(title: str, solver: str, run: Standing, *, tau: bool = False, awaited
     solved = f", solver {solver}" if solver else ""
     waits = f", inputs not set: {', '.join(awaited)}" if awaited else ""
     steps = f"{run.steps} steps{lengths_of(run.h, run.goal, tau=tau)}"
-    return f"<{type(run).__name__} of {title}; t = {run.t:g} after {steps}{goal}{solved}{waits}>"
+    return one_line(run, title, f"t = {run.t:g} after {steps}{goal}{solved}{waits}")
 
 
 def holds(result: StandingStates, lengths: str) -> str:
     """Return ``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` follows "steps"."""
     span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
-    return f"<{type(result).__name__} of {result.stepper.title}; {span}, {result.steps} steps{lengths}>"
+    return one_line(result, short_title(result.stepper.interface), f"{span}, {result.steps} steps{lengths}")
+
+
+def short_title(interface: Titled) -> str:
+    """Return the system and the short name of the method."""
+    return f"{interface.system}, {interface.method}"
 
 
 def lengths_of(h: float, goal: Goal | None, *, tau: bool) -> str:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from typing import Any, TypeAlias, TypeVar
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.given.counts import checked_count
 from scvi_codegen.given.kinds import WHOLE, takes
@@ -67,6 +68,8 @@ class Nodes:
     name: str
     degree: int
     points: Vector
+
+    __repr__ = summary("name", "degree")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", point_count(self.degree, "the degree", least=1))

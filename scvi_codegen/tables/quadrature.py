@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.given.kinds import TEXT, WHOLE, takes
 from scvi_codegen.tables.nodes import (
@@ -74,6 +75,8 @@ class Quadrature:
     weights: Vector
     derivative_weights: Matrix = ()
     order: int = 0
+
+    __repr__ = summary("name", "order")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", ascending_points(self.points, "quadrature point"))

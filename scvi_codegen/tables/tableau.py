@@ -16,6 +16,7 @@ from itertools import count as count_from
 from itertools import pairwise
 from typing import Any
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
 from scvi_codegen.given.kinds import WHOLE, takes
 from scvi_codegen.tables.basis import cardinal_integrals, transpose
@@ -63,6 +64,8 @@ class Tableau:
     A: Matrix
     b: Vector
     c: Vector
+
+    __repr__ = summary("name")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "A", tuple(tuple(map(to_number, row)) for row in self.A))

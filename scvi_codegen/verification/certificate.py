@@ -15,6 +15,7 @@ from functools import partial
 from typing import IO, Any, NamedTuple
 
 from scvi_codegen.display.cards import Html, card, grid, plain
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.native.waiting import waiting_for
@@ -143,6 +144,8 @@ class Certificate:
     parameters: dict[str, float]
     checks: tuple[Check, ...]
     seconds: float
+
+    __repr__ = summary("system", "method", "verdict")
 
     @property
     def passed(self) -> bool:

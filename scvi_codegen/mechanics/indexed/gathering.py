@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sympy import Add, Expr, Integer, Symbol
 
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.inputs import input_formulas
 from scvi_codegen.formulas.symbols import DOT, symbol
@@ -42,6 +43,8 @@ class RolledSums:
     system: IndexedSystem
     tables: dict[str, NDArray[np.int32]]
     parameters: dict[str, NDArray[np.float64]]
+
+    __repr__ = summary("system", "tables", "parameters")
 
 
 @takes(SystemDefinitionError, system=SYSTEM)

@@ -16,6 +16,7 @@ from typing import Any
 
 from sympy import Expr, S, Symbol
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
@@ -70,7 +71,9 @@ class IndexedSystem:
     constraints: tuple[IndexedTerm, ...] = ()
 
     def __repr__(self) -> str:
-        return f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))"
+        return clipped(
+            f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))", LONGEST
+        )
 
     def __post_init__(self) -> None:
         self._check_names()

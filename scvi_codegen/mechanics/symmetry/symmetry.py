@@ -30,6 +30,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
+from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.given.kinds import several, takes
@@ -78,6 +79,8 @@ class Symmetry:
     direction: tuple[Expr, ...]
     gauge: Expr
     momentum_map: Expr
+
+    __repr__ = summary("name")
 
     def __str__(self) -> str:
         return f"{self.name} = {self.formula}"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
@@ -75,7 +76,7 @@ class RecordedRun:
     def __repr__(self) -> str:
         goal = self.manifest.goal
         end = f"t = {self.t[-1]:g} of {goal.t_end:g}" if goal else f"step {self.steps} of {self.manifest.steps}"
-        return f"<RecordedRun '{self.folder}': {len(self)} states, {end}>"
+        return clipped(f"<RecordedRun '{self.folder}': {len(self)} states, {end}>", LONGEST)
 
     @overload
     def __getitem__(self, rows: slice) -> Trajectory: ...
@@ -291,7 +292,7 @@ class LazyArray:
         return len(self._run)
 
     def __repr__(self) -> str:
-        return f"<LazyArray {COLUMNS[self._column]}{self.shape} of '{self._run.folder}'>"
+        return clipped(f"<LazyArray {COLUMNS[self._column]}{self.shape} of '{self._run.folder}'>", LONGEST)
 
     def __iter__(self) -> Iterator[Any]:
         for number in range(-(-len(self) // self._run.manifest.rows)):

@@ -1,0 +1,58 @@
+"""Representations of objects for ``repr``: constructor-like or a summary, at most ``LONGEST`` characters."""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Callable, Mapping
+from typing import Any
+
+__all__ = ["LONGEST", "clipped", "one_line", "summary"]
+
+LONGEST = 100
+LONGEST_VALUE = 40
+
+
+def summary(*names: str) -> Callable[[Any], str]:
+    """Return a ``__repr__`` that shows these attributes as ``Name(a=1, b=<61 x 4>)``; what does not fit becomes "..".
+
+    A value with the attribute ``name`` is shown by that.
+    """
+
+    def shown(self: Any) -> str:
+        head, parts = f"{type(self).__name__}(", list[str]()
+        for name in names:
+            parts.append(f"{name}={_short(getattr(self, name))}")
+            if len(head) + len(", ".join(parts)) > LONGEST - len(", ..)") * (name != names[-1]) - 1:
+                parts[-1] = ".."
+                break
+        return f"{head}{', '.join(parts)})"
+
+    return shown
+
+
+def one_line(value: Any, title: str, facts: str) -> str:
+    """Return ``<Run of TITLE; FACTS>``, the title shortened to fit."""
+    head, tail = f"<{type(value).__name__} of ", f"; {facts}>"
+    return f"{head}{clipped(title, LONGEST - len(head) - len(tail))}{tail}"
+
+
+def clipped(text: str, length: int) -> str:
+    """Return the text, or its beginning and "..", in at most ``length`` characters."""
+    return text if len(text) <= length else f"{text[: max(length - 2, 0)]}.."
+
+
+def _short(value: Any) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype") and value.shape:
+        return f"[{', '.join(f'{x:.6g}' for x in value)}]" if value.shape in ((1,), (2,)) else _size(value.shape)
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return f"{float(value):.6g}"
+    if isinstance(getattr(value, "name", None), str):
+        return repr(value.name)
+    text = str(value) if hasattr(value, "_mpf_") else repr(value)
+    if len(text) > LONGEST_VALUE and isinstance(value, tuple | list | Mapping):
+        return _size((len(value),))
+    return clipped(text.replace("\n", " "), LONGEST_VALUE)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"<{' x '.join(map(str, shape))}>"
