@@ -56,7 +56,7 @@ class RunOutcome:
         seconds: seconds spent in steps.
         failure: error of the step that failed, or ``None``.
         interrupted: True if a signal ended the run.
-        broken: message if the steps of tau miss the tolerance that they were chosen for, else ``None``.
+        missed: message if the steps of tau miss the tolerance that they were chosen for, else ``None``.
     """
 
     trajectory: Trajectory | DrivenTrajectory
@@ -65,7 +65,7 @@ class RunOutcome:
     seconds: float
     failure: StepFailedError | None
     interrupted: bool
-    broken: str | None = None
+    missed: str | None = None
 
     @property
     def end(self) -> tuple[float, Array, Array]:
@@ -108,7 +108,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
         seconds=work.seconds,
         failure=work.failure,
         interrupted=work.stopped,
-        broken=_broken(model, trajectory),
+        missed=_missed(model, trajectory),
     )
 
 
@@ -174,11 +174,11 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
         seconds=time.perf_counter() - began,
         failure=failure,
         interrupted=bool(caught) and not observed.ended,
-        broken=_broken(model, trajectory),
+        missed=_missed(model, trajectory),
     )
 
 
-def _broken(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
+def _missed(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
     """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
     allowed = allowed_error(model)
     if allowed is None or not model.paced:

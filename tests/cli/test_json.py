@@ -104,7 +104,7 @@ def test_the_numbers_of_a_run_are_those_of_the_library():
     exact = stepper.integrate(kepler.q, velocity=kepler.velocity, t_end=5.0).q[-1]
     error = np.abs(run.q[-1] - exact)
     assert np.all(np.array(list(found["final_error"]["q"].values())) > 0.3 * error)
-    assert (found["failure"], found["broken"], found["written"]) == (None, None, ["orbit.npz"])
+    assert (found["failure"], found["missed"], found["written"]) == (None, None, ["orbit.npz"])
 
 
 def test_a_run_that_fails_tells_how_far_it_came():
@@ -112,7 +112,7 @@ def test_a_run_that_fails_tells_how_far_it_came():
     assert "step" in found["failure"]
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
     far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
-    assert "use another monitor" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["broken"]
+    assert "use another monitor" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
 
 

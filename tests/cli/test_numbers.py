@@ -310,7 +310,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         "final_error": near_truth,
         "chaotic": lambda x: x is False,
         "failure": lambda x: x is None,
-        "broken": lambda x: x is None,
+        "missed": lambda x: x is None,
         "written": lambda x: [Path(each).name for each in x] == ["states.npz"],
     }
 
@@ -445,7 +445,7 @@ def test_every_field_and_line_of_an_ensemble(springs):
         "energy_change": lambda x: abs(x - change) < 1e-14 * largest(energy) and change > 1e-7,
         "momentum_errors": lambda x: abs(x["angular momentum"] - largest((turning - turning[0]) / sizes)) < 2e-15,
         "failure": lambda x: x is None,
-        "broken": lambda x: x is None,
+        "missed": lambda x: x is None,
         "written": lambda x: x == ["many.npz"],
     }
     assert numbers.keys() <= checks.keys()
@@ -472,7 +472,7 @@ def test_every_field_and_line_of_a_recorded_run(springs):
         "final": lambda x: x == memory["final"],  # held against the saved states above
         "finished": lambda x: x is True,
         "failure": lambda x: x is None,
-        "broken": lambda x: x is None,
+        "missed": lambda x: x is None,
         "written": lambda x: x == ["long.run"],
     }
     assert numbers.keys() <= checks.keys()

@@ -194,7 +194,7 @@ def _check_confirmed(found: GlobalError | None) -> None:
         unconfirmed = (
             f"the bound {found.requested:g} on the global error is confirmed only until t = {found.confirmed_until:g}"
         )
-        tell(broken=unconfirmed)
+        tell(missed=unconfirmed)
         raise CommandFailure(unconfirmed, FAILURE)
 
 
@@ -284,15 +284,15 @@ def _run_one(
         raise CommandFailure(f"{outcome.failure}\n{_kept(outcome, written)}", FAILURE)
     if outcome.interrupted:
         raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{_kept(outcome, written)}", INTERRUPTED)
-    if outcome.broken is not None:
-        tell(broken=outcome.broken)
-        raise CommandFailure(f"{outcome.broken}\n{_kept(outcome, written)}", FAILURE)
+    if outcome.missed is not None:
+        tell(missed=outcome.missed)
+        raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
-    broken = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised, known)
-    tell(broken=broken or None)
-    if broken:
-        raise CommandFailure(broken, FAILURE)
+    missed = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised, known)
+    tell(missed=missed or None)
+    if missed:
+        raise CommandFailure(missed, FAILURE)
 
 
 def _finish_recording(outcome: RecordedOutcome) -> None:
