@@ -50,7 +50,7 @@ def test_sweeps_carry_what_factors_do(name):
     random, m = np.random.default_rng(20261122), swept.dimension
     q = np.array([0.9, -0.4, 0.1, 0.6, -0.8, 0.2, 0.5, -0.3, 0.4, 0.7])[:m]
     p = swept.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
-    directions = random.normal(size=(swept.given, 9))
+    directions = random.normal(size=(swept._input_size, 9))
     slopes = random.normal(size=(STEPS + 1, 2 * m, 2))
     found = []
     for stepper in (swept, factored):
