@@ -145,7 +145,7 @@ def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -
     copy = copied(run)
     for each in (run, copy):
         for name in {"u", "w"} - set(held):
-            with pytest.raises(sc.StateError, match=name):
+            with pytest.raises(sc.StateError, match=r"the input '[uw]' is not set"):
                 each.advance(1)
             each.set_inputs(**{name: 0.2})
         each.advance(2)
