@@ -4,11 +4,11 @@ const searchWords = (new URLSearchParams(location.search).get("q") || "").toLowe
 const supporting = {reference: -10, gallery: -8, coming_from: -8, performance: -6, theory: -4, glossary: -2};
 
 var Scorer = {
-  score: ([docname, title, anchor, description, score]) => {
-    const heading = title.toLowerCase();
+  score: ([docname, title, anchor, description, score, filename, kind]) => {
+    const heading = kind === "object" ? "" : title.toLowerCase();
     const matched = searchWords.filter((word) => heading.includes(word)).length;
-    const kind = docname === "reference/index" || docname === "performance" ? "" : docname.split(/[/_]/)[0];
-    const section = docname.startsWith("coming_from") ? "coming_from" : kind;
+    const group = docname === "reference/index" || docname === "performance" ? "" : docname.split(/[/_]/)[0];
+    const section = docname.startsWith("coming_from") ? "coming_from" : group;
     return score + (10 * matched) / Math.max(searchWords.length, 1) + (supporting[section] || 0);
   },
   // Defaults of Sphinx.

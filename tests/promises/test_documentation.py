@@ -187,6 +187,15 @@ QUERIES = {
     "quickstart": "quickstart",
     "tutorial": "tutorials/index tutorials/orbit tutorials/mechanism tutorials/lattice tutorials/fit",
     "API reference": "reference/index",
+    "N-body": "lattices",
+    "PDE": "lattices",
+    "MPI": "decomposition",
+    "parallel": "ensembles",
+    "Jacobian": "derivatives",
+    "tolerance": "steps",
+    "friction": "forces",
+    "stiff": "methods array_solvers",
+    "cite": "paper",
 }
 """What users search for, and the pages of which one must be among the first three results."""
 SETTLED = """() => {
