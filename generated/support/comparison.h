@@ -9,3 +9,4 @@
 #define MOST_HALVINGS 24
 #define GROSS_DIFFERENCE REAL(10.0) /* relative to the state: beyond it the step is a spurious solution */
 #define ROUNDING_OF_HALVES (64 * REAL_EPSILON)
+#define SMALL_PART REAL(0.1) /* of the largest momentum: smaller changes count as little */

@@ -34,8 +34,8 @@ NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
 WAVE_VECTORS = 2
 """Further vectors: scratch of Fourier transforms (templates/support/indexed_waves.h)."""
-HALVES_VECTORS = 6
-"""Further vectors: the state at the start of a step and two increments (templates/support/indexed_halves.h)."""
+HALVES_VECTORS = 7
+"""Further vectors: the state at the start of a step and three increments (templates/support/indexed_halves.h)."""
 
 
 def render_indexed(program: IndexedProgram) -> Source:

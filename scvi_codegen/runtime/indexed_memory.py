@@ -15,9 +15,12 @@ from scvi_codegen.runtime.indexed_interface import Numbers
 
 __all__ = ["MOMENTS", "STATE", "IndexedMark", "aligned", "held_memory"]
 
-CHOICE = ("rung", "change", "change_before", "direction", "rejected", "failed", "avoiding", "error_before")
+CHOICE = ("rung", "change", "change_before", "direction", "rejected", "failed", "avoiding", "error_before", "doubted")
 """Fields of the C struct that control adaptive steps."""
-MOMENTS = ("t", "t_low", "h", "step", "guess", "turn", "error", "error_t", "largest_q", "largest_p", "leaving", *CHOICE)
+MOMENTS = (
+    *("t", "t_low", "h", "step", "guess", "turn", "error", "error_t"),
+    *("largest_q", "largest_p", "leaving", "uneven", *CHOICE),
+)
 """Scalar fields of the C struct of a run."""
 STATE = ("q", "p", "carry_q", "carry_p")
 """Arrays of the state: positions, momenta and their compensation terms."""

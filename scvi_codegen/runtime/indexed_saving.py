@@ -18,10 +18,11 @@ from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE
 __all__ = ["read_saved", "restore_memory", "saved_arrays", "saved_bytes", "telling_of_damage"]
 
 RANGES = {
-    **dict.fromkeys(("step", "rejected", "avoiding", "leaving"), (0, 2**53)),
+    **dict.fromkeys(("step", "rejected", "avoiding", "leaving", "doubted"), (0, 2**53)),
     "guess": (0, 2),
     "turn": (0, 2),
     "direction": (-1, 1),
+    "uneven": (0, 1),
     **dict.fromkeys(("rung", "change", "change_before", "failed"), (-(2**16), 2**16)),
 }
 """Smallest and largest values of whole numbers that C uses as indices or states."""

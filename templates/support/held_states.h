@@ -40,7 +40,7 @@ static int project_positions(const held_run *of)
       size += to * to;
       parts->Y[i] = to;
     }
-    judge(&now, beside_state(moved, size, of->options), of->options, of->report);
+    judge(&now, changes_of_all(moved, size, of->options), of->options, of->report);
   }
 }
 

@@ -123,7 +123,7 @@ static int meet(const held_run *of, double h, double t, double *size)
     add_to(held->lambda, held->change, 1.0, held->count);
     find_reactions(held, held->change, parts->F, of->n);
     moved = h * h / 2 * (h * h / 2) * push(parts->R, parts->F, 1.0, of->run->inverse_mass, of->n);
-    judge(&now, beside_state(moved, *size, of->options), of->options, of->report);
+    judge(&now, changes_of_all(moved, *size, of->options), of->options, of->report);
   }
 }
 
@@ -159,7 +159,7 @@ static int turn(const held_run *of, double by, double unit, double size)
       return status;
     find_reactions(held, held->change, of->parts.R, of->n);
     moved = unit * by * (unit * by) * push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
-    judge(&now, beside_state(moved, size, of->options), of->options, of->report);
+    judge(&now, changes_of_all(moved, size, of->options), of->options, of->report);
   }
 }
 

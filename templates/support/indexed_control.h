@@ -2,7 +2,7 @@
 
 static void take_trial(run_memory *run, trial *now)
 {
-  accept(run, now->n, now->error, now->guess);
+  accept(run, now->n, larger(now->error, now->apart), now->guess);
   if (now->last) {
     now->at.t = now->t_end;
     now->at.t_low = 0.0;
@@ -25,7 +25,9 @@ static int take_trials(run_memory *run, const travel *way, solver_report *report
   begin_trials(run, &now, way->tolerance, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
-    const int status = find_step(run, &now, options, report);
+    int status = find_step(run, &now, options, report);
+    if (status == OK)
+      status = confirm_step(run, &now, options, report);
     if (status != OK)
       return status;
     take_trial(run, &now);

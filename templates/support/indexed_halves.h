@@ -2,15 +2,17 @@
  * in place, so that F of the step is lost; forces of former steps are preserved. Requires: comparison.h,
  * HALVES_VECTORS, solve and go_on of a solver. */
 
-/* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half. */
+/* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half;
+ * increments of momenta by the step. */
 typedef struct {
-  double *q, *p, *carry_q, *carry_p, *whole, *first;
+  double *q, *p, *carry_q, *carry_p, *whole, *first, *whole_p;
 } state_at_start;
 
 static state_at_start state_in(const run_memory *run, long long n)
 {
   double *work = run->work + (STATUS(WORK) - HALVES_VECTORS) * n;
-  const state_at_start kept = {work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n};
+  const state_at_start kept = {work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n,
+      work + 6 * n};
   return kept;
 }
 
@@ -24,15 +26,33 @@ static void copy_state(const state_at_start *from, const state_at_start *to, sec
   memcpy(to->carry_p + own.first, from->carry_p + own.first, size);
 }
 
-static inline double increment_of(const run_memory *run, const state_at_start *kept, long long i)
+/* Positions, or momenta, now and at the start of a step, and their increments by the step. */
+typedef struct {
+  const double *now, *carry, *start, *start_carry;
+  double *whole;
+} numbers;
+
+static numbers positions_of(const run_memory *run, const state_at_start *kept)
 {
-  return (run->q[i] - kept->q[i]) + (run->carry_q[i] - kept->carry_q[i]);
+  const numbers of = {run->q, run->carry_q, kept->q, kept->carry_q, kept->whole};
+  return of;
 }
 
-static void note_increments(const run_memory *run, const state_at_start *kept, double *increments, section own)
+static numbers momenta_of(const run_memory *run, const state_at_start *kept)
+{
+  const numbers of = {run->p, run->carry_p, kept->p, kept->carry_p, kept->whole_p};
+  return of;
+}
+
+static inline double increment_of(const numbers *x, long long i)
+{
+  return (x->now[i] - x->start[i]) + (x->carry[i] - x->start_carry[i]);
+}
+
+static void note_increments(const numbers *x, double *increments, section own)
 {
   for (long long i = own.first; i < own.end; i++)
-    increments[i] = increment_of(run, kept, i);
+    increments[i] = increment_of(x, i);
 }
 
 /* Performs a step without a predictor. */
@@ -54,17 +74,19 @@ static int make_part(run_memory *run, const problem *given, long long n, const s
 static int make_halves(run_memory *run, const problem *given, long long n, double h, const state_at_start *kept,
     const solver_options *options)
 {
+  numbers positions;
   int status;
   run->h = h / 2;
   status = make_part(run, given, n, options);
   if (status != OK)
     return status;
-  note_increments(run, kept, kept->first, mine(run, n));
+  positions = positions_of(run, kept);
+  note_increments(&positions, kept->first, mine(run, n));
   return make_part(run, given, n, options);
 }
 
 /* Largest difference of the increments relative to the state after the half steps; 0 if it may be rounding. */
-static double difference(const run_memory *run, const state_at_start *kept, long long n)
+static double difference(const run_memory *run, const numbers *x, long long n)
 {
   double largest, most;
   sums all;
@@ -72,7 +94,7 @@ static double difference(const run_memory *run, const state_at_start *kept, long
   while (next_block(&all)) {
     double of_block = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++)
-      of_block = larger(of_block, fabs(kept->q[i]) + fabs(increment_of(run, kept, i)));
+      of_block = larger(of_block, fabs(x->start[i]) + fabs(increment_of(x, i)));
     add_block(&all, of_block, 0.0);
   }
   wait_for_others(run);
@@ -81,8 +103,8 @@ static double difference(const run_memory *run, const state_at_start *kept, long
   while (next_block(&all)) {
     double of_block = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      const double increment = increment_of(run, kept, i), size = fabs(kept->q[i]) + fabs(increment) + largest;
-      const double apart = fabs(kept->whole[i] - increment) / size;
+      const double increment = increment_of(x, i), size = fabs(x->start[i]) + fabs(increment) + largest;
+      const double apart = fabs(x->whole[i] - increment) / size;
       if (!(apart <= of_block))
         of_block = apart < INFINITY ? apart : INFINITY;
     }
@@ -93,24 +115,29 @@ static double difference(const run_memory *run, const state_at_start *kept, long
   return most > ROUNDING_OF_HALVES ? most : 0.0;
 }
 
-/* Computes the error of the solved step as in halves.h; state and time are restored. */
-static SELDOM int compare_with_halves(run_memory *run, const problem *given, long long n,
+/* Computes the error of the solved step as in halves.h, of momenta too if requested; state and time are restored. */
+static SELDOM int compare_with_halves(run_memory *run, const problem *given, long long n, int momenta,
     const solver_options *options, double *error)
 {
-  const state_at_start kept = state_in(run, n), now = {run->q, run->p, run->carry_q, run->carry_p, NULL, NULL};
+  const state_at_start kept = state_in(run, n), now = {run->q, run->p, run->carry_q, run->carry_p, NULL, NULL, NULL};
+  const numbers q = positions_of(run, &kept), p = momenta_of(run, &kept);
   const section own = mine(run, n);
   const double whole = run->h, t = run->t, t_low = run->t_low;
+  const long long uneven = run->uneven;
   double before = -1.0, h = whole;
   int status = OK, go = 1;
   copy_state(&now, &kept, own);
   go_on(run, n);
-  note_increments(run, &kept, kept.whole, own);
+  note_increments(&q, kept.whole, own);
+  note_increments(&p, kept.whole_p, own);
   *error = 0.0;
   for (int k = 0; go && k < MOST_HALVINGS; k++) {
     double apart = INFINITY;
     copy_state(&kept, &now, own);
     if (make_halves(run, given, n, h, &kept, options) == OK)
-      apart = difference(run, &kept, n);
+      apart = difference(run, &q, n);
+    if (momenta && k == 0 && apart < INFINITY)
+      *error = difference(run, &p, n);
     *error = larger(*error, apart);
     if (!(apart <= GROSS_DIFFERENCE))
       status = STATUS(STRAYED);
@@ -122,5 +149,6 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
   }
   copy_state(&kept, &now, own);
   run->h = whole;
+  run->uneven = uneven;
   return status;
 }

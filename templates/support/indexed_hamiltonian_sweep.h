@@ -37,45 +37,56 @@ static void continue_slopes(const run_memory *run, const parts_of_work *parts, l
       }
 }
 
-/* Updates a block of y from index `first` on from its rates, by a table and weights; returns the sum of the squared
- * changes and adds the squared sizes to *size. */
-static double improve_block(const run_memory *run, lanes *X, const lanes *rates, const lanes *table,
-    const lanes *weights, long long first, long long n, section here, double *size)
+/* Updates a block of y from index `first` on from its rates, by a table and weights; computes the sums of the squared
+ * scaled changes, relative changes and scaled sizes, and the largest size. */
+static void improve_block(const run_memory *run, lanes *X, const lanes *rates, const lanes *table,
+    const lanes *weights, long long first, long long n, const measures *by_size, section here, double *total)
 {
   const long long apart = 2 * n;
-  lanes total = lanes_of(0.0);
+  lanes of_all = lanes_of(0.0), of_each = lanes_of(0.0);
+  double size = 0.0, largest = 0.0;
   for (long long i = first + here.first; i < first + here.end; i++) {
-    lanes scaled[GROUPS], increment[GROUPS];
-    double of_one;
+    lanes kick[GROUPS], increment[GROUPS];
+    double of_one, inverse;
     for (int g = 0; g < GROUPS; g++)
-      scaled[g] = run->h * weights[g] * rates[g * apart + i - first];
+      kick[g] = run->h * weights[g] * rates[g * apart + i - first];
+    for (int g = 0; g < GROUPS; g++)
+      increment[g] = given_by_all(table, g, kick, 1);
+    of_one = fabs(run->q[i]) + fabs(at_point(increment, 1, POINTS - 1));
+    largest = larger(largest, of_one);
+    of_one *= by_size->scale;
+    size += of_one * of_one;
+    inverse = inverse_size(of_one, by_size);
     for (int g = 0; g < GROUPS; g++) {
-      lanes y, moved;
-      increment[g] = given_by_all(table, g, scaled, 1);
-      y = run->q[i] + (run->carry_q[i] + increment[g]), moved = y - X[g * apart + i];
-      total += moved * moved;
+      const lanes y = run->q[i] + (run->carry_q[i] + increment[g]), moved = y - X[g * apart + i];
+      const lanes scaled = by_size->scale * moved, relative = inverse * moved;
+      of_all += scaled * scaled;
+      of_each += relative * relative;
       X[g * apart + i] = y;
     }
-    of_one = fabs(run->q[i]) + fabs(at_point(increment, 1, POINTS - 1));
-    *size += of_one * of_one;
   }
-  return lanes_total(total);
+  total[0] = lanes_total(of_all), total[1] = lanes_total(of_each), total[2] = size, total[3] = largest;
 }
 
-/* Updates n elements; returns the sum of the squared changes, relative to that of the sizes unless these are
- * absolute. */
-static double improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
-    long long first, long long n, const solver_options *options)
+/* Updates n elements; *largest is the largest size, on entry that of the previous iteration. */
+static changes improve(const run_memory *run, lanes *X, const lanes *rates, const lanes *table, const lanes *weights,
+    long long first, long long n, double *largest, const solver_options *options)
 {
+  const changes sudden = {1.0, 1.0};
+  const measures by_size = measures_of(*largest);
+  const double before = *largest;
+  double total[4];
   sums all;
   begin_sums(&all, run, n);
   while (next_block(&all)) {
-    double size = 0.0;
-    const double change = improve_block(run, X, rates, table, weights, first, n, all.here, &size);
-    add_block(&all, change, size);
+    improve_block(run, X, rates, table, weights, first, n, &by_size, all.here, total);
+    add_values(&all, total, 4);
   }
   wait_for_others(run);
-  return beside_state(sum_of(&all, 0), sum_of(&all, 1), options);
+  for (int k = 0; k < 3; k++)
+    total[k] = sum_of(&all, k);
+  *largest = largest_of(&all, 3);
+  return *largest > SUDDEN_GROWTH * before ? sudden : changes_of(total, &by_size, n, options);
 }
 
 /* Returns 1 if all rates are finite. */
@@ -168,15 +179,18 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
 {
   const parts_of_work parts = divide(run, n);
   iteration now = at_its_start();
-  double change = 0.0;
+  double largest_q = 0.0, largest_p = 0.0;
+  changes last = {0.0, 0.0};
   continue_slopes(run, &parts, n, tables, *guess);
   for (int k = 0; now.status == 0; k++) {
-    const double of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, options);
-    const double of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, options);
+    const changes of_q = improve(run, parts.X, parts.G + n, POSITION, POSITION_WEIGHT, 0, n, &largest_q, options);
+    const changes of_p = improve(run, parts.X, parts.G, MOMENTUM, MOMENTUM_WEIGHT, n, n, &largest_p, options);
+    const changes both = {of_q.of_all + of_p.of_all, of_q.of_each + of_p.of_each};
+    const changes pair = {last.of_all + both.of_all, last.of_each + both.of_each};
     forces(run, given, parts.X, 2 * n, parts.G, 2 * n);
-    change = k % 2 ? of_q + of_p : change + of_q + of_p;
     if (k > 0 && k % 2 == 0)
-      judge(&now, change, options, report);
+      judge(&now, pair, options, report);
+    last = both;
   }
   if (now.status < 0)
     return failure_of(&now);

@@ -8,7 +8,8 @@ typedef struct {
   lengths by;
   long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
-  double state; /* size of the coordinates */
+  measures by_size;
+  double state; /* scaled size of the coordinates */
   const lanes *X;
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;

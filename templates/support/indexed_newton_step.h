@@ -43,7 +43,7 @@ static void find_residual(linear_system *of, const lanes *X, const lanes *F)
   }
 }
 
-/* Squared size of the coordinates in the step. */
+/* Squared scaled size of the coordinates in the step. */
 static double size_of_state(const linear_system *of, const lanes *X)
 {
   const run_memory *run = of->run;
@@ -54,7 +54,7 @@ static double size_of_state(const linear_system *of, const lanes *X)
     for (long long i = all.here.first; i < all.here.end; i++) {
       double low;
       const double part = fabs(run->q[i]) + fabs(drift_of(run, i, &low));
-      const double of_one = part + fabs(at_point(&X[i], of->n, KEPT - 1) - run->q[i]);
+      const double of_one = of->by_size.scale * (part + fabs(at_point(&X[i], of->n, KEPT - 1) - run->q[i]));
       size += of_one * of_one;
     }
     add_block(&all, size, 0.0);
@@ -93,28 +93,28 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   double largest = first_positions(run, &parts, &of.by, n, tables, *guess);
   iteration now = at_its_start();
   forces_at_points(run, given, parts.X, parts.F, n);
+  largest = largest_moved(run, parts.F, &of.by, n, largest);
+  of.by_size = measures_of(largest);
   start_nearer(&of, &parts);
   of.state = sqrt(size_of_state(&of, parts.X));
   while (now.status == 0) {
-    double change, size, left;
+    double total[3] = {0.0}, left;
     find_residual(&of, parts.X, parts.F);
-    if (now.last > REFRESHED) /* also before the first iteration */
+    if (now.last.of_all > REFRESHED) /* also before the first iteration */
       find_inverses(&of);
     left = find_correction(&of, report);
     add_multiple(&of, parts.X, 1.0, of.correction);
     forces_at_points(run, given, parts.X, parts.F, n);
-    change = inner_product(&of, of.correction, of.correction);
-    size = size_of_state(&of, parts.X);
-    of.state = sqrt(size);
-    judge(&now, beside_state(change, size, options), options, report);
+    total[0] = inner_product(&of, of.correction, of.correction);
+    total[2] = size_of_state(&of, parts.X);
+    of.state = sqrt(total[2]);
+    judge(&now, changes_of(total, &of.by_size, n, options), options, report);
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
                                                            * correction */
-      now.status = -1, now.last = left;
+      now.status = -1, now.last.of_all = left;
   }
   if (now.status < 0)
     return failure_of(&now);
-  if (largest <= DBL_MIN)
-    largest = largest_at_end(run, parts.X, n);
   *guess = steps_to_continue(*guess, now.first);
   return examine(run, parts.F, &of.by, n, largest, decay, error) ? OK : NOT_FINITE;
 }

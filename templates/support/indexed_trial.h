@@ -1,4 +1,4 @@
-/* Trial of an adaptive step of an indexed system. Requires: rungs.h, ladder_tables.h, indexed_step.h. */
+/* Trial of an adaptive step of an indexed system. Requires: rungs.h, ladder_tables.h, indexed_step.h; DOUBTS. */
 #define HOT static
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
@@ -10,7 +10,7 @@ typedef struct {
     double t, t_low;
   } at;
   error_limits limits;
-  double t_end, error;
+  double t_end, error, apart; /* apart: error estimate by two half steps; 0 if they were not computed */
   int last; /* 1 if the step ends at t_end */
 } trial;
 
@@ -25,4 +25,41 @@ static void try_step(run_memory *run, trial *now, double least, const solver_opt
   if (solve(run, now->given, now->n, &tables, &now->guess, now->limits.decay, &now->error,
           options, report) != OK)
     now->error = INFINITY;
+}
+
+/* Returns 1 if the solved step changes the momenta by a small part of the largest one. */
+static SELDOM int changes_little(run_memory *run, const trial *step)
+{
+  const long long n = step->n;
+  const state_at_start kept = state_in(run, n), now = {run->q, run->p, run->carry_q, run->carry_p, NULL, NULL, NULL};
+  const numbers p = momenta_of(run, &kept);
+  const section own = mine(run, n);
+  sums all;
+  copy_state(&now, &kept, own);
+  go_on(run, n);
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    double change = 0.0, size = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      change = larger(change, fabs(increment_of(&p, i)));
+      size = larger(size, fabs(p.start[i]));
+    }
+    add_block(&all, change, size);
+  }
+  wait_for_others(run);
+  copy_state(&kept, &now, own);
+  return largest_of(&all, 0) < SMALL_PART * largest_of(&all, 1);
+}
+
+/* Compares a trial with two half steps, in momenta too if requested, and solves it again. */
+static SELDOM int compare_trial(run_memory *run, trial *now, int momenta, const solver_options *options, double *apart)
+{
+  const double error = now->error;
+  solver_report unread = {0};
+  const int status = compare_with_halves(run, now->given, now->n, momenta, options, apart);
+  try_step(run, now, 0, options, &unread);
+  if (status == OK && !(now->error < INFINITY))
+    return STATUS(STRAYED);
+  now->error = error;
+  return status;
 }

@@ -1,7 +1,9 @@
 /* Vectors over all points of all coordinates; every thread computes its own part. Requires: indexed_newton.h. */
 
+/* Inner product of scaled vectors. */
 static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
 {
+  const double scale = of->by_size.scale;
   sums all;
   begin_sums(&all, of->run, of->n);
   while (next_block(&all)) {
@@ -10,11 +12,11 @@ static double inner_product(const linear_system *of, const lanes *x, const lanes
       long long i = g * of->n + all.here.first;
       const long long end = g * of->n + all.here.end;
       for (; i + 1 < end; i += 2) {
-        a += x[i] * y[i];
-        b += x[i + 1] * y[i + 1];
+        a += (scale * x[i]) * (scale * y[i]);
+        b += (scale * x[i + 1]) * (scale * y[i + 1]);
       }
       if (i < end)
-        a += x[i] * y[i];
+        a += (scale * x[i]) * (scale * y[i]);
     }
     add_block(&all, lanes_total(a + b), 0.0);
   }

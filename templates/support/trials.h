@@ -1,6 +1,13 @@
-/* Trials of an adaptive step until its error estimate is admissible. Requires: rungs.h; the type trial with at.t,
- * at.t_low, t_end, limits, change, error, guess and last, and try_step, which sets the last three; SHORT_STEPS_FAIL, 1
- * if rounding alone may make a step fail; HOT. Include before the code that accepts the step. */
+/* Trials of an adaptive step until its error estimate is admissible, and comparison with two half steps. Requires:
+ * rungs.h, comparison.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last and apart;
+ * try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps, in momenta too
+ * if requested; changes_little, 1 if the momenta change by a small part of the largest one; SHORT_STEPS_FAIL, 1 if
+ * rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. Include before the code that accepts
+ * the step. */
+
+#define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
+#define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
+#define DOUBTED 16 /* steps that are compared after one that was shortened by a comparison */
 
 /* Number of levels by which the first step may be increased at once. */
 static int rungs_up(const trial *now)
@@ -73,6 +80,50 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   now->error = larger(now->error, least);
   now->change += run->rung;
   return OK;
+}
+
+/* Returns 1 if the momenta of a step are compared, too: after a step that was wrong, and where the step size fell by a
+ * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
+ * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
+ * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
+static inline int is_doubted(run_memory *run, const trial *now)
+{
+  return DOUBTS && (run->doubted > 0 || (now->change <= -OCTAVE && changes_little(run, now)));
+}
+
+/* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
+static SELDOM int compare_step(run_memory *run, trial *now, int doubted, const solver_options *options,
+    solver_report *report)
+{
+  const real allowed = larger(
+      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), doubted ? ROUNDOFF_LEVEL : SPURIOUS);
+  for (;;) {
+    real apart;
+    int status = compare_trial(run, now, doubted, options, &apart);
+    if (status > STATUS(STRAYED))
+      return status;
+    if (status == OK && apart <= allowed) {
+      now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
+      run->doubted -= run->doubted > 0;
+      return OK;
+    }
+    run->doubted = DOUBTED;
+    now->error = INFINITY;
+    if (!shorten(run, now, MOST_DOWN))
+      return STATUS(VANISHED);
+    run->error_before = now->limits.most;
+    status = find_step(run, now, options, report);
+    if (status != OK)
+      return status;
+  }
+}
+
+/* Compares the first step, one of COMPARED later, and those in doubt. */
+static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
+{
+  const int doubted = is_doubted(run, now);
+  now->apart = 0;
+  return doubted || run->step % COMPARED == 0 ? compare_step(run, now, doubted, options, report) : OK;
 }
 
 /* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the

@@ -86,3 +86,39 @@ def test_a_momentum_that_is_no_number_is_no_step():
     with pytest.raises(sc.StepFailedError, match="finite"):
         run.advance(1)
     assert run.q["q"][0] == 0.0
+
+
+@pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
+def test_a_light_stiff_mass_keeps_its_energy_beside_a_slow_one(form):
+    """The 2-norm of both would leave 1e-10 of it after 2,000 steps, of the Hamiltonian 1e-9."""
+    light, frequency, amplitude = 1e-8, 20.0, 1e-6
+    if form == "hamiltonian":
+        text = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/m[i] + k[i]*q[i]**2 + c[i]*q[i]**4)/2"}
+    else:
+        text = {"lagrangian": "sum(i in N, m[i]*q_dot[i]**2 - k[i]*q[i]**2 - c[i]*q[i]**4)/2"}
+    parameters = {"m[N]": 1, "k[N]": 1, "c[N]": 1}
+    system = sc.IndexedSystem.from_text(name="pair", coordinates=["q[N]"], parameters=parameters, **text)
+    stiffness = light * frequency**2
+    data = {"m": [1.0, light], "k": [1.0, stiffness], "c": [0.5, 0.0]}
+    run = sc.compile_indexed(system, "svi:8").start([1.0, amplitude], np.zeros(2), h=0.05, parameters=data)
+    run.advance(2000)
+    energy = run.p["q"][1] ** 2 / light + stiffness * run.q["q"][1] ** 2
+    assert abs(energy / (stiffness * amplitude**2) - 1) < 2e-14
+
+
+@pytest.mark.parametrize(("method", "solver", "h"), EACH)
+@pytest.mark.parametrize("exponent", [-900, -660, 660, 900])
+def test_squares_of_states_neither_overflow_nor_underflow(method, solver, h, exponent):
+    one, scaled = run_of(method, solver, h, 1.0), run_of(method, solver, h, 2.0**exponent)
+    assert np.abs(np.ldexp(scaled.q["q"], -exponent) - one.q["q"]).max() < 1e-14
+    assert scaled.iterations == pytest.approx(one.iterations, rel=0.02, abs=2)
+
+
+@pytest.mark.parametrize("exponent", [-660, 660])
+@pytest.mark.parametrize(("method", "solver"), [way for way in WAYS if way[0] != "stoermer-verlet"])
+def test_adaptive_steps_are_controlled_at_every_scale(method, solver, exponent):
+    form = "hamiltonian" if method == "hamiltonian" else ""
+    made = sc.compile_indexed(springs(form), "svi:4" if form else method, solver=solver)
+    one, scaled = (made.integrate(s * Q, s * P, t_end=2.0, tolerance=1e-9) for s in (1.0, 2.0**exponent))
+    assert scaled.steps == pytest.approx(one.steps, abs=2)
+    assert np.abs(np.ldexp(scaled.q["q"][-1], -exponent) - one.q["q"][-1]).max() < 1e-8

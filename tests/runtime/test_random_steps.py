@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from random_steps import FAMILIES, WANTED, compiled, outcome, trials
+from random_steps import FAMILIES, WANTED, compiled, displaced, outcome, trials
 
 import scvi_codegen as sc
 
@@ -65,6 +65,52 @@ def test_no_step_of_any_method_is(method, solver):
         check(name, method, solver, trials(name, 1100))
 
 
+def adaptive_ratio(name, method, solver, q, p, t, tolerance):
+    """Error of the first adaptive step of an array over the estimate of its run; None if the run fails."""
+    family, stepper = FAMILIES[name], compiled(name, method, solver)
+    shape = [axis.number or 1 for axis in stepper.interface.coordinates[0].axes]
+    at = [np.reshape(x, [-1, *shape[1:]]) for x in (q, p)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            run = stepper.integrate(*at, t=t, t_end=t + 3 * family.period, tolerance=tolerance)
+        except sc.StepFailedError:
+            return None
+    exact = sc.compile_stepper(family.written_out, sc.SVI(12))
+    end = exact.integrate(q, p, t=t, t_end=run.t[1]).q[-1]
+    return max(displaced(q, end, np.ravel(run.q["x"][1])) - 1e-11, 0.0) / run.step_error
+
+
+@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
+def test_an_adaptive_run_of_an_array_begins_with_no_spurious_step(solver):
+    """The curve of a step of three periods is smooth: its end was off by 50 times the state, at an estimate of 0.02."""
+    for method, q, p, tolerance in (
+        ("svi:2", [-0.39936294, 0.54643295], [-1.0628843, -0.90845495], 0.0415577830),
+        ("svi:3", [-0.33422731, -0.19620278], [0.07154765, -2.03847018], 0.0061320165),
+    ):
+        ratio = adaptive_ratio("ellipses", method, solver, np.array(q), np.array(p), 0.0, tolerance)
+        assert ratio is not None
+        assert ratio < WANTED
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("solver", ["fixed-point", "newton"])
+@pytest.mark.parametrize("method", ["svi:2", "svi:3", "svi:4", "svi:6", "svi:8", "gauss:3", "gauss:4"])
+def test_no_first_step_of_an_adaptive_run_of_an_array_is(method, solver):
+    """At tolerances above 1e-2 the half steps of an accepted step may differ from it by the whole state."""
+    for name in (each for each in FAMILIES if isinstance(FAMILIES[each].system, sc.IndexedSystem)):
+        random = np.random.default_rng(5)
+        exact = sc.compile_stepper(FAMILIES[name].written_out, sc.SVI(12))
+        ratios = []
+        for _ in range(100):
+            q, v, t = FAMILIES[name].state(random)
+            tolerance = 10.0 ** random.uniform(-7.0, -2.0)
+            ratios.append(adaptive_ratio(name, method, solver, q, exact.momentum(q, v, t), t, tolerance))
+        accepted = [ratio for ratio in ratios if ratio is not None]
+        assert len(accepted) > 80
+        assert max(accepted) <= WANTED
+
+
 SPURIOUS = {
     "planar-pendulum": [
         ("scvi:3", 0.3071399754577905, -1.0088668625585298, 3.2754332164851276),
@@ -116,18 +162,24 @@ def test_comparing_with_halves_leaves_a_run_as_it_is():
         assert whole.step_error < 1e-6
 
 
+@pytest.mark.parametrize("steps", [{"h": 0.1, "steps": 12}, {"t_end": 0.5, "tolerance": 1e-6}], ids=["h", "t_end"])
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-def test_comparing_with_halves_leaves_an_array_as_it_is(solver):
+def test_comparing_with_halves_leaves_an_array_as_it_is(solver, steps):
     """Every step is compared, for any number of threads, and the run is that of which few are."""
     few = compiled("chain", "svi:4", solver)
-    headers = tuple((name, text.replace("COMPARED 512", "COMPARED 1")) for name, text in few.source.support)
-    source = dataclasses.replace(few.source, support=headers)
-    assert source != few.source
-    save_every = sc.IndexedStepper(source, few.interface)
+
+    def comparing(source):
+        headers = tuple((name, text.replace("COMPARED 512", "COMPARED 1")) for name, text in source.support)
+        assert headers != source.support
+        return dataclasses.replace(source, support=headers)
+
+    controlled = comparing(few._controlled_text())
+    all_of_them = sc.IndexedStepper(comparing(few.source), few.interface, controlled=lambda: controlled)
     start = np.random.default_rng(1).normal(size=1100)
-    wanted = few.integrate(start, h=0.1, steps=12)
+    wanted = few.integrate(start, **steps)
+    assert wanted.steps > 5
     for threads in (1, 2):
-        found = save_every.integrate(start, h=0.1, steps=12, threads=threads)
+        found = all_of_them.integrate(start, threads=threads, **steps)
         assert np.array_equal(found.q["x"], wanted.q["x"])
         assert np.array_equal(found.p["x"], wanted.p["x"])
         assert found.step_error >= wanted.step_error
