@@ -313,4 +313,4 @@ def test_a_duffing_oscillator_is_found_in_a_noisy_recording(output_of):
         value, error = map(float, re.search(rf"{name} += (\S+) \+- (\S+)", output).groups())
         assert abs(value - true) < 3.0 * error < 0.02
     assert abs(float(re.search(r"noise of (\S+),", output)[1]) - 0.02) < 0.002
-    assert "do not tell m, alpha, beta, delta and gamma apart" in output
+    assert "do not determine m, alpha, beta, delta and gamma separately" in output
