@@ -22,7 +22,7 @@ enum {
   MAX_ITERATIONS = 50, /* default */
   MAPS = 1, /* first integrals from symmetries */
   SUMS = 1, /* integrals along the curve of a step */
-  BAND = 1, /* largest distance of coupled coordinates in the ordering PLACE */
+  BAND = 1, /* largest distance of coupled coordinates in the ordering POSITION_IN_MATRIX */
   MASS_ENTRIES = 2, /* nonzero entries of the Legendre transform */
   MEMORY = 14, /* numbers kept from step to step */
   SCRATCH = 64 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
@@ -30,7 +30,7 @@ enum {
 
 #include "support/double.h"
 #include "support/numbers.h"
-#include "support/answers.h"
+#include "support/status_codes.h"
 #include "support/step.h"
 
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
@@ -85,8 +85,8 @@ static const int NODE_SLOPE_3[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int NODE_SLOPE_4[2][2] = {{0, 0}, {1, 1}};
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
-static const int PLACE[SITES] = {0, 1};
-#define MASS_PLACE PLACE
+static const int POSITION_IN_MATRIX[SITES] = {0, 1};
+#define MASS_POSITION POSITION_IN_MATRIX
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
 INVERSE_ROOT(1, (inverse));
@@ -255,10 +255,10 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   scatter(QUADRATURE_SCATTER_1[0], 2, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 4,
-      slope + 0, 6, jacobian, shape);
-  scatter_slopes(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      slope + 4, 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
+      4, &slope[0], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
+      &slope[4], 6, jacobian, shape);
 }
 
 /* Node points: adds their part of the rows, and of the Jacobian unless it is NULL. */
@@ -284,15 +284,15 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
   scatter(NODE_SCATTER_3[0], 2, NODE_WEIGHT, h, value + 6, 8, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_slopes(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, slope + 0, 16,
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, &slope[0], 16,
       jacobian, shape);
-  scatter_slopes(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_1, 4, slope + 4, 16, jacobian,
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_1, 4, &slope[4], 16,
+      jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_2, 2, &slope[8], 16, jacobian,
       shape);
-  scatter_slopes(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_2, 2, slope + 8, 16, jacobian,
-      shape);
-  scatter_slopes(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_3, 4, slope + 10, 16, jacobian,
-      shape);
-  scatter_slopes(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_4, 2, slope + 14, 16, jacobian,
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_3, 4, &slope[10], 16,
+      jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_4, 2, &slope[14], 16, jacobian,
       shape);
 }
 
@@ -311,18 +311,18 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define STAGE_POWER 1.5 /* exponent from the curve's estimate to the error of the end */
 static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
 static const double STAGE_NEXT[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
-static const double STAGE_BEND[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
-static const double STAGE_OTHER_BEND[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
+static const double STAGE_CURVATURE[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
+static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
 #include "support/stage_error.h"
 #include "support/newton_from_line.h"
-#include "support/strays.h"
+#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 2
 #define LANES 2
 #define HOT static inline __attribute__((always_inline))
-#define SWEEPS_AFTER 0
+#define FINAL_ITERATIONS 0
 #define NODES 2
 
 #include "support/vectors.h"
@@ -389,16 +389,16 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
   value[1] = -(w0 * u[1]);
 }
 
-#include "support/contraction.h"
+#include "support/convergence.h"
 #include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/diagonal_mass.h"
 #include "support/unknown_velocity.h"
 #include "support/curve.h"
 #include "support/curve_points.h"
-#include "support/shooting_sweep.h"
+#include "support/shooting_iteration.h"
 #include "support/newton_fallback.h"
-#include "support/sweep_solver.h"
+#include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
@@ -411,7 +411,7 @@ static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
 #include "support/curve_error.h"
-#include "support/sweep_or_stage_error.h"
+#include "support/iteration_or_stage_error.h"
 #include "support/sizes.h"
 #include "support/comparison.h"
 #include "support/halves.h"

@@ -21,7 +21,7 @@ enum {
   MAX_ITERATIONS = 50, /* default */
   MAPS = 1, /* first integrals from symmetries */
   SUMS = 1, /* integrals along the curve of a step */
-  BAND = 1, /* largest distance of coupled coordinates in the ordering PLACE */
+  BAND = 1, /* largest distance of coupled coordinates in the ordering POSITION_IN_MATRIX */
   MASS_ENTRIES = 2, /* nonzero entries of the Legendre transform */
   MEMORY = 16, /* numbers kept from step to step */
   SCRATCH = 56 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
@@ -29,7 +29,7 @@ enum {
 
 #include "support/double.h"
 #include "support/numbers.h"
-#include "support/answers.h"
+#include "support/status_codes.h"
 #include "support/step.h"
 
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
@@ -71,8 +71,8 @@ static const int QUADRATURE_SLOPE_0[4][2] = {{0, 0}, {0, 1}, {1, 0}, {1, 1}};
 static const int QUADRATURE_SLOPE_1[2][2] = {{0, 0}, {1, 1}};
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
-static const int PLACE[SITES] = {0, 1};
-#define MASS_PLACE PLACE
+static const int POSITION_IN_MATRIX[SITES] = {0, 1};
+#define MASS_POSITION POSITION_IN_MATRIX
 static const int MASS_ENTRY[2][2] = {{0, 0}, {1, 1}};
 
 INVERSE_ROOT(1, (inverse));
@@ -166,10 +166,10 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   scatter(QUADRATURE_SCATTER_1[0], 4, QUADRATURE_WEIGHT, 1, value + 2, 4, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_slopes(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0, 4,
-      slope + 0, 6, jacobian, shape);
-  scatter_slopes(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 4, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      slope + 4, 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
+      4, &slope[0], 6, jacobian, shape);
+  scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 4, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
+      &slope[4], 6, jacobian, shape);
 }
 
 /* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
@@ -186,17 +186,17 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define STAGE_POWER 1.6666666666666667 /* exponent from the curve's estimate to the error of the end */
 static const double STAGE_HIGHEST[4] = {-3.710270034019473, 9.39772470377753, -9.39772470377753, 3.710270034019473};
 static const double STAGE_NEXT[4] = {3.195048252113469, -3.195048252113469, -3.195048252113469, 3.195048252113469};
-static const double STAGE_BEND[4] = {-1.0, 0.0, 0.0, 1.0};
-static const double STAGE_OTHER_BEND[4] = {-1.0, 0.0, 1.0, 0.0};
+static const double STAGE_CURVATURE[4] = {-1.0, 0.0, 0.0, 1.0};
+static const double STAGE_OTHER_CURVATURE[4] = {-1.0, 0.0, 1.0, 0.0};
 
 #include "support/stage_error.h"
 #include "support/newton_from_line.h"
-#include "support/strays.h"
+#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 4
 #define HOT static inline __attribute__((always_inline))
-#define SWEEPS_AFTER 1
+#define FINAL_ITERATIONS 1
 
 #include "support/vectors.h"
 #include "support/inverse_roots.h"
@@ -260,12 +260,12 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[1] = 1.0;
 }
 
-#include "support/contraction.h"
+#include "support/convergence.h"
 #include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
-#include "support/separable_sweep.h"
+#include "support/separable_iteration.h"
 #include "support/newton_fallback.h"
-#include "support/sweep_solver.h"
+#include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 4
@@ -278,7 +278,7 @@ static const lanes HIGHEST[GROUPS] = {-0.37102700340194733, 0.939772470377753, -
 static const lanes NEXT[GROUPS] = {0.5325080420189116, -0.5325080420189116, -0.5325080420189116, 0.5325080420189116};
 
 #include "support/curve_error.h"
-#include "support/sweep_or_stage_error.h"
+#include "support/iteration_or_stage_error.h"
 #include "support/sizes.h"
 #include "support/comparison.h"
 #include "support/halves.h"

@@ -13,7 +13,7 @@
 enum {
   M = 1, /* coordinates */
   MAX_ITERATIONS = 50, /* default */
-  BAND = 0, /* largest distance of coupled coordinates in the ordering PLACE */
+  BAND = 0, /* largest distance of coupled coordinates in the ordering POSITION_IN_MATRIX */
   MASS_ENTRIES = 1, /* nonzero entries of the Legendre transform */
   MEMORY = 1, /* numbers kept from step to step */
   SCRATCH = 2 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
@@ -21,12 +21,12 @@ enum {
 
 #include "support/double.h"
 #include "support/numbers.h"
-#include "support/answers.h"
+#include "support/status_codes.h"
 #include "support/step.h"
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
-static const int PLACE[M] = {0};
-#define MASS_PLACE PLACE
+static const int POSITION_IN_MATRIX[M] = {0};
+#define MASS_POSITION POSITION_IN_MATRIX
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */

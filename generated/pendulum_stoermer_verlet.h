@@ -62,7 +62,7 @@ typedef struct {
   long long iterations; /* since the last stored state */
   double error, error_t; /* largest error estimate of a step so far, and the time of that step */
   double largest_q, largest_p; /* largest numbers of the states examined so far */
-  long long leaving; /* steps after a start at rest in the origin, while the error is rescaled with the state */
+  long long steps_from_rest; /* steps after a start at rest in the origin, while the error is rescaled with the state */
 } pendulum_stoermer_verlet_run;
 
 /* Tolerance 2.220446049250313e-16 (relative), at most 50 iterations. */

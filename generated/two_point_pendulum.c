@@ -21,7 +21,7 @@ enum {
   MOST_ITERATIONS = INT_MAX, /* whatever the options are */
   MAX_ITERATIONS = 50, /* default */
   SUMS = 1, /* integrals along the curve of a step */
-  BAND = 0, /* largest distance of coupled coordinates in the ordering PLACE */
+  BAND = 0, /* largest distance of coupled coordinates in the ordering POSITION_IN_MATRIX */
   MASS_ENTRIES = 1, /* nonzero entries of the Legendre transform */
   MEMORY = 4, /* numbers kept from step to step */
   SCRATCH = 12 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
@@ -29,7 +29,7 @@ enum {
 
 #include "support/double.h"
 #include "support/numbers.h"
-#include "support/answers.h"
+#include "support/status_codes.h"
 #include "support/step.h"
 
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
@@ -42,8 +42,8 @@ static const double MOVES[1] = {1.0};
 static const double QUADRATURE_WEIGHT[2] = {0.5, 0.5};
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
-static const int PLACE[SITES] = {0};
-#define MASS_PLACE PLACE
+static const int POSITION_IN_MATRIX[SITES] = {0};
+#define MASS_POSITION POSITION_IN_MATRIX
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* L_q and L_v at u = (q, v). Operations: 6 *, 1 neg, 1 sin. */
@@ -134,12 +134,12 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 
 #include "support/newton.h"
 #include "support/newton_from_line.h"
-#include "support/strays.h"
+#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 2
 #define HOT static inline __attribute__((always_inline))
-#define SWEEPS_AFTER 1
+#define FINAL_ITERATIONS 1
 
 #include "support/vectors.h"
 #include "support/vector_library.h"
@@ -184,12 +184,12 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
-#include "support/contraction.h"
+#include "support/convergence.h"
 #include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
-#include "support/separable_sweep.h"
+#include "support/separable_iteration.h"
 #include "support/newton_fallback.h"
-#include "support/sweep_solver.h"
+#include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
@@ -202,7 +202,7 @@ static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 static const lanes NEXT[GROUPS] = {0.0, 0.0};
 
 #include "support/curve_error.h"
-#include "support/sweep_error.h"
+#include "support/iteration_error.h"
 #include "support/sizes.h"
 #include "support/comparison.h"
 #include "support/halves.h"

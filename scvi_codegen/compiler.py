@@ -3,11 +3,11 @@
     MechanicalSystem, Method
       -> discretise  StageSystem   points, kernel and tables: the equations of one step
                                    (:mod:`scvi_codegen.methods.discretise`)
-      -> sweep_of    Sweep         fixed-point iteration, if the system admits one; splitting_of: explicit splitting
+      -> iteration_of    Sweep         fixed-point iteration, if the system admits one; splitting_of: explicit splitting
                                    (:mod:`scvi_codegen.lowering.solvers.choice`)
       -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
       -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
-      -> render      Source        header and source text, from ``templates/`` (:mod:`scvi_codegen.rendering.text`);
+      -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);
                                    plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
       -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration is
                                    added when a fixed point first fails (:mod:`scvi_codegen.rendering.fallback`)
@@ -19,7 +19,7 @@ paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them i
 CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stage equations as CasADi expressions.
 
 Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
-cached in the user's cache folder (:mod:`scvi_codegen.rendering.text_cache`), so later calls skip the derivation.
+cached in the user's cache folder (:mod:`scvi_codegen.rendering.source_cache`), so later calls skip the derivation.
 """
 
 from __future__ import annotations
@@ -32,31 +32,29 @@ from functools import cache, partial
 from sympy import Expr
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.parts import key_of
-from scvi_codegen.given.kinds import SWITCH, TEXT, TEXTS, takes
+from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.density import density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.rolled import with_sums
-from scvi_codegen.lowering.solvers.choice import check_solver, sweep_of
-from scvi_codegen.lowering.solvers.ladder import control_of
+from scvi_codegen.lowering.solvers.choice import check_solver, iteration_of
+from scvi_codegen.lowering.solvers.predictor_tables import control_of
 from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
-from scvi_codegen.mechanics.changes import with_changes
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
-from scvi_codegen.mechanics.rolled import rolled
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.term_groups import rolled
+from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
+from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.events import with_events
-from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.rendering.text import (
+from scvi_codegen.rendering.program_source import (
     EMBEDDED,
     Embedded,
     render,
@@ -65,9 +63,11 @@ from scvi_codegen.rendering.text import (
     render_ensemble,
     workspace_size,
 )
-from scvi_codegen.rendering.text_cache import remembered_text
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source_cache import cached_source
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import SWITCH, TEXT, TEXTS, checks_arguments
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_source", "program_of"]
 
@@ -81,7 +81,7 @@ C_HEADERS = frozenset(
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
-@takes(system=SYSTEM, solver=TEXT, flags=TEXTS, prefix=TEXT, symmetries=SYMMETRIES)
+@checks_arguments(system=SYSTEM, solver=TEXT, flags=TEXTS, prefix=TEXT, symmetries=SYMMETRIES)
 def compile_stepper(
     system: MechanicalSystem,
     method: Method | str,
@@ -117,24 +117,24 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: if the solver is not available for the method.
     """
-    texts = _Texts(system, as_method(method, system), solver, prefix, symmetries, monitor)
-    own = json.loads(remembered_text((*texts.key, "integrator"), texts.integrator))
+    sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, monitor)
+    own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
     source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
     return Stepper(
         source,
         interface,
-        ensemble=texts.remembered("ensemble", lambda: render_ensemble(texts.program())),
-        controlled=texts.remembered("controlled", texts.controlled),
-        fallback=texts.remembered("fallback", texts.fallback),
-        tangent=texts.remembered("tangent", texts.tangent),
-        curvature=texts.remembered("curvature", partial(texts.tangent, second=True)),
-        changes=lambda count: texts.remembered(f"changes {count}", partial(texts.changes, count))(),
+        ensemble=sources.remembered("ensemble", lambda: render_ensemble(sources.program())),
+        controlled=sources.remembered("controlled", sources.controlled),
+        fallback=sources.remembered("fallback", sources.fallback),
+        tangent=sources.remembered("tangent", sources.tangent),
+        curvature=sources.remembered("curvature", partial(sources.tangent, second=True)),
+        changes=lambda count: sources.remembered(f"changes {count}", partial(sources.changes, count))(),
         flags=flags,
         events=as_events(events),
     )
 
 
-class _Texts:
+class _Sources:
     """C sources of one integrator and its variants, derived on first use."""
 
     def __init__(
@@ -154,18 +154,24 @@ class _Texts:
     def program(self, *, fallback: bool = False) -> Program:
         """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
         if fallback not in self._programs:
-            with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
+            with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
                 self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
         return self._programs[fallback]
 
     @property
-    def borrows(self) -> bool:
+    def uses_fallback_library(self) -> bool:
         """Return whether Newton's iteration comes from a separate fallback library."""
         return self.solver == "auto" and self.program().sweep is not None and not self.program().newton
 
     def integrator(self) -> str:
         """Return the C source and its interface as JSON."""
-        interface = describe(self.program(), self.system, self.method, borrows=self.borrows, monitor=self.monitor)
+        interface = describe(
+            self.program(),
+            self.system,
+            self.method,
+            uses_fallback_library=self.uses_fallback_library,
+            monitor=self.monitor,
+        )
         return json.dumps([self._rendered().to_json(), interface.to_json()])
 
     def controlled(self) -> Source | None:
@@ -175,7 +181,7 @@ class _Texts:
 
     def fallback(self) -> Source | None:
         """Return the source with Newton's iteration if the integrator itself contains none."""
-        return render(self.program(fallback=True), fallback="lent") if self.borrows else None
+        return render(self.program(fallback=True), fallback="provided") if self.uses_fallback_library else None
 
     def tangent(self, *, second: bool = False) -> Source | None:
         """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
@@ -188,38 +194,40 @@ class _Texts:
         if not found.newton:  # explicit steps
             found = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
-        with waiting_for(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
+        with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
             return render_derivatives(derivatives_of(self.system, stages, found, second=second))
 
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
-        twin, sweep = lagrangian_twin(self.system), self.program().sweep
-        varied = with_changes(twin, count) if twin and sweep and sweep.serves_many and sweep.constant_mass else None
+        twin, sweep = equivalent_lagrangian(self.system), self.program().sweep
+        varied = (
+            with_tangent_vectors(twin, count) if twin and sweep and sweep.serves_many and sweep.constant_mass else None
+        )
         if varied is None:
             return None
         stages, prefix = discretise(varied, self.method), self.program().prefix
-        program = lower(varied, self.method, stages, prefix=prefix, sweep=sweep_of(varied, stages), newton=False)
+        program = lower(varied, self.method, stages, prefix=prefix, sweep=iteration_of(varied, stages), newton=False)
         return render_ensemble(program)
 
     def _rendered(self, control: Control | None = None) -> Source:
-        return render(self.program(), control, fallback="borrowed" if self.borrows else None)
+        return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
 
     def remembered(self, name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
         """Return a function that makes a source or loads it from the cache."""
 
         @cache
         def source() -> Source | None:
-            text = remembered_text((*self.key, name), lambda: _text_of(make()))
+            text = cached_source((*self.key, name), lambda: _json_of(make()))
             return Source.from_json(text) if text else None
 
         return source
 
 
-def _text_of(source: Source | None) -> str:
+def _json_of(source: Source | None) -> str:
     return "" if source is None else source.to_json()
 
 
-@takes(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
+@checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
 def generate_source(
     system: MechanicalSystem,
     method: Method | str,
@@ -306,8 +314,8 @@ def _program(
     stages = discretise(system, method)
     explicit = solver in ("auto", "explicit") and not system.integrands
     splitting = splitting_of(system, method) if explicit else None
-    swept = lanes and solver in ("auto", "fixed-point") and splitting is None
-    sweep = sweep_of(system, stages) if swept else None
+    use_fixed_point = lanes and solver in ("auto", "fixed-point") and splitting is None
+    sweep = iteration_of(system, stages) if use_fixed_point else None
     check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
     alone = sweep is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
@@ -329,10 +337,10 @@ def describe(
     system: MechanicalSystem,
     method: Method,
     *,
-    borrows: bool = False,
+    uses_fallback_library: bool = False,
     monitor: str | Expr | None = None,
 ) -> Interface:
-    """Return the interface of a program; ``borrows``: Newton's iteration comes from a separate fallback library."""
+    """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
     return Interface(
         prefix=program.prefix,
         title=program.title,
@@ -344,11 +352,11 @@ def describe(
         defaults=program.parameter_defaults,
         unknowns=program.unknowns,
         workspace=workspace_size(program),
-        has_action=program.action or (borrows and program.acts),
+        has_action=program.action or (uses_fallback_library and program.acts),
         map_names=tuple(each.name for each in program.momentum_maps),
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
-        has_fallback=borrows or (program.newton and program.sweep is not None),
+        has_fallback=uses_fallback_library or (program.newton and program.sweep is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,

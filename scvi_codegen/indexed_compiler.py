@@ -15,25 +15,25 @@ from dataclasses import replace
 from functools import cached_property
 
 from scvi_codegen.compiler import c_identifier
-from scvi_codegen.given.kinds import TEXT, TEXTS, takes
 from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.lowering.indexed import check_solver, lower_indexed, one_coordinate, with_control
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
+from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.indexed import render_indexed
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.rendering.text_cache import remembered_text
+from scvi_codegen.rendering.source_cache import cached_source
 from scvi_codegen.runtime.indexed_interface import IndexedInterface
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.validation.argument_types import TEXT, TEXTS, checks_arguments
 
 __all__ = ["compile_indexed", "generate_indexed"]
 
 
-@takes(system=INDEXED, flags=TEXTS, prefix=TEXT, solver=TEXT)
+@checks_arguments(system=INDEXED, flags=TEXTS, prefix=TEXT, solver=TEXT)
 def compile_indexed(
     system: IndexedSystem,
     method: Method | str,
@@ -58,19 +58,19 @@ def compile_indexed(
         BuildError: if there is no C compiler.
         MethodError: if the method or the solver is not supported.
     """
-    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
-    return IndexedStepper(texts.plain, texts.interface, controlled=lambda: texts.controlled, flags=flags)
+    sources = _IndexedSources(system, as_method(method, one_coordinate(system)), prefix, solver)
+    return IndexedStepper(sources.plain, sources.interface, controlled=lambda: sources.controlled, flags=flags)
 
 
 def generate_indexed(
     system: IndexedSystem, method: Method | str, *, solver: str = "fixed-point", prefix: str | None = None
 ) -> tuple[Source, IndexedInterface]:
     """Return the C source and its interface; arguments and errors as of :func:`compile_indexed`."""
-    texts = _IndexedTexts(system, as_method(method, one_coordinate(system)), prefix, solver)
-    return texts.plain, texts.interface
+    sources = _IndexedSources(system, as_method(method, one_coordinate(system)), prefix, solver)
+    return sources.plain, sources.interface
 
 
-class _IndexedTexts:
+class _IndexedSources:
     """C sources of one integrator, derived on first use."""
 
     def __init__(self, system: IndexedSystem, method: Method, prefix: str | None, solver: str) -> None:
@@ -89,7 +89,7 @@ class _IndexedTexts:
     @cached_property
     def program(self) -> IndexedProgram:
         """Lowered program with fixed step size."""
-        with waiting_for(f"deriving the equations of {self.system.name} by {self.method.name}"):
+        with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
             return lower_indexed(self.system, self.method, self.prefix, newton=self.solver == "newton")
 
     @cached_property
@@ -109,7 +109,7 @@ class _IndexedTexts:
         return Source.from_json(found) if found else None
 
     def _remembered(self, what: str, make: Callable[[], str]) -> str:
-        return remembered_text((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
+        return cached_source((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
 
 
 def _interface(system: IndexedSystem, method: Method, prefix: str) -> IndexedInterface:

@@ -18,7 +18,7 @@ SELDOM int NAME(discrete_legendre)(real t, real h, const real *q0, const real *q
     v[i] = (q1[i] - q0[i]) / h;
   status = NAME(momentum)(t, q0, v, parameters, start_p, workspace);
   if (status == OK) {
-    place_on_line(v, start_p, data.z);
+    start_on_line(v, start_p, data.z);
     status = newton(&step, &data, q1, start_p, increment, &keep, options ? options : &standard, report);
   }
   if (status != OK)

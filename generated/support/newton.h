@@ -4,9 +4,9 @@
 
 #define STOPPED_SHRINKING REAL(0.25) /* Newton updates converge quadratically: one that decreases by less is rounding */
 #define STAGE_ROUNDOFF (REAL(32.0) * REAL_EPSILON) /* rounding error of positions that a stiff force determines */
-#define STALLS (SITES > M ? 2 : 1) /* with frozen factors positions and multipliers converge one after the other */
-#define KEEP_CHANGE REAL(1e-2) /* factors are reused while updates are below this part of the state */
-#define KEEP_RATE REAL(0.1) /* and decrease at least tenfold: then another iteration costs less than new factors */
+#define STAGNATIONS (SITES > M ? 2 : 1) /* with frozen factors positions and multipliers converge one after the other */
+#define REUSE_CHANGE REAL(1e-2) /* factors are reused while updates are below this part of the state */
+#define REUSE_RATE REAL(0.1) /* and decrease at least tenfold: then another iteration costs less than new factors */
 
 /* Change of the stages and the end momentum by the last update: the largest ratio to the own size, the ratio of the
  * largest to the largest size, and the largest itself. */
@@ -53,7 +53,7 @@ static newton_data newton_in(real *workspace)
 }
 
 /* Stages of a straight line with velocity v and momentum p0; other unknowns are 0. */
-static void place_on_line(const real *v, const real *p0, real *z)
+static void start_on_line(const real *v, const real *p0, real *z)
 {
   memset(z + M * B, 0, sizeof(real) * (N - M * B));
   for (int i = 0; i < M; i++)
@@ -68,10 +68,10 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
   const int blocks = shape->rows / SITES;
   real change[SITES];
   for (int i = 0; i < SITES; i++)
-    memcpy(data->update + PLACE[i] * blocks, data->rows + i * (B + 1), sizeof(real) * (size_t)blocks);
+    memcpy(data->update + POSITION_IN_MATRIX[i] * blocks, data->rows + i * (B + 1), sizeof(real) * (size_t)blocks);
   back_substitute(data->factors, shape, data->pivot, data->update);
   for (int i = 0; i < SITES; i++) {
-    const real *update = data->update + PLACE[i] * blocks;
+    const real *update = data->update + POSITION_IN_MATRIX[i] * blocks;
     change[i] = 0;
     for (int b = 0; b < B; b++) {
       data->z[i * B + b] -= update[b];
@@ -81,7 +81,7 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
   measure(moved, change, size_q);
   moved->stages = moved->overall;
   for (int i = 0; p0 && i < M; i++) {
-    change[i] = data->update[PLACE[i] * blocks + B];
+    change[i] = data->update[POSITION_IN_MATRIX[i] * blocks + B];
     p0[i] -= change[i];
   }
   if (p0)
@@ -90,7 +90,7 @@ static void apply_update(const newton_data *data, const band *shape, real h, rea
 
 /* Returns 1 if an update at round-off level no longer decreases. A stiff force amplifies the rounding of positions in
  * the momenta: then only the positions are at round-off, and the momenta cannot be computed more accurately. */
-static int has_stalled(const movement *moved, real last)
+static int has_stagnated(const movement *moved, real last)
 {
   return moved->relative >= STOPPED_SHRINKING * last &&
       (moved->overall <= ROUNDOFF_LEVEL || moved->stages <= STAGE_ROUNDOFF);
@@ -99,7 +99,7 @@ static int has_stalled(const movement *moved, real last)
 /* Returns 1 if the iterate that `moved` led to is accepted: its update is below the tolerance, or has stalled at
  * round-off level. With frozen factors convergence is linear: one decrease is required, and two to distinguish
  * round-off from slow convergence. */
-static int has_converged(const solver_options *options, const movement *moved, int stalls, int trials)
+static int has_converged(const solver_options *options, const movement *moved, int stagnations, int trials)
 {
   if (trials < 2)
     return 0;
@@ -107,7 +107,7 @@ static int has_converged(const solver_options *options, const movement *moved, i
     return moved->absolute < options->tolerance;
   if (moved->relative <= options->tolerance)
     return 1;
-  return trials > 2 && stalls >= STALLS;
+  return trials > 2 && stagnations >= STAGNATIONS;
 }
 
 /* Replaces the row of p1 - p0 by q0 + h sum_b beta_b z_b = q1, with p0 as a further unknown. */
@@ -121,7 +121,7 @@ static void add_boundary(const step_data *step, const newton_data *data, const r
       *row += END_POSITION[b] * data->z[i * B + b];
   }
   for (int i = 0; with_jacobian && i < M; i++) {
-    real *corner = data->factors + shape->first + PLACE[i] * (B + 1) * (shape->stride + 1);
+    real *corner = data->factors + shape->first + POSITION_IN_MATRIX[i] * (B + 1) * (shape->stride + 1);
     for (int b = 0; b < B; b++) {
       corner[B * shape->stride + b] = MOMENTUM_ROW[b];
       corner[b * shape->stride + B] = END_POSITION[b];
@@ -150,7 +150,7 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
   const band shape = band_of(SITES, q1 ? B + 1 : B);
   real size_q[M], size_p[SITES], change[M], last = (real)INFINITY;
   movement moved = no_movement();
-  int trials = 0, stalls = 0;
+  int trials = 0, stagnations = 0;
   memset(increment, 0, sizeof(real) * M);
   for (int k = 0;; k++) {
     evaluate(step, data->z, data->rows, size_p, size_q, *keep ? NULL : data->factors, &shape);
@@ -166,8 +166,8 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     if (k > 0) {
       measure(&moved, change, size_p);
       report->change = options->absolute ? moved.absolute : moved.relative;
-      stalls += has_stalled(&moved, last);
-      if (has_converged(options, &moved, stalls, trials)) {
+      stagnations += has_stagnated(&moved, last);
+      if (has_converged(options, &moved, stagnations, trials)) {
 #ifdef DAMPED
         shrink(step, increment);
 #endif
@@ -182,8 +182,8 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
       return SINGULAR;
     moved = no_movement();
     apply_update(data, &shape, step->h, p0, size_p, size_q, &moved);
-    *keep = has_converged(options, &moved, stalls + has_stalled(&moved, last), trials) ||
-        (moved.overall < KEEP_CHANGE && moved.relative < KEEP_RATE * last);
+    *keep = has_converged(options, &moved, stagnations + has_stagnated(&moved, last), trials) ||
+        (moved.overall < REUSE_CHANGE && moved.relative < REUSE_RATE * last);
     report->iterations++;
   }
 }

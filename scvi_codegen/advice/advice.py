@@ -17,20 +17,20 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.advice.pilot import STEEP, Pilot, launch
+from scvi_codegen.advice.pilot import EXPONENTIAL_POWER, Pilot, run_pilot
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.display.cards import Html, card, grid, plain
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.given.kinds import SWITCH, TEXT, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.representation import summary
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
 
 __all__ = ["Advice", "Evidence", "advise"]
 
@@ -38,7 +38,7 @@ DEGREES = (2, 4, 6, 8, 10, 12)
 """Degrees, or numbers of stages, among which ``advise`` chooses."""
 SAFETY = 2.0
 """Ratio of the tolerance to the error aimed at."""
-CLOSE = 1.5
+BISECTION_RATIO = 1.5
 """Ratio of the errors of neighbouring step sizes at which bisection ends."""
 ORDER_MARGIN = 0.3
 """Largest relative deviation of the measured from the claimed order for extrapolating to untried steps."""
@@ -46,7 +46,7 @@ LANES = 8
 """Numbers in a vector register, for the cost of an evaluation."""
 OVERHEAD = 3.0
 """Cost of a step in addition to its iterations, in iterations."""
-MUCH_LESS = 0.9
+WORK_RATIO = 0.9
 """Ratio of work at which a smaller step is preferred to the largest admissible one."""
 NUMBERS, FEWEST, MOST = 2**21, 2**13, 2**18
 """Number of stage positions computed in one pilot run, and bounds of its number of steps."""
@@ -109,8 +109,8 @@ class Advice:
         return card(f"Advice: {self.method.title}", facts, pilots)
 
 
-@takes(system=SYSTEM, degree=SWITCH, solver=TEXT)
-@unwarned()
+@checks_arguments(system=SYSTEM, degree=SWITCH, solver=TEXT)
+@without_accuracy_warnings()
 def advise(
     system: MechanicalSystem,
     method: Method | str,
@@ -158,7 +158,7 @@ def advise(
     method = as_method(method, system)
     if system.clock is not None:
         raise MethodError(
-            f"'{system.name}' is in transformed time: no step size is recommended; use longest_step or try h"
+            f"'{system.name}' is in transformed time: no step size is recommended; use largest_step or try h"
         )
     length, target = checked_number(span, "the span"), checked_number(tolerance, "the tolerance")
     if length == 0.0:
@@ -166,21 +166,21 @@ def advise(
     if target <= 0.0:
         raise StateError(f"the tolerance must be positive, not {tolerance!r}")
     state = {"p": p, "t": t, "parameters": parameters, "options": options}
-    found: list[tuple[float, Advice]] = []
+    result: list[tuple[float, Advice]] = []
     failures: list[StateError] = []
     for candidate in _candidates(method) if degree else [method]:
         for stepper in _steppers(system, candidate, solver):
             try:
-                found.append(_advised(stepper, candidate, is_symplectic(candidate, system), q, state, length, target))
+                result.append(_advised(stepper, candidate, is_symplectic(candidate, system), q, state, length, target))
             except StateError as failure:
                 failures.append(failure)
                 continue
-            if found[-1][1].expected_error <= target:
+            if result[-1][1].expected_error <= target:
                 break
-    if not found:
+    if not result:
         raise failures[-1]
-    met = [pair for pair in found if pair[1].expected_error <= target]
-    return min(met, key=lambda pair: pair[0])[1] if met else min(found, key=lambda pair: pair[1].expected_error)[1]
+    met = [pair for pair in result if pair[1].expected_error <= target]
+    return min(met, key=lambda pair: pair[0])[1] if met else min(result, key=lambda pair: pair[1].expected_error)[1]
 
 
 def _advised(
@@ -196,13 +196,13 @@ def _advised(
     start = stepper.start(q, state["p"], h=1.0, t=state["t"], parameters=state["parameters"]).q  # checks the arguments
     points = _points(method)
     most = min(max(FEWEST, NUMBERS // (points * stepper.dimension)), MOST)
-    pilot = launch(
+    pilot = run_pilot(
         partial(stepper.integrate, **state),
         method,
         start,
         span,
         symplectic=symplectic,
-        goal=tolerance / SAFETY,
+        target_error=tolerance / SAFETY,
         most=most,
     )
     choice = _choose(pilot, tolerance)
@@ -237,7 +237,7 @@ def _points(method: Method) -> int:
 def _cost(pilot: Pilot, n: float, points: int) -> float:
     """Return the number of evaluations, in full vector registers, per unit of time."""
     nearest = min(pilot.good, key=lambda k: abs(math.log(k / n)))
-    return (pilot.legs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES / pilot.step(n)
+    return (pilot.runs[nearest].iterations + OVERHEAD) * math.ceil(points / LANES) * LANES / pilot.step(n)
 
 
 class _Choice(NamedTuple):
@@ -251,16 +251,16 @@ class _Choice(NamedTuple):
 
 def _choose(pilot: Pilot, tolerance: float) -> _Choice:
     """Return the largest step that meets the tolerance, or whose error is dominated by round-off."""
-    floor, (coarse, fine) = pilot.floor_at_end, pilot.judged[-2:]
-    goal = max(tolerance / SAFETY, 2.0 * floor)
-    n = _cheapest(pilot, _bisected(pilot, goal))
+    floor, (coarse, fine) = pilot.floor_at_end, pilot.compared[-2:]
+    target_error = max(tolerance / SAFETY, 2.0 * floor)
+    n = _cheapest(pilot, _bisected(pilot, target_error))
     if n is not None or (pilot.rate and floor > tolerance):
         n = n or fine
-        return _Choice(n, min(1.0, pilot.error(n)), tuple(_doubts(pilot, tolerance, n)))
-    doubts = tuple(_doubts(pilot, tolerance, fine))
-    missed, ratio = pilot.error(fine) / goal, pilot.error(coarse) / pilot.error(fine)
+        return _Choice(n, min(1.0, pilot.error(n)), tuple(_warnings(pilot, tolerance, n)))
+    doubts = tuple(_warnings(pilot, tolerance, fine))
+    missed, ratio = pilot.error(fine) / target_error, pilot.error(coarse) / pilot.error(fine)
     if ratio > 1.0 and abs(math.log(ratio, fine / coarse) - pilot.order) <= ORDER_MARGIN * pilot.order:
-        return _Choice(fine * missed ** (1.0 / pilot.order), goal, doubts, tried=False)
+        return _Choice(fine * missed ** (1.0 / pilot.order), target_error, doubts, tried=False)
     words = (
         f"the tolerance may be missed: the errors of runs with steps down to {pilot.step(pilot.finest):.3g} do not "
         "follow the order of the method yet"
@@ -268,7 +268,7 @@ def _choose(pilot: Pilot, tolerance: float) -> _Choice:
     return _Choice(fine, min(1.0, pilot.error(fine)), (*doubts, words))
 
 
-def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
+def _warnings(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
     """Yield warnings about conditions that prevent, or may prevent, the tolerance from being met."""
     floor = pilot.floor_at_end
     if pilot.rate:
@@ -278,27 +278,27 @@ def _doubts(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
             yield f"{chaos}, at an uncertain rate later"
             return
         yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
-        digits = math.log10(tolerance / max(pilot.late_error(n), 2.0**-52))
+        digits = math.log10(tolerance / max(pilot.final_quarter_error(n), 2.0**-52))
         kept = max(0.0, abs(pilot.length) + digits * tenfold)
         yield f"the recommended step meets it for about {kept:.3g} units of time"
     elif floor > tolerance / SAFETY:
         yield f"round-off alone causes an error of about {floor:.1g} at the end, for any step size"
-    elif not pilot.whole and pilot.growth > STEEP:
+    elif not pilot.whole and pilot.growth > EXPONENTIAL_POWER:
         yield f"errors grew like t^{pilot.growth:.1f} in the pilot runs, a rate that may not continue"
 
 
-def _bisected(pilot: Pilot, goal: float) -> int | None:
+def _bisected(pilot: Pilot, target_error: float) -> int | None:
     """Return the fewest steps that meet the bound, as all larger numbers do; ``None`` if the finest run does not."""
-    fits = list(takewhile(lambda n: pilot.error(n) <= goal, reversed(pilot.judged)))
+    fits = list(takewhile(lambda n: pilot.error(n) <= target_error, reversed(pilot.compared)))
     if not fits:
         return None
-    best, worse = fits[-1], max((n for n in pilot.legs if n < fits[-1]), default=0)
-    while worse and best / worse > CLOSE ** (1.0 / pilot.order):
+    best, worse = fits[-1], max((n for n in pilot.runs if n < fits[-1]), default=0)
+    while worse and best / worse > BISECTION_RATIO ** (1.0 / pilot.order):
         middle = _sampled(math.sqrt(worse * best))
         if not worse < middle < best:
             break
         pilot.run(middle)
-        worse, best = (worse, middle) if pilot.error(middle) <= goal else (middle, best)
+        worse, best = (worse, middle) if pilot.error(middle) <= target_error else (middle, best)
     return best
 
 
@@ -306,9 +306,9 @@ def _cheapest(pilot: Pilot, n: int | None) -> int | None:
     """Return n, or a larger number of steps with much less work: iterations increase near the convergence limit."""
     if n is None:
         return None
-    work = {k: k * (pilot.legs[k].iterations + OVERHEAD) for k in pilot.judged if k >= n}
+    work = {k: k * (pilot.runs[k].iterations + OVERHEAD) for k in pilot.compared if k >= n}
     best = min(work, key=work.__getitem__)
-    return best if work[best] < MUCH_LESS * work[n] else n
+    return best if work[best] < WORK_RATIO * work[n] else n
 
 
 def _sampled(n: float) -> int:
@@ -322,8 +322,8 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
     steps = max(1, math.ceil(choice.n * (pilot.span / pilot.length) * (1.0 - 1e-12)))
     specification = method.specification()
     degree = specification.get("degree", specification.get("stages"))
-    told = sorted(n for n, leg in pilot.legs.items() if n in pilot.judged or leg.failure)
-    legs = [(n, pilot.legs[n]) for n in told]
+    shown = sorted(n for n, leg in pilot.runs.items() if n in pilot.compared or leg.failure)
+    runs = [(n, pilot.runs[n]) for n in shown]
     return Advice(
         h=pilot.span / steps,
         steps=steps,
@@ -332,7 +332,7 @@ def _advice(pilot: Pilot, choice: _Choice, method: Method) -> Advice:
         expected_error=choice.error,
         evidence=tuple(
             Evidence(pilot.length / n, pilot.error(n), leg.iterations, leg.seconds / abs(pilot.length))
-            for n, leg in legs
+            for n, leg in runs
         ),
         message=" ".join(_sentences(pilot, choice, method, steps)),
         warnings=choice.warnings,
@@ -348,12 +348,12 @@ def _sentences(pilot: Pilot, choice: _Choice, method: Method, steps: int) -> Ite
         yield f"The pilot runs covered {pilot.length:.4g} of {pilot.span:.4g}, where errors grew {growth}."
     if not choice.tried:
         yield f"So small a step was not tried: the error is extrapolated by order {pilot.order}."
-    failing = [n for n, leg in pilot.legs.items() if leg.failure]
+    failing = [n for n, leg in pilot.runs.items() if leg.failure]
     if failing:
         n = max(failing)
-        yield f"The solver fails at a step size of {pilot.step(n):.3g}: {pilot.legs[n].failure}."
-    useless = [n for n in pilot.judged if pilot.error(n) >= 1.0]
-    if useless and len(useless) < len(pilot.judged):
+        yield f"The solver fails at a step size of {pilot.step(n):.3g}: {pilot.runs[n].failure}."
+    useless = [n for n in pilot.compared if pilot.error(n) >= 1.0]
+    if useless and len(useless) < len(pilot.compared):
         yield f"At a step size of {pilot.step(max(useless)):.3g} no digit is correct."
     if pilot.symplectic:
         yield "The method is symplectic only at this fixed step size."

@@ -18,9 +18,9 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
-from scvi_codegen.runtime.accuracy import unwarned
-from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
 
 __all__ = ["SECOND_RUN", "Known", "known_digits"]
 
@@ -28,11 +28,11 @@ Array = NDArray[np.float64]
 
 SECOND_RUN = 10_000
 """Steps that a second run may take in addition to four times those of the first."""
-SAMPLES, NEAR = 1024, 0.01
+SAMPLES, LINEAR_DISTANCE = 1024, 0.01
 """Number of states compared, and the distance relative to their size up to which linearised growth is assumed."""
 QUARTERS, DECADES = 4, 0.5
 """Growth is exponential if the distance grows by ``DECADES`` decades in each quarter of the time."""
-NUDGE = 2.0**-50
+PERTURBATION = 2.0**-50
 """Relative perturbation of the initial positions."""
 
 
@@ -59,7 +59,7 @@ class _TooLongError(Exception):
     """Raised if the second run would take too many steps."""
 
 
-@unwarned()
+@without_accuracy_warnings()
 def known_digits(
     system: MechanicalSystem,
     trajectory: Trajectory | DrivenTrajectory,
@@ -80,35 +80,35 @@ def known_digits(
 
     chosen = np.unique(np.linspace(0, len(trajectory) - 1, SAMPLES).astype(int))
     times = trajectory.t[chosen]
-    nudged = trajectory.q[0] * (1.0 + NUDGE * np.cos(np.arange(trajectory.q.shape[1])))
+    nudged = trajectory.q[0] * (1.0 + PERTURBATION * np.cos(np.arange(trajectory.q.shape[1])))
     span: dict[str, Any] = {"t": float(times[0]), "t_end": float(times[-1])}
-    given = {**span, "parameters": trajectory.parameters, "progress": count}
+    arguments = {**span, "parameters": trajectory.parameters, "progress": count}
     try:
         stepper = compile_stepper(system, default_method(system))
         if system.inputs:
-            q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **given).at(times)
+            q, p = stepper.integrate(nudged, trajectory.p[0], inputs=inputs or {}, **arguments).at(times)
         else:
-            second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **given)
+            second = stepper.integrate(nudged, trajectory.p[0], t_eval=times, **arguments)
             q, p = second.q, second.p
     except (ScviCodegenError, _TooLongError):
         return None
     size = math.sqrt(float(np.mean(np.sum(q**2, axis=1)))) or 1.0
     q, p = np.abs(q - trajectory.q[chosen]), np.abs(p - trajectory.p[chosen])
     tenfold = _tenfold(np.linalg.norm(q, axis=1) / size, abs(float(times[-1] - times[0])))
-    return Known(q=_at_the_end(q), p=_at_the_end(p), tenfold=tenfold)
+    return Known(q=_final_error(q), p=_final_error(p), tenfold=tenfold)
 
 
-def _at_the_end(apart: Array) -> Array:
+def _final_error(difference: Array) -> Array:
     """Return the error at the last state, at least the mean over the last sixteenth, as zero crossings occur."""
-    late = apart[-max(1, len(apart) // 16) :]
-    error: Array = np.maximum(apart[-1], np.sqrt(np.mean(late**2, axis=0)))
+    late = difference[-max(1, len(difference) // 16) :]
+    error: Array = np.maximum(difference[-1], np.sqrt(np.mean(late**2, axis=0)))
     return error
 
 
-def _tenfold(apart: Array, span: float) -> float:
+def _tenfold(difference: Array, span: float) -> float:
     """Return the time of tenfold growth from relative distances at equal times; infinity if not exponential."""
-    far = np.flatnonzero(apart > NEAR)
-    near = apart[1 : int(far[0]) if len(far) else len(apart)]
+    far = np.flatnonzero(difference > LINEAR_DISTANCE)
+    near = difference[1 : int(far[0]) if len(far) else len(difference)]
     length = len(near) // QUARTERS
     if length < 2:
         return math.inf
@@ -118,4 +118,4 @@ def _tenfold(apart: Array, span: float) -> float:
     gained = np.diff(np.log10(means))
     if gained.min() < DECADES:
         return math.inf
-    return float(span * length / (len(apart) - 1) / gained.mean())
+    return float(span * length / (len(difference) - 1) / gained.mean())

@@ -24,30 +24,30 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["Leg", "Pilot", "launch"]
+__all__ = ["Pilot", "PilotRun", "run_pilot"]
 
 Array = NDArray[np.float64]
 Integrate = Callable[..., Trajectory]
 
 SAMPLES = 64
 """Number of states of each run that are compared."""
-RESOLVED, DUST = 0.01, 1e-9
+RESOLVED, ROUNDOFF_LEVEL = 0.01, 1e-9
 """Bounds of the asymptotic regime: larger errors do not follow a power of h yet, smaller ones are round-off."""
-CUT, MOST_CUTS = 4, 20
+SHORTENING, MAX_SHORTENINGS = 4, 20
 """Factor by which pilot runs are shortened, and the largest number of times."""
 SEARCH = 16
 """Ratio of the steps that a run may have to those used to find the length of the pilot run."""
-STEEP, NEARLY_LINEAR, ROUNDING = 2.5, 1.35, 1.5
+EXPONENTIAL_POWER, NEARLY_LINEAR, ROUNDING = 2.5, 1.35, 1.5
 """Powers of time: distances growing faster than the first are exponential; errors of a symplectic method slower than
 the second are linear; the third is the growth of position errors by random-walk energy errors."""
-NUDGE = 1e-9
+PERTURBATION = 1e-9
 """Relative perturbation of the initial positions, whose growth indicates chaos."""
 EARLY, LATE = 0.38, 0.76
 """Times, relative to the pilot run, at which a linearly growing error has its root mean square over the second
 quarter and over the second half."""
 
 
-class Leg(NamedTuple):
+class PilotRun(NamedTuple):
     """One run: (samples, m) positions at equal intervals, iterations per step, seconds, reason of failure or ``""``."""
 
     q: Array
@@ -56,8 +56,8 @@ class Leg(NamedTuple):
     failure: str = ""
 
 
-def launch(
-    integrate: Integrate, method: Method, q: Array, span: float, *, symplectic: bool, goal: float, most: int
+def run_pilot(
+    integrate: Integrate, method: Method, q: Array, span: float, *, symplectic: bool, target_error: float, most: int
 ) -> Pilot:
     """Return pilot runs over the longest part of the span that can be resolved, with steps down to the error bound.
 
@@ -74,22 +74,22 @@ def launch(
         StateError: if the solution seems to end in a singularity, or no step size resolves it from the start.
     """
     pilot, first = None, 1
-    for cuts in range(MOST_CUTS, -1, -1):
-        longer = Pilot(integrate, method, q, span, span / CUT**cuts, symplectic)
+    for cuts in range(MAX_SHORTENINGS, -1, -1):
+        longer = Pilot(integrate, method, q, span, span / SHORTENING**cuts, symplectic)
         longer.resolve(first, most // SEARCH)
         if not longer.resolved:
             break
-        pilot, first = longer, max(1, longer.finest // CUT)
-    h, failure = longer.step(longer.finest), longer.legs[longer.finest].failure
-    if pilot is None or (failure and CUT * h < pilot.step(pilot.finest)):
+        pilot, first = longer, max(1, longer.finest // SHORTENING)
+    h, failure = longer.step(longer.finest), longer.runs[longer.finest].failure
+    if pilot is None or (failure and SHORTENING * h < pilot.step(pilot.finest)):
         raise StateError(
             f"no pilot run over t = {longer.length:.3g} succeeds, with step sizes down to {h:.3g}: the solution may "
             "end in a singularity or have a close encounter; use adaptive step size (t_end, --tolerance), or a shorter "
             "span"
         )
     if not pilot.whole:
-        pilot.rate = pilot.rate_of_parting(most // SEARCH)
-    pilot.complete(goal, most)
+        pilot.rate = pilot.divergence_rate(most // SEARCH)
+    pilot.complete(target_error, most)
     return pilot
 
 
@@ -104,7 +104,7 @@ class Pilot:
     ) -> None:
         self.integrate, self.q, self.span, self.length, self.rate = integrate, q, span, length, 0.0
         self.order, self.symplectic = method.order or 1, symplectic
-        self.legs: dict[int, Leg] = {}
+        self.runs: dict[int, PilotRun] = {}
 
     @property
     def whole(self) -> bool:
@@ -114,33 +114,33 @@ class Pilot:
     @property
     def good(self) -> list[int]:
         """Numbers of steps of the runs without a failure, largest step size first."""
-        return sorted(n for n, leg in self.legs.items() if not leg.failure)
+        return sorted(n for n, leg in self.runs.items() if not leg.failure)
 
     @property
-    def judged(self) -> list[int]:
+    def compared(self) -> list[int]:
         """All successful runs but the finest, with which they are compared."""
         return self.good[:-1]
 
     @property
     def finest(self) -> int:
         """Number of steps of the run with the smallest step, successful or not."""
-        return max(self.legs)
+        return max(self.runs)
 
     @property
     def resolved(self) -> bool:
         """True if the errors of the two finest judged runs are small and decrease."""
-        if len(self.judged) < 2:
+        if len(self.compared) < 2:
             return False
-        coarse, fine = map(self.late_error, self.judged[-2:])
-        return coarse < RESOLVED and fine <= max(coarse, DUST)
+        coarse, fine = map(self.final_quarter_error, self.compared[-2:])
+        return coarse < RESOLVED and fine <= max(coarse, ROUNDOFF_LEVEL)
 
     @property
     def floor(self) -> float:
         """Round-off level of the error, 0 if the runs do not reach it."""
-        errors = [self.late_error(n) for n in self._halved()][-3:]
+        errors = [self.final_quarter_error(n) for n in self._halved()][-3:]
         falls = max(0.5, 2.0 ** (-0.3 * self.order))
         levelled = [fine > coarse * falls for coarse, fine in pairwise(errors)]
-        shown = levelled == [True, True] or (levelled[-1:] == [True] and errors[-1] < DUST)
+        shown = levelled == [True, True] or (levelled[-1:] == [True] and errors[-1] < ROUNDOFF_LEVEL)
         return errors[-1] if shown else 0.0
 
     @property
@@ -165,10 +165,10 @@ class Pilot:
         try:
             trajectory = self.integrate(self.q, h=self.length / n, steps=n, save_every=n // math.gcd(n, SAMPLES))
         except StepFailedError as failure:
-            self.legs[n] = Leg(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
+            self.runs[n] = PilotRun(np.empty((0, 0)), 0.0, time.perf_counter() - began, failure.status)
         else:
             iterations = float(trajectory.iterations.sum()) / n
-            self.legs[n] = Leg(trajectory.q[1:], iterations, time.perf_counter() - began)
+            self.runs[n] = PilotRun(trajectory.q[1:], iterations, time.perf_counter() - began)
 
     def resolve(self, n: int, most: int) -> None:
         """Halve the step size, starting with n steps, until errors are small."""
@@ -176,36 +176,38 @@ class Pilot:
             self.run(n)
             n *= 2
 
-    def complete(self, goal: float, most: int) -> None:
+    def complete(self, target_error: float, most: int) -> None:
         """Add smaller steps until the bound is met, round-off or cost ends it; larger ones until no digit is right."""
-        while self.error(self.judged[-1]) > goal and not self.floor and 2 * self.finest <= most:
+        while self.error(self.compared[-1]) > target_error and not self.floor and 2 * self.finest <= most:
             self.run(2 * self.finest)
-        while min(self.legs) > 1 and self.error(min(self.legs)) < 1.0:
-            self.run(min(self.legs) // 2)
+        while min(self.runs) > 1 and self.error(min(self.runs)) < 1.0:
+            self.run(min(self.runs) // 2)
 
-    def rate_of_parting(self, most: int) -> float:
+    def divergence_rate(self, most: int) -> float:
         """Return the exponential growth rate of a perturbation of the initial positions, 0 if not exponential."""
         h = math.copysign(self.step(self.finest), self.span)
         steps = min(most, int(self.span / h))
-        nudged = self.q + NUDGE * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
+        nudged = self.q + PERTURBATION * np.cos(np.arange(len(self.q))) * (_rms(self.q) or 1.0)
         try:
             one, other = (self.integrate(q, h=h, steps=steps, save_every=1).q[1:] for q in (self.q, nudged))
         except StepFailedError:
             return 0.0
-        apart = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)
-        near = apart[: int(np.argmax(apart > RESOLVED)) or steps]
+        difference = np.linalg.norm(other - one, axis=1) / (_rms(np.linalg.norm(one, axis=1)) or 1.0)
+        near = difference[: int(np.argmax(difference > RESOLVED)) or steps]
         # Exponential growth exp(r t): the mean of the second half over the second quarter gives r.
         power = _power(near)
-        return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > STEEP else 0.0
+        return power * math.log(2.0) / abs(0.5 * h * len(near)) if power > EXPONENTIAL_POWER else 0.0
 
     def error(self, n: int) -> float:
         """Return the expected error at the end of the span of the run with n steps; infinite if it failed."""
-        if n not in self.judged:
+        if n not in self.compared:
             return math.inf
         if self.whole:
-            return max(float(self._errors(n)[-1]), self.late_error(n) / 3.0)  # the error may cross zero at the end
+            return max(
+                float(self._errors(n)[-1]), self.final_quarter_error(n) / 3.0
+            )  # the error may cross zero at the end
         if self.rate:
-            return self._exploded(self.late_error(n))
+            return self._exploded(self.final_quarter_error(n))
         # Fit error(t) = a t + b t^2 to the mean errors of two windows; symplectic methods: b = 0.
         early, late = _windows(self._errors(n))
         ratio = self.span / self.length
@@ -214,14 +216,14 @@ class Pilot:
         quadratic = max(0.0, (late / LATE - early / EARLY) / (LATE - EARLY))
         return max(0.0, late / LATE - quadratic * LATE) * ratio + quadratic * ratio**2
 
-    def late_error(self, n: int) -> float:
+    def final_quarter_error(self, n: int) -> float:
         """Return the root-mean-square error of the run with n steps in the last quarter of the pilot run."""
         errors = self._errors(n)
         return _rms(errors[-max(1, len(errors) // 4) :])
 
     def _halved(self) -> list[int]:
         """Return the runs obtained by halving whose errors are small."""
-        return [n for n in self.judged if n.bit_count() == 1 and self.late_error(n) < RESOLVED]
+        return [n for n in self.compared if n.bit_count() == 1 and self.final_quarter_error(n) < RESOLVED]
 
     def _errors(self, n: int) -> Array:
         """Return the errors of a run at its samples relative to the finest run.
@@ -229,7 +231,7 @@ class Pilot:
         That run is not exact: errors are corrected by the factor 1 - (n/finest)^order (Richardson extrapolation).
         """
         finest = self.good[-1]
-        reference, positions = self.legs[finest].q, self.legs[n].q
+        reference, positions = self.runs[finest].q, self.runs[n].q
         size = _rms(np.linalg.norm(reference[len(reference) // 2 :], axis=1)) or 1.0
         count = math.gcd(len(reference), len(positions))
         both = [q[len(q) // count - 1 :: len(q) // count] for q in (reference, positions)]

@@ -12,29 +12,29 @@ from numpy.typing import ArrayLike, NDArray
 from sympy import Expr
 
 from scvi_codegen.advice.advice import advise
-from scvi_codegen.advice.promise import broken_promise
+from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.given.kinds import SWITCH, of, takes
 from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.representation import summary
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.events import EventLike
 from scvi_codegen.runtime.global_error import checked_error
-from scvi_codegen.runtime.longest_step import longest_step, too_wrong
+from scvi_codegen.runtime.largest_step import accuracy_message, largest_step
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
 
 __all__ = ["OdeResult", "solve_ivp"]
 
 Array = NDArray[np.float64]
 Solution: TypeAlias = Callable[[ArrayLike], Array]
-REACHED, EVENT, FAILED, BROKEN = 0, 1, -1, -2
-ADVISED = 1e-9
+REACHED, EVENT, FAILED, MISSED = 0, 1, -1, -2
+DEFAULT_TOLERANCE = 1e-9
 """Tolerance of the recommended fixed step size for methods without adaptive steps, if none is passed."""
 
 
@@ -72,7 +72,7 @@ class OdeResult:
         return self.status >= 0
 
 
-@takes(system=of("a system or its stepper", MechanicalSystem, Stepper), dense_output=SWITCH)
+@checks_arguments(system=of("a system or its stepper", MechanicalSystem, Stepper), dense_output=SWITCH)
 def solve_ivp(
     system: MechanicalSystem | Stepper,
     t_span: Sequence[float],
@@ -117,7 +117,7 @@ def solve_ivp(
             ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
             is not confirmed.
         monitor: time-rescaling function g of :func:`reparametrise`: equal steps of tau, dt = g dtau, symplectic and
-            with variable step size in t. ``h`` is then in tau; without it :func:`longest_step` finds one for ``rtol``,
+            with variable step size in t. ``h`` is then in tau; without it :func:`largest_step` finds one for ``rtol``,
             and ``success`` is False if the run misses that.
         controller: ``"reversible"``: the time-rescaling function of :func:`compile_stepper`, also for systems with
             explicit time or forces; ``"symplectic"`` (default): that of :func:`reparametrise`.
@@ -137,25 +137,30 @@ def solve_ivp(
     parameters = parameters if args is None else args
     start, end = _span(t_span)
     q, given = _halves(y0) if velocity is None else (y0, None)
-    asked = None if t_eval is None else times_of_run(t_eval, start, end)
+    requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
         others = {"h": h, "tolerance": tolerance, "rtol": rtol, "monitor": monitor, "controller": controller}
         checked_error(error, others)
-    wish = _Wish(h, rtol, tolerance, error)
-    stepper, uncompiled = _stepper(system, method, (monitor, controller), wish)
+    request = _StepRequest(h, rtol, tolerance, error)
+    stepper, uncompiled = _stepper(system, method, (monitor, controller), request)
     p = stepper._initial_momenta(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
-    plan = _plan(stepper, uncompiled, wish, (q, p, end - start), along)
-    told = {**_steps(stepper, start, end, plan), **along, "events": events, "t_eval": None if dense_output else asked}
+    plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
+    settings = {
+        **_steps(stepper, start, end, plan),
+        **along,
+        "events": events,
+        "t_eval": None if dense_output else requested_times,
+    }
     try:
-        trajectory = stepper.integrate(q, p, **told)
+        trajectory = stepper.integrate(q, p, **settings)
         status, message = _outcome(trajectory, plan)
     except StepFailedError as error:
         trajectory, status, message = Trajectory.before(error), FAILED, str(error)
-    return _motion(trajectory, asked if dense_output else None, dense_output, status, message)
+    return _motion(trajectory, requested_times if dense_output else None, dense_output, status, message)
 
 
-class _Wish(NamedTuple):
+class _StepRequest(NamedTuple):
     """Requested step-size selection; adaptive if nothing is requested."""
 
     h: float | None
@@ -164,32 +169,34 @@ class _Wish(NamedTuple):
     error: float | None
 
 
-class _Chosen(NamedTuple):
+class _StepChoice(NamedTuple):
     """Step-size selection, and a check of the completed run that returns a message if the tolerance is missed."""
 
     h: float | None
     rtol: float | None
-    broken: Callable[[Trajectory], str] = lambda trajectory: ""
+    missed: Callable[[Trajectory], str] = lambda trajectory: ""
     error: float | None = None
 
 
 def _stepper(
     system: MechanicalSystem | Stepper,
     method: Method | str | None,
-    pace: tuple[str | Expr | None, str | None],
-    wish: _Wish,
+    time_transformation: tuple[str | Expr | None, str | None],
+    request: _StepRequest,
 ) -> tuple[Stepper, tuple[MechanicalSystem, Method] | None]:
-    """Return the stepper, and its system and method if it was compiled here; ``pace`` is g and its controller."""
-    if wish.tolerance is not None and (wish.h is not None or wish.rtol is not None or pace != (None, None)):
+    """Return the stepper, and its system and method if compiled here; ``time_transformation``: g and its controller."""
+    if request.tolerance is not None and (
+        request.h is not None or request.rtol is not None or time_transformation != (None, None)
+    ):
         raise StateError(
             "tolerance (fixed step size for an error at the end), h (fixed step size) and rtol (adaptive step size) "
             "exclude each other: give one of them, and with a time transformation h or rtol"
         )
     if not isinstance(system, Stepper):
-        system, monitor = with_monitor(system, *pace)
+        system, monitor = with_monitor(system, *time_transformation)
         chosen = default_method(system) if method is None else as_method(method, system)
         return compile_stepper(system, chosen, monitor=monitor), (system, chosen)
-    if method is not None or pace != (None, None) or wish.tolerance is not None:
+    if method is not None or time_transformation != (None, None) or request.tolerance is not None:
         raise StateError(
             "method, monitor, controller and tolerance need a system, not a compiled stepper: omit them, give h (fixed "
             "step size) or rtol (adaptive step size)"
@@ -200,36 +207,38 @@ def _stepper(
 def _plan(
     stepper: Stepper,
     uncompiled: tuple[MechanicalSystem, Method] | None,
-    wish: _Wish,
+    request: _StepRequest,
     motion: tuple[ArrayLike, ArrayLike, float],
     along: dict[str, Any],
-) -> _Chosen:
+) -> _StepChoice:
     """Return the step-size selection for a request and an initial state (q, p) over a span."""
-    if wish.error is not None:
-        return _Chosen(None, None, _unconfirmed, wish.error)
-    if wish.h is not None:
-        return _Chosen(wish.h, wish.rtol)
-    if _paced(stepper):
-        error = wish.rtol or 0.0
-        tau = longest_step(stepper, *motion, error, **along)
-        return _Chosen(tau, None, lambda run: too_wrong(run.step_error, run.worst_step_time, error) or "")
-    advised = wish.tolerance if wish.tolerance is not None or _chooses(stepper) else ADVISED
-    if wish.rtol is not None or uncompiled is None or advised is None:
-        return _Chosen(None, wish.rtol)
+    if request.error is not None:
+        return _StepChoice(None, None, _unconfirmed, request.error)
+    if request.h is not None:
+        return _StepChoice(request.h, request.rtol)
+    if _is_time_transformed(stepper):
+        error = request.rtol or 0.0
+        tau = largest_step(stepper, *motion, error, **along)
+        return _StepChoice(tau, None, lambda run: accuracy_message(run.step_error, run.worst_step_time, error) or "")
+    advised = request.tolerance if request.tolerance is not None or _has_adaptive_steps(stepper) else DEFAULT_TOLERANCE
+    if request.rtol is not None or uncompiled is None or advised is None:
+        return _StepChoice(None, request.rtol)
     (system, method), (q, p, span) = uncompiled, motion
     h = advise(system, method, q, p, span, advised, **along).h
-    return _Chosen(h, None, lambda run: broken_promise(system, run, advised))
+    return _StepChoice(h, None, lambda run: missed_tolerance(system, run, advised))
 
 
 def _unconfirmed(trajectory: Trajectory) -> str:
     """Return the time until which the global error is confirmed, as a message; empty at the end of the run."""
-    found = trajectory.confirmation
-    if found is None or found.confirmed:
+    result = trajectory.confirmation
+    if result is None or result.confirmed:
         return ""
-    return f"The bound {found.requested:g} on the global error is confirmed only until t = {found.confirmed_until:.6g}."
+    return (
+        f"The bound {result.requested:g} on the global error is confirmed only until t = {result.confirmed_until:.6g}."
+    )
 
 
-INSTEAD = {
+ALTERNATIVES = {
     "atol": "local errors are relative to the size of the state: give rtol",
     "max_step": "the step size is adaptive with rtol, or fixed: give h, its upper bound",
     "first_step": "the first step is adaptive like the others: give rtol, or h for a fixed step size",
@@ -240,15 +249,15 @@ INSTEAD = {
 def _refuse(given: Mapping[str, float | None]) -> None:
     for name, value in given.items():
         if value is not None:
-            raise StateError(f"solve_ivp has no {name}={value!r}: {INSTEAD[name]}")
+            raise StateError(f"solve_ivp has no {name}={value!r}: {ALTERNATIVES[name]}")
 
 
-def _paced(stepper: Stepper) -> bool:
+def _is_time_transformed(stepper: Stepper) -> bool:
     """Return True if the steps are of tau."""
     return bool(stepper.interface.energy_parameter or stepper.interface.monitor)
 
 
-def _chooses(stepper: Stepper) -> bool:
+def _has_adaptive_steps(stepper: Stepper) -> bool:
     """Return True if the stepper has adaptive steps."""
     try:
         stepper._adaptive()
@@ -257,40 +266,42 @@ def _chooses(stepper: Stepper) -> bool:
     return True
 
 
-def _steps(stepper: Stepper, start: float, end: float, plan: _Chosen) -> dict[str, Any]:
+def _steps(stepper: Stepper, start: float, end: float, plan: _StepChoice) -> dict[str, Any]:
     """Return the arguments of :meth:`Stepper.integrate`: whole fixed steps that fill the span, or adaptive steps."""
     if plan.error is not None:
         return {"t_end": end, "error": plan.error}
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
-    if _paced(stepper):
+    if _is_time_transformed(stepper):
         sign = 1.0 if stepper.interface.monitor else end - start
         return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}
 
 
-def _outcome(trajectory: Trajectory, plan: _Chosen) -> tuple[int, str]:
+def _outcome(trajectory: Trajectory, plan: _StepChoice) -> tuple[int, str]:
     """Return status and message of a run without failed steps."""
-    if broken := plan.broken(trajectory):
-        return BROKEN, broken
+    if missed := plan.missed(trajectory):
+        return MISSED, missed
     if trajectory.ended_by is not None:
         return EVENT, f"The terminal event '{trajectory.ended_by.function}' occurred."
     return REACHED, "The end of the span was reached."
 
 
-def _motion(trajectory: Trajectory, asked: Array | None, dense_output: bool, status: int, message: str) -> OdeResult:
+def _motion(
+    trajectory: Trajectory, requested_times: Array | None, dense_output: bool, status: int, message: str
+) -> OdeResult:
     t, y = trajectory.t, np.hstack([trajectory.q, trajectory.p]).T
-    if asked is not None:
-        t = asked[(asked - trajectory.t[-1]) * trajectory.h <= 0.0]
+    if requested_times is not None:
+        t = requested_times[(requested_times - trajectory.t[-1]) * trajectory.h <= 0.0]
         y = _states(trajectory, t)
-    found = trajectory.events
+    result = trajectory.events
     return OdeResult(
         t=t,
         y=y,
         sol=(lambda times: _states(trajectory, times)) if dense_output else None,
-        t_events=[crossings.t for crossings in found] if found else None,
-        y_events=[np.hstack([crossings.q, crossings.p]) for crossings in found] if found else None,
+        t_events=[crossings.t for crossings in result] if result else None,
+        y_events=[np.hstack([crossings.q, crossings.p]) for crossings in result] if result else None,
         status=status,
         message=message,
         trajectory=trajectory,

@@ -42,26 +42,26 @@ from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
 from scvi_codegen.benchmark.builds import run_builds
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.cluster import run_cluster
+from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.compile_times import run_compile_times
 from scvi_codegen.benchmark.compositions import run_compositions
+from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hand_written import run_hand_written
-from scvi_codegen.benchmark.held import run_held
-from scvi_codegen.benchmark.long_sums import run_energies
+from scvi_codegen.benchmark.indexed_energies import run_energies
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
-from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.racing import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
 from scvi_codegen.benchmark.samples import run_samples
-from scvi_codegen.benchmark.shared_steps import run_threads
 from scvi_codegen.benchmark.start_up import run_start_up
 from scvi_codegen.benchmark.sums import run_growth, run_sums
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.threads import run_threads
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_atomically
 
@@ -70,7 +70,7 @@ __all__ = ["CASES", "PEERS", "SCHEMA", "SECTIONS", "Plan", "Report", "benchmark"
 SCHEMA = 2
 """Version of the JSON document."""
 
-SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
+SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable]] = {
     **{name: partial(run_case, name) for name in CASES},
     **{f"ensemble:{name}": partial(run_ensemble, name) for name in ENSEMBLES},
     **{f"forced:{name}": partial(run_forced, name) for name in FORCED_CASES},
@@ -83,7 +83,7 @@ SECTIONS: Mapping[str, Callable[[Plan, Say], CaseResult | ResultTable]] = {
     "start-up": run_start_up,
     "compile": run_compile_times,
     "mechanisms": run_mechanisms,
-    "held": run_held,
+    "held": run_constrained_bodies,
     "samples": run_samples,
     "sums": run_sums,
     "growth": run_growth,
@@ -137,8 +137,8 @@ def benchmark(
     json_path: str | None = None,
     plot_path: str | None = None,
     resume: bool = False,
-    say: Say = lambda text: None,
-    show: Say = lambda text: None,
+    report_activity: ReportActivity = lambda text: None,
+    show: ReportActivity = lambda text: None,
 ) -> Report:
     """Measure sections in turn; a section that fails is reported, Ctrl-C ends the benchmark with its results so far.
 
@@ -161,7 +161,7 @@ def benchmark(
         check_plot_path(plot_path)
     known = _known(json_path) if resume and json_path is not None else {}
     wanted = dict.fromkeys((*known, *(sections or SECTIONS)))
-    for report in _reports(tuple(wanted), known, plan or Plan(), say, show):
+    for report in _reports(tuple(wanted), known, plan or Plan(), report_activity, show):
         if json_path is not None:
             _write(report, json_path)
     if plot_path is not None and report.cases:
@@ -169,9 +169,9 @@ def benchmark(
 
         plot_curves(report.cases, plot_path)
         if any(result.name.startswith("adaptive:") for result in report.cases):
-            from scvi_codegen.benchmark.step_lengths import plot_step_lengths
+            from scvi_codegen.benchmark.step_size_plot import plot_step_sizes
 
-            plot_step_lengths(Path(plot_path).with_stem(f"{Path(plot_path).stem}-steps"))
+            plot_step_sizes(Path(plot_path).with_stem(f"{Path(plot_path).stem}-steps"))
     return report
 
 
@@ -208,13 +208,15 @@ def _write(report: Report, json_path: str) -> None:
     write_atomically(json_path, lambda file: file.write(text.encode()))
 
 
-def _reports(names: Sequence[str], known: Mapping[str, Result], plan: Plan, say: Say, show: Say) -> Iterator[Report]:
+def _reports(
+    names: Sequence[str], known: Mapping[str, Result], plan: Plan, report_activity: ReportActivity, show: ReportActivity
+) -> Iterator[Report]:
     """Yield the report after each section; its text is shown as it grows."""
     report = Report(machine=machine(), results=())
     show(header_lines(report.machine))
     for name in names:
         try:
-            result = known[name] if name in known else SECTIONS[name](plan, say)
+            result = known[name] if name in known else SECTIONS[name](plan, report_activity)
         except KeyboardInterrupt:
             yield replace(report, interrupted=name)
             break

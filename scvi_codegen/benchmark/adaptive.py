@@ -16,11 +16,11 @@ from mpmath import mp
 
 from scvi_codegen.benchmark.adaptive_cases import adaptive_case
 from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.benchmark.comparison import Makers, race
 from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
 from scvi_codegen.benchmark.contenders.ours import compiled, momenta_of
 from scvi_codegen.benchmark.contenders.peers import peer_contenders
-from scvi_codegen.benchmark.plan import Plan, Say
-from scvi_codegen.benchmark.racing import Makers, race
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import (
     Extended,
     Field,
@@ -36,7 +36,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
@@ -52,12 +52,12 @@ HALVINGS = 2
 """Largest number of halvings of a reference's steps, if a step of a close encounter is too large for Gauss."""
 
 
-@unwarned()
-def run_adaptive(name: str, plan: Plan, say: Say) -> CaseResult:
+@without_accuracy_warnings()
+def run_adaptive(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
     """Measure this package in all its modes, heyoka, and for gravitating bodies IAS15."""
     chosen = adaptive_case(name)
     makers: Makers = {peer: partial(peer_contenders, peer, chosen, quick=True) for peer in PEERS if peer in plan.peers}
-    return race(chosen, partial(_ours, chosen, quick=plan.quick), makers, plan, say, adaptive_reference)
+    return race(chosen, partial(_ours, chosen, quick=plan.quick), makers, plan, report_activity, adaptive_reference)
 
 
 def _ours(chosen: Case, *, quick: bool) -> list[Contender]:

@@ -125,14 +125,16 @@ def gravitating(masses: Sequence[float], q: Sequence[float], velocity: Sequence[
 
 
 def _pythagorean_case() -> Case:
-    masses, places = PYTHAGOREAN
-    return gravitating(masses, [x for place in places for x in (*place, 0.0)], [0.0] * 9, name="pythagorean", span=65.0)
+    masses, positions = PYTHAGOREAN
+    return gravitating(
+        masses, [x for position in positions for x in (*position, 0.0)], [0.0] * 9, name="pythagorean", span=65.0
+    )
 
 
 def _figure_eight_case() -> Case:
     (x, y), (u, v) = FIGURE_EIGHT
-    places, speeds = (x, y, 0, -x, -y, 0, 0, 0, 0), (-u / 2, -v / 2, 0, -u / 2, -v / 2, 0, u, v, 0)
-    return gravitating((1.0, 1.0, 1.0), places, speeds, name="figure-eight", span=100.0)
+    positions, speeds = (x, y, 0, -x, -y, 0, 0, 0, 0), (-u / 2, -v / 2, 0, -u / 2, -v / 2, 0, u, v, 0)
+    return gravitating((1.0, 1.0, 1.0), positions, speeds, name="figure-eight", span=100.0)
 
 
 def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: float) -> Case:
@@ -145,10 +147,10 @@ def _solar_case(name: str, body: Mapping[str, float], span: float, *, part: floa
     e, mu = part * body["eccentricity"], values["G"] * masses[0]
     distance, speed = body["axis"] * (1.0 - e), math.sqrt(mu * (1.0 + e) / (1.0 - e) / body["axis"])
     tilt = math.cos(body["inclination"]), math.sin(body["inclination"])
-    place, velocity = sun + np.array([distance, 0.0, 0.0]), sun_velocity + speed * np.array([0.0, *tilt])
+    position, velocity = sun + np.array([distance, 0.0, 0.0]), sun_velocity + speed * np.array([0.0, *tilt])
     return gravitating(
         [*masses, body["mass"]],
-        [*outer.q, *place],
+        [*outer.q, *position],
         [*outer.velocity, *velocity],
         name=name,
         gravity=values["G"],

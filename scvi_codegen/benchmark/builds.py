@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import SVI
@@ -35,7 +35,7 @@ LEVELS: Mapping[str, tuple[str, str]] = {
 Step = Callable[[], object]
 
 
-def run_builds(plan: Plan, say: Say) -> ResultTable:
+def run_builds(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure microseconds per step: minima of processor time, all builds in turn, round after round."""
     steps = max(1, int(STEPS * plan.share))
     builds = _builds()
@@ -43,7 +43,7 @@ def run_builds(plan: Plan, say: Say) -> ResultTable:
     for name in PROBLEMS:
         for degree in DEGREES:
             column = f"{name}, SVI({degree})"
-            say(f"builds: {column}")
+            report_activity(f"builds: {column}")
             runs = {build: _runner(name, degree, steps, *how) for build, how in builds.items()}
             for build, seconds in _fastest(runs, plan.rounds).items():
                 rows[build][column] = 1e6 * seconds / steps
@@ -59,11 +59,11 @@ def run_builds(plan: Plan, say: Say) -> ResultTable:
 
 def _builds() -> dict[str, tuple[str, tuple[str, ...]]]:
     """Return compiler and flags by title, for the compilers that are installed."""
-    found = {name: name for name in ("gcc", "clang") if shutil.which(name)}
+    result = {name: name for name in ("gcc", "clang") if shutil.which(name)}
     if importlib.util.find_spec("ziglang"):
-        found["ziglang"] = f"{sys.executable} -m ziglang cc"
+        result["ziglang"] = f"{sys.executable} -m ziglang cc"
     builds: dict[str, tuple[str, tuple[str, ...]]] = {}
-    for title, command in found.items():
+    for title, command in result.items():
         builds[f"{title}, this processor"] = (command, TUNED_FLAGS)
         for level in _levels():
             flags = tuple(f"-march={level}" if flag == "-march=native" else flag for flag in TUNED_FLAGS)
@@ -106,10 +106,10 @@ def _compiled_by(command: str) -> Iterator[None]:
 
 def _fastest(runs: Mapping[str, Step], rounds: int) -> dict[str, float]:
     """Return the smallest processor time of each, in seconds."""
-    found = dict.fromkeys(runs, float("inf"))
+    result = dict.fromkeys(runs, float("inf"))
     for _ in range(rounds):
         for build, run in runs.items():
             began = time.process_time()
             run()
-            found[build] = min(found[build], time.process_time() - began)
-    return found
+            result[build] = min(result[build], time.process_time() - began)
+    return result

@@ -181,8 +181,8 @@ def relativistic_in_momenta(x: Vector, of: Mapping[str, Any], functions: Any) ->
 
 def chain(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> list[Any]:
     """Return the accelerations of unit masses between fixed ends, on springs of force d + beta d^3 (alpha = 0)."""
-    stretches = [q[0], *(right - left for left, right in pairwise(q)), -q[-1]]
-    forces = [(1.0 + of["beta"] * (d * d)) * d for d in stretches]
+    elongations = [q[0], *(right - left for left, right in pairwise(q)), -q[-1]]
+    forces = [(1.0 + of["beta"] * (d * d)) * d for d in elongations]
     return [right - left for left, right in pairwise(forces)]
 
 

@@ -9,11 +9,11 @@ from importlib.util import find_spec
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.large_cases import Lattice, bodies
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.sums import reference_of, rms
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["run_cluster"]
 
@@ -26,8 +26,8 @@ OURS_BY = {"svi:2": (16, 32), "svi:4": (4, 8, 16), "svi:8": (2, 4, 8, 16), "comp
 """Numbers of steps of each method."""
 
 
-@unwarned()
-def run_cluster(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_cluster(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure every contender at several numbers of steps, each twice."""
     each = bodies(QUICK_COUNT if plan.quick else COUNT, SPAN)
     reference, doubt = reference_of(each)
@@ -35,7 +35,7 @@ def run_cluster(plan: Plan, say: Say) -> ResultTable:
     before = energy((each.q, each.v))
     rows = []
     for name, steps, settle in _contenders(each, plan):
-        say(f"cluster: {name}, {steps or 'adaptive'} steps")
+        report_activity(f"cluster: {name}, {steps or 'adaptive'} steps")
         seconds, end = _timed(settle)
         errors = {"error": rms(end[0], reference), "energy_error": abs(energy(end) / before - 1.0)}
         rows.append({"by": name, "steps": steps, "ms": 1e3 * seconds, **errors})
@@ -101,8 +101,8 @@ def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], 
         if steps is not None:
             simulation.dt = each.span / steps
         simulation.integrate(each.span)
-        found = [[[p.x, p.y, p.z], [p.vx, p.vy, p.vz]] for p in simulation.particles]
-        positions, velocities = np.array(found).transpose(1, 0, 2)
+        result = [[[p.x, p.y, p.z], [p.vx, p.vy, p.vz]] for p in simulation.particles]
+        positions, velocities = np.array(result).transpose(1, 0, 2)
         return positions, velocities
 
     return settle

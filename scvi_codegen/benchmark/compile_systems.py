@@ -8,13 +8,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-__all__ = ["Written", "bodies", "chain", "cloth", "kepler", "lennard_jones", "links", "post_newtonian"]
+__all__ = ["SystemText", "bodies", "chain", "cloth", "kepler", "lennard_jones", "links", "post_newtonian"]
 
 AXES = "xyz"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Written:
+class SystemText:
     """Lagrangian as text, and an initial state.
 
     Attributes:
@@ -32,9 +32,9 @@ class Written:
     parameters: dict[str, float] = field(default_factory=dict)
 
 
-def kepler() -> Written:
+def kepler() -> SystemText:
     """Return the planar Kepler problem."""
-    return Written(
+    return SystemText(
         name="Kepler",
         coordinates=("q1", "q2"),
         lagrangian="(q1_dot**2 + q2_dot**2)/2 + mu/sqrt(q1**2 + q2**2)",
@@ -43,11 +43,11 @@ def kepler() -> Written:
     )
 
 
-def links(n: int) -> Written:
+def links(n: int) -> SystemText:
     """Return a pendulum of n unit masses in a chain."""
     masses = [[n - max(i, j) for j in range(n)] for i in range(n)]
     kinetic = (f"{masses[i][j]}*cos(q{i} - q{j})*q{i}_dot*q{j}_dot/2" for i in range(n) for j in range(n))
-    return Written(
+    return SystemText(
         name=f"{n} links",
         coordinates=tuple(f"q{i}" for i in range(n)),
         lagrangian=_sum((*kinetic, *(f"{n - i}*g*cos(q{i})" for i in range(n)))),
@@ -56,11 +56,11 @@ def links(n: int) -> Written:
     )
 
 
-def chain(n: int) -> Written:
+def chain(n: int) -> SystemText:
     """Return a chain of n unit masses between walls with quartic springs (FPUT, beta)."""
     names = tuple(f"q{i}" for i in range(1, n + 1))
     stretched = [f"({b} - {a})" for a, b in pairwise(("0", *names, "0"))]
-    return Written(
+    return SystemText(
         name=f"chain of {n}",
         coordinates=names,
         lagrangian=_sum((*(f"{q}_dot**2/2" for q in names), *(f"-{s}**2/2 - beta*{s}**4/4" for s in stretched))),
@@ -69,10 +69,10 @@ def chain(n: int) -> Written:
     )
 
 
-def bodies(n: int) -> Written:
+def bodies(n: int) -> SystemText:
     """Return n gravitating bodies in space."""
     names = [f"b{i}" for i in range(n)]
-    return Written(
+    return SystemText(
         name=f"{n} bodies",
         coordinates=_cartesian(names),
         lagrangian=_sum(
@@ -86,13 +86,13 @@ def bodies(n: int) -> Written:
     )
 
 
-def lennard_jones(n: int) -> Written:
+def lennard_jones(n: int) -> SystemText:
     """Return n atoms in space."""
     names = [f"a{i}" for i in range(n)]
     pairs = (
         f"4*epsilon*((sigma/{_distance(a, b)})**6 - (sigma/{_distance(a, b)})**12)" for a, b in combinations(names, 2)
     )
-    return Written(
+    return SystemText(
         name=f"Lennard-Jones {n}",
         coordinates=_cartesian(names),
         lagrangian=_sum((*(f"mass*{_square(a)}/2" for a in names), *pairs)),
@@ -101,13 +101,13 @@ def lennard_jones(n: int) -> Written:
     )
 
 
-def cloth(n: int) -> Written:
+def cloth(n: int) -> SystemText:
     """Return n by n unit masses in space, with springs of length 1 along the threads, under gravity."""
     names = [f"p{i}_{j}" for i in range(n) for j in range(n)]
     threads = [(i * n + j, i * n + j + 1) for i in range(n) for j in range(n - 1)]
     threads += [(i * n + j, (i + 1) * n + j) for i in range(n - 1) for j in range(n)]
     springs = (f"-k*({_distance(names[a], names[b])} - 1)**2/2" for a, b in threads)
-    return Written(
+    return SystemText(
         name=f"cloth {n} x {n}",
         coordinates=_cartesian(names),
         lagrangian=_sum((*(f"{_square(a)}/2 - g*{a}_z" for a in names), *springs)),
@@ -116,7 +116,7 @@ def cloth(n: int) -> Written:
     )
 
 
-def post_newtonian(n: int) -> Written:
+def post_newtonian(n: int) -> SystemText:
     """Return point masses with first post-Newtonian corrections (Einstein, Infeld, Hoffmann)."""
     names = [f"b{i}" for i in range(n)]
     kinetic = [f"m_{a}*({_square(a)}/2 + {_square(a)}**2/(8*c2))" for a in names]
@@ -124,7 +124,7 @@ def post_newtonian(n: int) -> Written:
         f"-m_{a}*({_sum(f'm_{b}/{_distance(a, b)}' for b in names if b != a)})**2/(2*c2)"
         for a in names
     )  # fmt: skip
-    return Written(
+    return SystemText(
         name=f"post-Newtonian {n}",
         coordinates=_cartesian(names),
         lagrangian=_sum((*kinetic, *(_relativistic_pair(a, b) for a, b in combinations(names, 2)), *squared)),

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from scvi_codegen.benchmark.compile_systems import (
-    Written,
+    SystemText,
     bodies,
     chain,
     cloth,
@@ -22,13 +22,13 @@ from scvi_codegen.benchmark.compile_systems import (
     links,
     post_newtonian,
 )
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 
 __all__ = ["COMPILED", "run_compile_times"]
 
-COMPILED: Mapping[str, tuple[Callable[[], Written], str]] = {
+COMPILED: Mapping[str, tuple[Callable[[], SystemText], str]] = {
     "Kepler": (kepler, "SVI(8)"),
     "double pendulum": (partial(links, 2), "SVI(8)"),
     "10 links": (partial(links, 10), "SVI(4)"),
@@ -69,13 +69,13 @@ print(json.dumps([done - began, marks[1] - marks[0], marks[2] - marks[1], python
 """
 
 
-def run_compile_times(plan: Plan, say: Say) -> ResultTable:
+def run_compile_times(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure one run per system, each with an empty cache."""
     rows = []
     for name, (write, method) in COMPILED.items():
         if plan.quick and name not in QUICK:
             continue
-        say(f"compile: {name}")
+        report_activity(f"compile: {name}")
         rows.append({"system": name, "method": method} | _first_step(write(), method))
     formats = {"system": "", "method": "", "coordinates": "d", "lines_of_C": "d", "first_step_s": ".2f"}
     return ResultTable(
@@ -90,7 +90,7 @@ def run_compile_times(plan: Plan, say: Say) -> ResultTable:
     )
 
 
-def _first_step(written: Written, method: str) -> dict[str, Any]:
+def _first_step(written: SystemText, method: str) -> dict[str, Any]:
     given = asdict(written)
     start = given.pop("start")
     name, _, arguments = method.rstrip(")").partition("(")
@@ -101,13 +101,13 @@ def _first_step(written: Written, method: str) -> dict[str, Any]:
             [sys.executable, "-c", FIRST_STEP],
             input=text, capture_output=True, text=True, env=environment, check=True, timeout=LONGEST,
         )  # fmt: skip
-    whole, read, found, python, compiler, lines = json.loads(run.stdout)
+    whole, read, result, python, compiler, lines = json.loads(run.stdout)
     return {
         "coordinates": len(start),
         "lines_of_C": lines,
         "first_step_s": whole,
         "read_s": read,
-        "symmetries_s": found,
+        "symmetries_s": result,
         "python_cpu_s": python,
         "compiler_cpu_s": compiler,
     }

@@ -17,7 +17,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import Case, case
 from scvi_codegen.benchmark.contenders.ours import momenta_of
 from scvi_codegen.benchmark.curves import Point, time_at
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
@@ -26,7 +26,7 @@ from scvi_codegen.methods import StoermerVerlet
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["run_compositions"]
 
@@ -38,15 +38,15 @@ LONGEST, COARSEST = 0.5, 8.0
 """Seconds per trajectory beyond which no smaller step is tried; the first step, in units of the step of the case."""
 
 FINER = math.sqrt(0.5)
-MOST_RUNGS = 60
+MAX_REFINEMENTS = 60
 RESOLVED = 1e-2
 """Largest error in the asymptotic regime of the order."""
 
 REPEATS = 3
 
 
-@unwarned()
-def run_compositions(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_compositions(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure milliseconds of a trajectory for each error, and the fastest method."""
     rows = []
     for name in COMPARED:
@@ -54,7 +54,7 @@ def run_compositions(plan: Plan, say: Say) -> ResultTable:
         chosen = replace(plain, span=plain.span * SHARE * plan.share)
         curves = {}
         for method in METHODS:
-            say(f"compositions: {name}, {method.name}")
+            report_activity(f"compositions: {name}, {method.name}")
             curves[method.name] = _curve(chosen, method, LONGEST * plan.share)
         rows += [_row(chosen, error, curves) for error in ERRORS]
     return ResultTable(
@@ -93,8 +93,8 @@ def _curve(chosen: Case, method: Method, longest: float) -> list[Point]:
     momenta = momenta_of(stepper, chosen)
     exact = reference(chosen, momenta)
     points: list[Point] = []
-    for rung in range(MOST_RUNGS):
-        count = max(1, round(chosen.span / (COARSEST * chosen.step * FINER**rung)))
+    for refinement in range(MAX_REFINEMENTS):
+        count = max(1, round(chosen.span / (COARSEST * chosen.step * FINER**refinement)))
         try:
             point = _point(stepper, chosen, momenta, count, exact)
         except StepFailedError:

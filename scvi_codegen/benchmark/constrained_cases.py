@@ -9,7 +9,13 @@ from functools import partial
 from scvi_codegen.benchmark.cases import Array, Case, Formulation, scaled, second_order
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_contenders
-from scvi_codegen.benchmark.hanging_rods import angles_of, places_of, rod_accelerations, rods_in_angles, rods_in_places
+from scvi_codegen.benchmark.hanging_rods import (
+    angles_of,
+    positions_of,
+    rod_accelerations,
+    rods_in_angles,
+    rods_in_positions,
+)
 from scvi_codegen.methods import as_method
 
 __all__ = ["CONSTRAINED_CASES", "ConstrainedCase", "constrained_contenders"]
@@ -29,24 +35,24 @@ class ConstrainedCase:
     """
 
     angles: Case
-    places: Case
+    positions: Case
     methods: tuple[str, ...]
 
     def shortened(self, share: float) -> ConstrainedCase:
         """Return the cases with a part of the span."""
         span = share * self.angles.span
-        return replace(self, angles=replace(self.angles, span=span), places=replace(self.places, span=span))
+        return replace(self, angles=replace(self.angles, span=span), positions=replace(self.positions, span=span))
 
 
 def constrained_contenders(both: ConstrainedCase, *, quick: bool) -> list[Contender]:
     """Return contenders with constraints and, for few rods, in angles."""
-    methods = [as_method(name, both.places.system) for name in both.methods[: 1 if quick else None]]
-    held = [_told_in_angles(each) for each in our_contenders(both.places, methods=methods, quick=quick)]
+    methods = [as_method(name, both.positions.system) for name in both.methods[: 1 if quick else None]]
+    held = [_converted_to_angles(each) for each in our_contenders(both.positions, methods=methods, quick=quick)]
     few = both.angles.dimension <= LARGEST_IN_ANGLES
     return [*held, *(_named_angles(each) for each in our_contenders(both.angles, quick=quick) if few)]
 
 
-def _told_in_angles(contender: Contender) -> Contender:
+def _converted_to_angles(contender: Contender) -> Contender:
     """Return the contender with final positions converted to angles, untimed."""
 
     def prepare(index: int) -> Callable[[], Array]:
@@ -72,8 +78,10 @@ def _rods(name: str, n: int, start: float, *, methods: tuple[str, ...], span: fl
         step=fine,
         fine=fine,
     )
-    places = replace(angles, system=rods_in_places(n), formulations=(), q=places_of(q), velocity=0.0 * places_of(q))
-    return ConstrainedCase(angles=angles, places=places, methods=methods)
+    positions = replace(
+        angles, system=rods_in_positions(n), formulations=(), q=positions_of(q), velocity=0.0 * positions_of(q)
+    )
+    return ConstrainedCase(angles=angles, positions=positions, methods=methods)
 
 
 CONSTRAINED_CASES: Mapping[str, Callable[[], ConstrainedCase]] = {

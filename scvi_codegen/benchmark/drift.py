@@ -10,11 +10,11 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import Array, Case, case
 from scvi_codegen.benchmark.contenders.taylor import heyoka_states
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["DRIFTS", "fitted_slope", "run_drift"]
@@ -27,15 +27,15 @@ SAMPLES = 2000
 BLOCKS = 20
 
 
-@unwarned()
-def run_drift(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_drift(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure all cases at all step sizes, with SVI(8) and heyoka at its default tolerance."""
     steps = QUICK_STEPS if plan.quick else STEPS
     with_heyoka = "heyoka" in plan.peers and importlib.util.find_spec("heyoka") is not None
     rows = []
     for name, sizes in DRIFTS.items():
         for h in sizes:
-            say(f"drift: {name}, h = {h:g}, {steps} steps")
+            report_activity(f"drift: {name}, h = {h:g}, {steps} steps")
             rows += drift_rows(case(name), h, steps, with_heyoka=with_heyoka)
     formats = {"case": "", "method": "", "h": "g", "span": ".0f", "seconds": ".2f", "at_the_end": ".1e"}
     return ResultTable(
@@ -57,16 +57,16 @@ def drift_rows(chosen: Case, h: float, steps: int, *, with_heyoka: bool) -> list
     save_every = max(1, steps // SAMPLES)
     began = time.process_time()
     run = stepper.integrate(q, p, h=h, steps=steps, save_every=save_every)
-    found = [("scvi-codegen", h, time.process_time() - began, run.q, run.p)]
+    result = [("scvi-codegen", h, time.process_time() - began, run.q, run.p)]
     if with_heyoka:
         began = time.process_time()
         states = heyoka_states(chosen, np.linspace(0.0, h * steps, steps // save_every + 1))
         half = chosen.dimension
-        found.append(("heyoka", float("nan"), time.process_time() - began, states[:, :half], states[:, half:]))
+        result.append(("heyoka", float("nan"), time.process_time() - began, states[:, :half], states[:, half:]))
     return [
         {"case": chosen.name, "method": method, "h": size, "span": h * steps, "seconds": seconds}
         | _energy_entries(stepper, q, p)
-        for method, size, seconds, q, p in found
+        for method, size, seconds, q, p in result
     ]
 
 

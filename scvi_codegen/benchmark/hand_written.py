@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Array, Case, case
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
 from scvi_codegen.tables.precision import Matrix, mp
@@ -37,12 +37,12 @@ DECLARATIONS = (
 )
 
 
-@unwarned()
-def run_hand_written(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_hand_written(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure nanoseconds per step of both in turn, and the difference of their final states."""
     rows = []
     for name, h in HAND_WRITTEN.items():
-        say(f"hand-written: {name}")
+        report_activity(f"hand-written: {name}")
         rows.append(_compare(case(name), h, repeats=3 * plan.repeats, steps=STEPS // 20 if plan.quick else STEPS))
     return ResultTable(
         name="hand-written",
@@ -105,21 +105,21 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
         q, v = chosen.q[0].copy(), chosen.velocity[0].copy()
         out = np.empty((count // every, chosen.dimension))
         pointers = [module.ffi.from_buffer("double[]", array) for array in (q, v, out)]
-        sweeps = module.lib.hand_written(pointers[0], pointers[1], strength, h, count, every, pointers[2])
-        return out, sweeps
+        iterations_counted = module.lib.hand_written(pointers[0], pointers[1], strength, h, count, every, pointers[2])
+        return out, iterations_counted
 
     def generated(count: int, every: int) -> tuple[Array, int]:
         return _generated(stepper, chosen, h, count, every)
 
     seconds: dict[str, list[float]] = {"generated": [], "by_hand": []}
-    sweeps = {}
+    iterations_counted = {}
     for _ in range(repeats):
         for name, function in (("generated", generated), ("by_hand", by_hand)):
             began = time.process_time()
-            _, sweeps[name] = function(steps, steps)
+            _, iterations_counted[name] = function(steps, steps)
             seconds[name].append(time.process_time() - began)
     one, other = generated(COMPARED, 1)[0], by_hand(COMPARED, 1)[0]
-    middle = {name: float(np.median(found)) for name, found in seconds.items()}
+    middle = {name: float(np.median(result)) for name, result in seconds.items()}
     return {
         "case": chosen.name,
         "h": h,
@@ -127,8 +127,8 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
         "by_hand_ns": 1e9 * middle["by_hand"] / steps,
         "ratio": middle["generated"] / middle["by_hand"],
         "apart": float(np.abs(one - other).max() / np.abs(other).max()),
-        "generated_iterations": sweeps["generated"] / steps,
-        "by_hand_iterations": sweeps["by_hand"] / steps,
+        "generated_iterations": iterations_counted["generated"] / steps,
+        "by_hand_iterations": iterations_counted["by_hand"] / steps,
     }
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import Array, Vector
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
-__all__ = ["angles_of", "places_of", "rod_accelerations", "rods_in_angles", "rods_in_places"]
+__all__ = ["angles_of", "positions_of", "rod_accelerations", "rods_in_angles", "rods_in_positions"]
 
 UNITS = {"m": 1.0, "l": 1.0, "g": 1.0}
 
@@ -48,7 +48,7 @@ def rods_in_angles(
     )
 
 
-def rods_in_places(n: int) -> LagrangianSystem:
+def rods_in_positions(n: int) -> LagrangianSystem:
     """Return the system in the positions (x0, y0, x1, ..) of the masses, with distance constraints."""
     kinetic = " + ".join(f"x{k}_dot**2 + y{k}_dot**2" for k in range(n))
     rods = [f"(x{k} - x{k - 1})**2 + (y{k} - y{k - 1})**2 = l**2" for k in range(1, n)]
@@ -84,26 +84,26 @@ def rod_accelerations(
     return [each / length for each in across]
 
 
-def _tridiagonal(diagonal: Sequence[float], beside: Vector, right: Vector) -> list[Any]:
+def _tridiagonal(diagonal: Sequence[float], off_diagonal: Vector, right: Vector) -> list[Any]:
     """Solve diagonal_k x_k - beside_k x_(k+1) - beside_(k-1) x_(k-1) = right_k by elimination from the end."""
     pivots, values = [diagonal[-1]], [right[-1]]
-    for d, b, r in zip(diagonal[-2::-1], reversed(beside), right[-2::-1], strict=True):
+    for d, b, r in zip(diagonal[-2::-1], reversed(off_diagonal), right[-2::-1], strict=True):
         share = b / pivots[-1]
         pivots.append(d - share * b)
         values.append(r + share * values[-1])
     x = [values.pop() / pivots.pop()]
-    for b, pivot, value in zip(beside, reversed(pivots), reversed(values), strict=True):
+    for b, pivot, value in zip(off_diagonal, reversed(pivots), reversed(values), strict=True):
         x.append((value + b * x[-1]) / pivot)
     return x
 
 
-def places_of(angles: Array, length: float = 1.0) -> Array:
+def positions_of(angles: Array, length: float = 1.0) -> Array:
     """Return (.., 2 n) positions of (.., n) angles."""
     steps = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
     return np.cumsum(steps, axis=-2).reshape(*angles.shape[:-1], -1)
 
 
-def angles_of(places: Array) -> Array:
+def angles_of(positions: Array) -> Array:
     """Return the (.., n) angles, between -pi and pi, of (.., 2 n) positions."""
-    x, y = (np.diff(places[..., axis::2], axis=-1, prepend=0.0) for axis in (0, 1))
+    x, y = (np.diff(positions[..., axis::2], axis=-1, prepend=0.0) for axis in (0, 1))
     return np.arctan2(x, -y)

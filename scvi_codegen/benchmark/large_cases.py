@@ -72,8 +72,8 @@ def field(side: int, span: float) -> Lattice:
 
     def accelerations(u: Array) -> Array:
         around = sum(np.roll(u, shift, axis) for shift in (1, -1) for axis in (0, 1))
-        found: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
-        return found
+        result: Array = (around - 4.0 * u) / dx**2 - np.sin(u)
+        return result
 
     return Lattice(
         name="field",
@@ -101,8 +101,8 @@ def bodies(count: int, span: float) -> Lattice:
     def accelerations(r: Array) -> Array:
         d = r[np.newaxis] - r[:, np.newaxis]
         cube = (np.sum(d**2, axis=-1) + softening**2) ** -1.5
-        found: Array = np.einsum("ij,ijk->ik", cube, d) / count
-        return found
+        result: Array = np.einsum("ij,ijk->ik", cube, d) / count
+        return result
 
     return Lattice(
         name="bodies",
@@ -132,8 +132,8 @@ def atoms(cells: int, span: float) -> Lattice:
         d = r[np.newaxis] - r[:, np.newaxis]
         square = np.sum(d**2, axis=-1)
         np.fill_diagonal(square, np.inf)
-        found: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
-        return found
+        result: Array = -np.einsum("ij,ijk->ik", 24.0 * (2.0 * square**-7 - square**-4), d)
+        return result
 
     return Lattice(
         name="atoms",
@@ -157,8 +157,8 @@ def waves(count: int, span: float) -> Lattice:
     """Return a Klein-Gordon ring with on-site q^4 potential, with long waves."""
 
     def accelerations(q: Array) -> Array:
-        found: Array = np.roll(q, -1) - 2.0 * q + np.roll(q, 1) - q - q**3
-        return found
+        result: Array = np.roll(q, -1) - 2.0 * q + np.roll(q, 1) - q - q**3
+        return result
 
     phase = 2.0 * np.pi * np.arange(count) / count
     return Lattice(
@@ -184,8 +184,8 @@ def breather(count: int, span: float) -> Lattice:
     slope = np.sqrt(1.0 - frequency**2)
 
     def accelerations(u: Array) -> Array:
-        found: Array = (np.roll(u, -1) - 2.0 * u + np.roll(u, 1)) / dx**2 - np.sin(u)
-        return found
+        result: Array = (np.roll(u, -1) - 2.0 * u + np.roll(u, 1)) / dx**2 - np.sin(u)
+        return result
 
     x = dx * (np.arange(count) - count // 2)
     return Lattice(
@@ -208,18 +208,18 @@ def breather(count: int, span: float) -> Lattice:
 
 def cloth(side: int, span: float) -> Lattice:
     """Return points on a square with springs between neighbours along both axes, slightly stretched and waving."""
-    places = np.arange(side**2).reshape(side, side)
-    down, along = np.stack([places[:-1], places[1:]], -1), np.stack([places[:, :-1], places[:, 1:]], -1)
+    indices = np.arange(side**2).reshape(side, side)
+    down, along = np.stack([indices[:-1], indices[1:]], -1), np.stack([indices[:, :-1], indices[:, 1:]], -1)
     bonds = np.concatenate([down.reshape(-1, 2), along.reshape(-1, 2)])
     x, y = (each.T for each in np.meshgrid(np.arange(side), np.arange(side)))
     q = np.stack([1.05 * x, 1.02 * y, 0.1 * np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
 
     def accelerations(r: Array) -> Array:
         d = r[bonds[:, 0]] - r[bonds[:, 1]]
-        length, found = np.sqrt(np.sum(d**2, axis=-1, keepdims=True)), np.zeros_like(r)
-        np.add.at(found, bonds[:, 0], -100.0 * (1.0 - 1.0 / length) * d)
-        np.add.at(found, bonds[:, 1], 100.0 * (1.0 - 1.0 / length) * d)
-        return found
+        length, result = np.sqrt(np.sum(d**2, axis=-1, keepdims=True)), np.zeros_like(r)
+        np.add.at(result, bonds[:, 0], -100.0 * (1.0 - 1.0 / length) * d)
+        np.add.at(result, bonds[:, 1], 100.0 * (1.0 - 1.0 / length) * d)
+        return result
 
     return Lattice(
         name="cloth",

@@ -14,7 +14,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.curves import Point, time_at
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 
@@ -27,15 +27,15 @@ ERROR = 1e-9
 LONGEST = 1800
 
 
-def run_mechanisms(plan: Plan, say: Say) -> ResultTable:
+def run_mechanisms(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure one process per contender, with an empty cache."""
     rows: list[dict[str, Any]] = []
     for links in LINKS[: 1 if plan.quick else None]:
-        found = {}
+        result = {}
         for name in CONTENDERS:
-            say(f"mechanisms: {links} links by {name}")
-            found[name] = _measured(name, links)
-        rows += [{"links": links, "by": name} | _row(name, found) for name in CONTENDERS]
+            report_activity(f"mechanisms: {links} links by {name}")
+            result[name] = _measured(name, links)
+        rows += [{"links": links, "by": name} | _row(name, result) for name in CONTENDERS]
     return ResultTable(
         name="mechanisms",
         title="a pendulum of n links on a cart, from SymPy's bodies and loads, in a fresh process with an empty cache",
@@ -71,9 +71,9 @@ def _measured(name: str, links: int) -> dict[str, Any]:
     return measured
 
 
-def _row(name: str, found: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def _row(name: str, result: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the times of a contender, with errors relative to another contender's most accurate run."""
-    own, other = found[name], found["lambdify" if name == OURS else OURS]
+    own, other = result[name], result["lambdify" if name == OURS else OURS]
     if "why_not" in own or "why_not" in other:
         return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "no reference to compare with"}
     exact = np.array(other["runs"][-1]["q"])

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Case, case
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
@@ -25,7 +25,7 @@ from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["run_paper_tables"]
@@ -40,12 +40,12 @@ TABLES = (
 """Number, case, (q0, v0), h, methods with the printed seconds, degree of collocation and its seconds."""
 
 
-@unwarned()
-def run_paper_tables(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_paper_tables(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure both tables."""
     rows: list[dict[str, Any]] = []
     for number, name, (q, v), h, methods, degree, seconds in TABLES:
-        say(f"tables: Table {number}, {name}")
+        report_activity(f"tables: Table {number}, {name}")
         plain = case(name)
         chosen = replace(plain, q=np.array([[q]]), velocity=np.array([[v]]), span=plain.span * plan.share)
         named = methods | {COLLOCATION: (SpectralCollocation(degree), seconds)}
@@ -73,7 +73,7 @@ def _table(
     for _ in range(repeats):
         for scheme, stepper in steppers.items():
             seconds[scheme].append(_seconds(stepper, chosen, count))
-    middle = {scheme: statistics.median(found) for scheme, found in seconds.items()}
+    middle = {scheme: statistics.median(result) for scheme, result in seconds.items()}
     return [
         {
             "table": number,

@@ -9,12 +9,12 @@ from scvi_codegen.benchmark.contenders.peers import PEERS
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods.method import Method
 
-__all__ = ["Plan", "Say"]
+__all__ = ["Plan", "ReportActivity"]
 
 QUICK_SHARE = 0.05
 QUICK_REPEATS = 2
 
-Say = Callable[[str], None]
+ReportActivity = Callable[[str], None]
 """Function that is called with a description of each activity."""
 
 

@@ -46,7 +46,7 @@ Field = Callable[[Extended, Extended], Extended]
 """Function that returns x' for x, (.., d), at times t, (..)."""
 
 STAGES = 16
-MOST_SWEEPS = 100
+MAX_ITERATIONS = 100
 STALLED, ROUNDED = 1e-16, 1e-14
 """Relative changes below which the iteration has converged: once they hardly shrink, or, near collisions, grow."""
 
@@ -164,18 +164,18 @@ def final_states(field: Field, start: Extended, span: float, h: float) -> Extend
 def states_after(field: Field, start: Extended, steps: Sequence[float] | Extended) -> Extended:
     """Return (k, d) states after these steps."""
     a, b, guess_table = gauss_tables(STAGES)
-    # Compensated summation (Kahan): ``carry`` is the part of x that rounding cut off.
-    x, carry, before, t = start.copy(), np.zeros_like(start), None, np.longdouble(0)
+    # Compensated summation (Kahan): ``compensation`` is the part of x that rounding cut off.
+    x, compensation, before, t = start.copy(), np.zeros_like(start), None, np.longdouble(0)
     stages: Extended | None = None
     for size in steps:
         guess = None if stages is None or size != before else _product(guess_table, stages)
         before, h = size, np.longdouble(size)
-        stages = _stages(partial(_at, field, t + h * a[0].sum(axis=1)), x + carry, h, a, guess)
-        change = carry + h * _product(b, stages)[0]
+        stages = _stages(partial(_at, field, t + h * a[0].sum(axis=1)), x + compensation, h, a, guess)
+        change = compensation + h * _product(b, stages)[0]
         new = x + change
-        carry = change - (new - x)
+        compensation = change - (new - x)
         x, t = new, t + h
-    return x + carry
+    return x + compensation
 
 
 def _at(field: Field, times: Extended, x: Extended) -> Extended:
@@ -209,15 +209,15 @@ def _stages(
     field: Callable[[Extended], Extended], x: Extended, h: np.longdouble, a: Table, guess: Extended | None
 ) -> Extended:
     """Return (s, k, d) derivatives F_n = field(x + h sum_j a_nj F_j), by fixed-point iteration to round-off."""
-    slopes = field(np.broadcast_to(x, (len(a[0]), *x.shape))) if guess is None else guess
-    low = _product((a[1],), slopes)  # small: not updated in the iteration
+    derivatives = field(np.broadcast_to(x, (len(a[0]), *x.shape))) if guess is None else guess
+    low = _product((a[1],), derivatives)  # small: not updated in the iteration
     scale, last = h / np.max(np.abs(x)), np.inf
-    for _ in range(MOST_SWEEPS):
-        new = field(x + h * (_product((a[0],), slopes) + low))
-        change = float(scale * np.max(np.abs(new - slopes)))
-        slopes = new
+    for _ in range(MAX_ITERATIONS):
+        new = field(x + h * (_product((a[0],), derivatives) + low))
+        change = float(scale * np.max(np.abs(new - derivatives)))
+        derivatives = new
         if change == 0.0 or (change < STALLED and change >= 0.3 * last) or (change < ROUNDED and change >= last):
-            return slopes
+            return derivatives
         last = change
     raise StateError(f"the reference did not converge with steps of {float(h):g} (last change {change:.1e})")
 

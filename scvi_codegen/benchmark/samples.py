@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -79,12 +79,12 @@ class Sampling:
         return [self.advanced.q.tolist(), self.held.q.tolist(), list(self._memory.q)]
 
 
-def run_samples(plan: Plan, say: Say) -> ResultTable:
+def run_samples(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure microseconds per call: minima of processor time, all in turn, round after round."""
     rows = []
     for name, system in SYSTEMS.items():
         for method in METHODS:
-            say(f"samples: {name} by {method}")
+            report_activity(f"samples: {name} by {method}")
             times = _fastest(Sampling(system, method).calls, plan)
             over = {"hold_over": times["hold"] - times["assign"], "advance_over": times["advance"] - times["bare"]}
             rows.append({"system": name, "by": method} | times | over)

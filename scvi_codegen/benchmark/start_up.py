@@ -11,7 +11,7 @@ import tempfile
 import time
 from typing import Any
 
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 
@@ -36,20 +36,20 @@ print(json.dumps([imported - began, done - imported, symbolic, "sympy" in sys.mo
 """
 
 
-def run_start_up(plan: Plan, say: Say) -> ResultTable:
+def run_start_up(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure medians, without and with cache in turn."""
-    found: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
+    result: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
     for number in range(plan.rounds):
-        say(f"start-up: round {number + 1}")
+        report_activity(f"start-up: round {number + 1}")
         with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
-            for kind, rows in found.items():
+            for kind, rows in result.items():
                 rows.append(_first_step(folder) | {"cache": kind})
     formats = {"cache": "", "import_ms": ".0f", "first_step_ms": ".0f", "process_ms": ".0f"}
     return ResultTable(
         name="start-up",
         title="from the text of Kepler's Lagrangian to the first step, in a fresh process",
         columns=formats | {"sympy_by_import": "", "sympy_by_step": ""},
-        rows=tuple(_medians(rows) for rows in found.values()),
+        rows=tuple(_medians(rows) for rows in result.values()),
         remarks=(
             "import: of scvi_codegen and the names used; first step: from the text on; process: the whole.",
             "sympy: whether SymPy was imported by 'import scvi_codegen', and by the step.",

@@ -21,13 +21,13 @@ from scvi_codegen.benchmark.contenders.molecules import PLATFORMS, openmm_run
 from scvi_codegen.benchmark.curves import Point, time_at
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, field, ring
 from scvi_codegen.benchmark.machine_limits import machine_limits
-from scvi_codegen.benchmark.plan import Plan, Say
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["reference_of", "rms", "run_growth", "run_sums"]
 
@@ -53,12 +53,12 @@ def lattices(plan: Plan) -> tuple[Lattice, ...]:
     return (ring(1000, 20.0), ring(100_000, 2.0), field(256, 2.0), bodies(256, 2.0), atoms(4, 1.0))
 
 
-@unwarned()
-def run_sums(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_sums(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure the times of every contender at equal error."""
     rows: list[dict[str, Any]] = []
     for each in lattices(plan):
-        say(f"sums: {each.name} of {each.q.size} coordinates")
+        report_activity(f"sums: {each.name} of {each.q.size} coordinates")
         reference, doubt = reference_of(each)
         curves = _curves(_contenders(each, plan), reference, plan)
         rows += [_row(each, error, curves, doubt) for error in ERRORS]
@@ -82,12 +82,12 @@ def run_sums(plan: Plan, say: Say) -> ResultTable:
 def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: float) -> dict[str, Any]:
     times = {name: time_at(points, error) for name, points in curves.items()}
     own = {name: seconds for name in METHODS if (seconds := times.get(name)) is not None}
-    found: dict[str, Any] = {"problem": each.name, "coordinates": each.q.size, "error": error, "doubt": doubt}
+    result: dict[str, Any] = {"problem": each.name, "coordinates": each.q.size, "error": error, "doubt": doubt}
     if not own:
-        return found
+        return result
     best = min(own, key=own.__getitem__)
     ratios = {name: seconds / own[best] for name, seconds in times.items() if name not in METHODS and seconds}
-    return found | {"ours_ms": 1e3 * own[best], "by": best} | ratios
+    return result | {"ours_ms": 1e3 * own[best], "by": best} | ratios
 
 
 def reference_of(each: Lattice) -> tuple[Array, float]:
@@ -129,33 +129,33 @@ def _count(each: Lattice, h: float) -> int:
 
 def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]]]:
     """Return the settings by name."""
-    found = {
+    result = {
         method: [_ours(each, method, _count(each, each.longest / 2**k)) for k in range(7 - int(method[-1]) // 2)]
         for method in METHODS
     }
-    found[OWN] = [_ours(each, Composition(8), _count(each, each.longest / 2**k)) for k in range(6)]
+    result[OWN] = [_ours(each, Composition(8), _count(each, each.longest / 2**k)) for k in range(6)]
     if each.by_hand:
-        found["leapfrog"] = [_by_hand(each, 2, _count(each, each.longest / 2**k)) for k in range(1, 13)]
-        found["order_8"] = [_by_hand(each, 8, _count(each, each.longest / 2**k)) for k in range(6)]
-    found["DOP853"] = [_dop853(each, tolerance) for tolerance in TOLERANCES]
+        result["leapfrog"] = [_by_hand(each, 2, _count(each, each.longest / 2**k)) for k in range(1, 13)]
+        result["order_8"] = [_by_hand(each, 8, _count(each, each.longest / 2**k)) for k in range(6)]
+    result["DOP853"] = [_dop853(each, tolerance) for tolerance in TOLERANCES]
     if each.name == "bodies" and "rebound" in plan.peers and find_spec("rebound"):
-        found["REBOUND_leapfrog"] = [
+        result["REBOUND_leapfrog"] = [
             _rebound(each, "leapfrog", _count(each, each.longest / 2**k)) for k in range(2, 12)
         ]
-        found["IAS15"] = [_rebound(each, "ias15", None)]
+        result["IAS15"] = [_rebound(each, "ias15", None)]
     if each.name == "atoms" and "openmm" in plan.peers and find_spec("openmm"):
         for name in PLATFORMS:
-            found[name] = [_openmm(name, each, _count(each, each.longest / 2**k)) for k in range(1, 10)]
-    return found
+            result[name] = [_openmm(name, each, _count(each, each.longest / 2**k)) for k in range(1, 10)]
+    return result
 
 
 def _ours(each: Lattice, method: Any, steps: int) -> Callable[[], Array]:
     stepper, name = compile_indexed(each.system, method), each.system.coordinates[0].name
 
     def run() -> Array:
-        found = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
-        found.advance(steps)
-        return found.q[name]
+        result = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
+        result.advance(steps)
+        return result.q[name]
 
     return run
 
@@ -185,13 +185,13 @@ def _by_hand_source() -> Source:
 def _dop853(each: Lattice, tolerance: float) -> Callable[[], Array]:
     size, shape = each.q.size, each.q.shape
 
-    def slope(t: float, y: Array) -> Array:
+    def derivative(t: float, y: Array) -> Array:
         return np.concatenate([y[size:], each.accelerations(y[:size].reshape(shape)).reshape(-1)])
 
     def run() -> Array:
         start = np.concatenate([each.q.reshape(-1), each.v.reshape(-1)])
-        found = solve_ivp(slope, (0.0, each.span), start, method="DOP853", rtol=tolerance, atol=tolerance)
-        end: Array = found.y[:size, -1].reshape(shape)
+        result = solve_ivp(derivative, (0.0, each.span), start, method="DOP853", rtol=tolerance, atol=tolerance)
+        end: Array = result.y[:size, -1].reshape(shape)
         return end
 
     return run
@@ -218,10 +218,10 @@ def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], 
     return run
 
 
-@unwarned()
-def run_growth(plan: Plan, say: Say) -> ResultTable:
+@without_accuracy_warnings()
+def run_growth(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure the time to the first step, and time and memory per step, by number of coordinates."""
-    rows, (memory, arithmetic) = list(_growth(plan, say)), machine_limits()
+    rows, (memory, arithmetic) = list(_growth(plan, report_activity)), machine_limits()
     return ResultTable(
         name="growth",
         title="scaling with size: h = 0.1 (field: 0.03), one process each with an empty cache",
@@ -245,20 +245,27 @@ def run_growth(plan: Plan, say: Say) -> ResultTable:
     )
 
 
-def _growth(plan: Plan, say: Say) -> Iterator[dict[str, Any]]:
+def _growth(plan: Plan, report_activity: ReportActivity) -> Iterator[dict[str, Any]]:
     sizes = [("ring", count) for count in GROWTH[: 2 if plan.quick else None]]
     sizes.append(("field", 16 if plan.quick else SIDE))
     for method in ("svi:4", "svi:8", "stoermer-verlet"):
         for name, size in sizes:
             count = size * size if name == "field" else size
-            say(f"growth: {name} of {count} coordinates by {method}")
+            report_activity(f"growth: {name} of {count} coordinates by {method}")
             with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
                 environment = os.environ | {building.CACHE_VARIABLE: folder}
-                command = [sys.executable, "-m", "scvi_codegen.benchmark.contenders.one_size", method, name, str(size)]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "scvi_codegen.benchmark.contenders.indexed_process",
+                    method,
+                    name,
+                    str(size),
+                ]
                 run = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
             yield {"problem": name, "by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
 
 
-def _numbers(found: Sequence[str]) -> dict[str, float]:
+def _numbers(result: Sequence[str]) -> dict[str, float]:
     names = ("first_step_s", "ns_a_coordinate_and_step", "iterations", "gflops", "gigabytes_s", "memory_mb")
-    return dict(zip(names, map(float, found), strict=True))
+    return dict(zip(names, map(float, result), strict=True))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import click
 
-from scvi_codegen.cli.frame import Commands
+from scvi_codegen.cli.command_group import Commands
 
 __all__ = ["main"]
 

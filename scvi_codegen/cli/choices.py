@@ -21,7 +21,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, read_model_file
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "Choices", "complete_model", "model_arguments", "read_model"]
+__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "ModelOptions", "complete_model", "model_arguments", "read_model"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -34,7 +34,7 @@ OFFERED_SIZES = range(1, 17)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choices:
+class ModelOptions:
     """Options of the command line that override MODEL; ``None`` or an empty tuple for options that are absent."""
 
     method: str | None
@@ -72,10 +72,10 @@ class Choices:
             "inputs": dict(self.inputs or ()),
             "sizes": dict(self.size or ()),
         }
-        given = {
+        arguments = {
             name: {key: _plain(x) for key, x in section.items() if x is not None} for name, section in named.items()
         }
-        return {name: section for name, section in given.items() if section}
+        return {name: section for name, section in arguments.items() if section}
 
 
 def _plain(value: Any) -> Any:
@@ -128,8 +128,8 @@ def _input_files(
     """Return NAME=FILE[:KIND] as entries of the section [inputs]; paths are relative to the working directory."""
     result = []
     for text in values:
-        name, _, given = (part.strip() for part in text.partition("="))
-        found = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", given)
+        name, _, arguments = (part.strip() for part in text.partition("="))
+        found = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", arguments)
         if not name or not found:
             raise click.BadParameter(f"'{text}' is not of the form NAME=FILE[:KIND], as in u=u.csv:cubic")
         entry = {key: value for key, value in found.groupdict().items() if value is not None}
@@ -250,7 +250,7 @@ SOLVER_OPTION = _option(
 
 
 def model_arguments(command: Command, *, required: bool = True) -> Command:
-    """Add the argument MODEL and the options of :class:`Choices` to a command."""
+    """Add the argument MODEL and the options of :class:`ModelOptions` to a command."""
     for option in reversed((*METHOD_OPTIONS, *STATE_OPTIONS)):
         command = option(command)
     return click.argument(
@@ -261,24 +261,24 @@ def model_arguments(command: Command, *, required: bool = True) -> Command:
     )(command)
 
 
-def _check_method(choices: Choices) -> None:
+def _check_method(choices: ModelOptions) -> None:
     """Reject options that the chosen method does not take or that contradict the number in its name."""
     if choices.method is None:
         return
-    said = specification_of(choices.method)
-    taken = ARGUMENTS[said["method"]]
+    message = specification_of(choices.method)
+    taken = ARGUMENTS[message["method"]]
     for option in METHOD_CHOICES[1:]:
         value = getattr(choices, option)
         if value is not None and option not in taken:
             takes = ", ".join(f"--{one}" for one in taken if one in METHOD_CHOICES) or "no options"
             raise click.UsageError(f"--method {choices.method} takes no --{option}; it takes {takes}")
-        if value is not None and said.get(option, value) != value:
+        if value is not None and message.get(option, value) != value:
             raise click.UsageError(
                 f"--method {choices.method} and --{option} {value} contradict each other: leave one of them out"
             )
 
 
-def read_model(name: str, choices: Choices) -> Model | IndexedModel:
+def read_model(name: str, choices: ModelOptions) -> Model | IndexedModel:
     """Return the model of a file or of the catalogue, overridden by the options of the command line.
 
     Raises:

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
 
 __all__ = ["Balance", "energy_balance", "energy_report", "momentum_report"]
 
 Array = NDArray[np.float64]
 
-MOST_SHOWN = 12
+MAX_LISTED = 12
 """Largest number of momentum maps that are listed one by one."""
-LARGE_ERROR, LOST = 1e-3, 0.1
+LARGE_ERROR, NOT_CONSERVED = 1e-3, 0.1
 """Relative errors from which a quantity is reported as hardly conserved, and as not conserved."""
-BALANCED_STEPS, BALANCED_COORDINATES = 10_000, 12
+MAX_BALANCE_STEPS, MAX_BALANCE_COORDINATES = 10_000, 12
 """Limits for computing the energy balance: Newton's iteration recomputes each step, some tens of microseconds each."""
 
 
@@ -41,7 +41,7 @@ def energy_balance(system: MechanicalSystem, trajectory: Trajectory | DrivenTraj
         trajectory: saved states; the steps between two of them are repeated to sum up the work.
         steps: number of steps.
     """
-    short = 0 < steps <= BALANCED_STEPS and system.dimension <= BALANCED_COORDINATES
+    short = 0 < steps <= MAX_BALANCE_STEPS and system.dimension <= MAX_BALANCE_COORDINATES
     if not (short and system.balances_energy):
         return None
     try:
@@ -75,7 +75,7 @@ def _verdict(error: float) -> str:
         f"a conserved quantity has a relative error of {error:.2g}: use a smaller step size or more stages",
         MethodWarning,
     )
-    return ": NOT conserved" if error >= LOST else ": hardly conserved"
+    return ": NOT conserved" if error >= NOT_CONSERVED else ": hardly conserved"
 
 
 def _drift(t: Array, error: Array) -> float:
@@ -95,8 +95,8 @@ def momentum_report(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) 
         yield str(failure)
         return
     largest = np.fmax.reduce(changes, axis=tuple(range(changes.ndim - 1)))
-    for name, exact, error in list(zip(described.map_names, described.map_exact, largest, strict=True))[:MOST_SHOWN]:
+    for name, exact, error in list(zip(described.map_names, described.map_exact, largest, strict=True))[:MAX_LISTED]:
         note = "" if exact else " (not guaranteed by this method)"
         yield f"relative error of {name}: {error:.2e} at most{note}{_verdict(error)}"
-    if len(largest) > MOST_SHOWN:
-        yield f"and {len(largest) - MOST_SHOWN} more conserved quantities, {largest[MOST_SHOWN:].max():.2e} at most"
+    if len(largest) > MAX_LISTED:
+        yield f"and {len(largest) - MAX_LISTED} more conserved quantities, {largest[MAX_LISTED:].max():.2e} at most"

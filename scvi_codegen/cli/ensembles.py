@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.cli.conservation import momentum_report
+from scvi_codegen.cli.formatting import counted, duration, span_remark
 from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
-from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import FAILURES, SolverOptions
+from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
 from scvi_codegen.runtime.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
+from scvi_codegen.runtime.ensemble_selection import ensemble_work
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import ensemble_work
 from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
@@ -66,10 +66,10 @@ def integrate_states(
     work = _work(model, stepper, states, options)
     started, interrupted = time.perf_counter(), False
     length = work.length
-    with interruptions() as caught, progress_bar(length) as reach:
+    with interruptions() as caught, progress_bar(length) as show_progress:
 
         def look(done: int) -> None:
-            reach(done)
+            show_progress(done)
             if caught and done < length:
                 raise _Stop
 
@@ -87,7 +87,7 @@ def integrate_states(
 
 def _work(
     model: Model, stepper: Stepper, states: EnsembleStates, options: SolverOptions | None
-) -> Ensemble | EnsembleToEnds:
+) -> Ensemble | AdaptiveEnsemble:
     """Return the compiled ensemble; Ctrl-C still ends the process here."""
     start = stepper, states.q, states.momenta(stepper)
     common: dict[str, Any] = {
@@ -100,7 +100,7 @@ def _work(
         inputs = model.all_inputs()
         return ensemble_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
-        return EnsembleToEnds(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
+        return AdaptiveEnsemble(*start, t_end=model.t + model.covered, tolerance=model.tolerance, **common)
     work = Ensemble(*start, h=model.h, steps=model.step_count, **common)
     work.blocks()
     return work
@@ -114,20 +114,20 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         model.system.name,
         model.method.title,
         f"{counted(len(result), 'trajectory').replace('trajectorys', 'trajectories')} of "
-        f"{_way(model, result)} saved of each",
+        f"{_describe_steps(model, result)} saved of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
         *(
             []
             if model.h is None or model.system.inputs
-            else whole_steps(model.span, model.step, model.step_count, model.t)
+            else span_remark(model.span, model.step, model.step_count, model.t)
         ),
         ", ".join(f"{number} {status}" for status, number in _statuses(result)),
     ]
     return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])
 
 
-def _way(model: Model, result: EnsembleTrajectory) -> str:
+def _describe_steps(model: Model, result: EnsembleTrajectory) -> str:
     if model.h is None:
         steps = f"{int(result.steps.min())} to {int(result.steps.max())} adaptive steps"
         return f"{steps} from t = {model.t:g} to t = {model.t + model.covered:g}; up to {len(result.t)} states"
@@ -144,7 +144,7 @@ def _statuses(result: EnsembleTrajectory) -> list[tuple[str, int]]:
 def _failures(result: EnsembleTrajectory) -> Iterator[str]:
     lost = np.flatnonzero(~result.ok & (result.status != "interrupted"))
     for j in lost[:SHOWN_FAILURES]:
-        t = result.ends[0][j] if result.goals or result.spans else result.t[0] + result.steps[j] * result.h
+        t = result.ends[0][j] if result.plans or result.spans else result.t[0] + result.steps[j] * result.h
         status = str(result.status[j])
         why = FAILURES[status][0] if status in FAILURES else status
         yield f"  trajectory {j}: step {result.steps[j]} at t = {t:g} failed: {why}"

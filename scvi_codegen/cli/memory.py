@@ -11,11 +11,11 @@ from pathlib import Path
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 
-__all__ = ["check_memory", "check_room", "check_states", "usable_memory"]
+__all__ = ["check_memory", "check_run_memory", "check_state_memory", "usable_memory"]
 
 COPIES = 2
 """Copies of the states that exist at once: the segments, and the arrays that join them."""
-LIMIT_OF_GROUP = Path("/sys/fs/cgroup/memory.max")
+CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a Linux control group (container)."""
 
 
@@ -25,41 +25,45 @@ def check_memory(model: Model, trajectories: int = 1) -> None:
     Raises:
         StateError: with the size needed and a ``--save-every`` at which the states fit.
     """
-    check_room(model, 0 if model.ends_at_time else model.step_count, trajectories)
+    check_run_memory(model, 0 if model.ends_at_time else model.step_count, trajectories)
 
 
-def check_room(model: Model, steps: int, trajectories: int = 1) -> None:
+def check_run_memory(model: Model, steps: int, trajectories: int = 1) -> None:
     """Reject a run of ``steps`` steps whose states do not fit; adaptive runs call it as they proceed.
 
     Raises:
         StateError: as :func:`check_memory`.
     """
     folder = "record the run in a folder (-o NAME.run)"
-    check_states(len(model.q), steps, model.save_every, trajectories, ways=[folder] if trajectories == 1 else [])
+    check_state_memory(
+        len(model.q), steps, model.save_every, trajectories, remedies=[folder] if trajectories == 1 else []
+    )
 
 
-def check_states(m: int, steps: int, save_every: int, trajectories: int = 1, *, ways: Sequence[str] = ()) -> None:
-    """Reject a run whose states, of ``m`` coordinates each, do not fit; ``ways`` are remedies to propose.
+def check_state_memory(
+    m: int, steps: int, save_every: int, trajectories: int = 1, *, remedies: Sequence[str] = ()
+) -> None:
+    """Reject a run whose states, of ``m`` coordinates each, do not fit; ``remedies`` are remedies to propose.
 
     Raises:
         StateError: as :func:`check_memory`.
     """
-    kept = steps // save_every + 1
+    saved = steps // save_every + 1
     each = 16 * m * trajectories + 12  # q and p of each; time and iterations
     room = usable_memory() / (COPIES * each)
-    if kept <= room:
+    if saved <= room:
         return
-    states = f"{kept} states" if trajectories == 1 else f"{kept} states of each of {trajectories} trajectories"
-    ways = [*([f"save fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *ways]
-    needed = f"{COPIES * each * kept / 1e9:.3g} GB of memory"
-    raise StateError(f"{states} need {needed}: {' or '.join(ways or ['reduce the number of steps'])}")
+    states = f"{saved} states" if trajectories == 1 else f"{saved} states of each of {trajectories} trajectories"
+    remedies = [*([f"save fewer (--save-every {-(-steps // int(room - 1))})"] if room >= 2 else []), *remedies]
+    needed = f"{COPIES * each * saved / 1e9:.3g} GB of memory"
+    raise StateError(f"{states} need {needed}: {' or '.join(remedies or ['reduce the number of steps'])}")
 
 
 def usable_memory() -> float:
     """Return the bytes of memory available to this process; infinity if the system does not report them."""
-    found = [math.inf]
+    result = [math.inf]
     with suppress(AttributeError, OSError, ValueError):
-        found.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
+        result.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
     with suppress(OSError, ValueError):
-        found.append(float(LIMIT_OF_GROUP.read_text()))
-    return min(found)
+        result.append(float(CGROUP_LIMIT.read_text()))
+    return min(result)

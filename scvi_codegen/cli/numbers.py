@@ -16,9 +16,9 @@ from scvi_codegen.cli.running import RunOutcome
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
-from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
 
 __all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
 
@@ -33,7 +33,7 @@ def run_numbers(
         **_about(model),
         "steps": run.steps,
         "rejected_steps": run.rejected_steps,
-        "h": run.goal.tau or None if run.goal else run.h,
+        "h": run.plan.tau or None if run.plan else run.h,
         "states": len(trajectory),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

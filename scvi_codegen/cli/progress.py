@@ -11,11 +11,11 @@ from types import FrameType
 
 import click
 
-from scvi_codegen.cli.frame import is_quiet
+from scvi_codegen.cli.command_group import is_quiet
 
-__all__ = ["PARTS", "interruptions", "progress_bar"]
+__all__ = ["BAR_LENGTH", "interruptions", "progress_bar"]
 
-PARTS = 1000
+BAR_LENGTH = 1000
 """Length of the progress bar of a run whose number of steps is not known in advance."""
 
 

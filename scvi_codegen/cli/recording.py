@@ -14,10 +14,10 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.cli.frame import tell
+from scvi_codegen.cli.command_group import tell
+from scvi_codegen.cli.formatting import counted, duration, span_remark
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.running import conserved, final_state
-from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
 from scvi_codegen.models.model import Model
@@ -26,16 +26,16 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run import Run
 
-__all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "is_folder", "standing"]
+__all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "describe_progress", "is_run_folder"]
 
 SUFFIX = ".run"
-LOOKED_AT = 10_000
+MAX_STATES = 10_000
 """Largest number of states used to summarise what was conserved."""
 WITH_RESUME = {"resume", "steps", "span", "checkpoint", "checkpoint_steps"}
 """Options that are allowed with ``--resume``."""
 
 
-def is_folder(output: str) -> bool:
+def is_run_folder(output: str) -> bool:
     """Return True if an output is a folder for a run: NAME.run, or a path that ends in a slash."""
     return output.endswith(("/", os.sep)) or Path(output).suffix.lower() == SUFFIX
 
@@ -89,7 +89,7 @@ class RecordedOutcome:
     def summary(self) -> str:
         """Return a summary of the run in a few lines."""
         steps = self.run.steps - self.first
-        lines = [standing(self.recorded)]
+        lines = [describe_progress(self.recorded)]
         if steps:
             since = f" since step {self.first}" if self.first else ""
             lines.append(f"{self.seconds:.3g} s{since}, {duration(self.seconds / steps)} per step, including writing")
@@ -102,12 +102,12 @@ class RecordedOutcome:
         text = self.recorded.manifest.model
         if text is None or not self.run.steps:
             return []
-        stride = -(-len(self.recorded) // LOOKED_AT)
+        stride = -(-len(self.recorded) // MAX_STATES)
         with np.errstate(all="ignore"):
             lines = list(conserved(parse_model(text), self.recorded[::stride]))
         return [f"in every {stride}th saved state:", *lines] if stride > 1 else lines
 
-    def kept(self) -> str:
+    def continuation(self) -> str:
         """Return a line on what was written, and the command that continues the run unless a step failed."""
         folder = self.recorded.folder
         states = f"the {len(self.recorded)} states computed before are in '{folder}'"
@@ -147,14 +147,14 @@ class Recording:
                 "a recorded run in transformed time needs a number of steps: give --step and --steps"
             )
         run = model.start(model.stepper(solver=solver), options=options)
-        if not run.goal:
-            tell("\n".join(whole_steps(model.span, model.step, model.step_count, model.t)))
-        return self._watched(
+        if not run.plan:
+            tell("\n".join(span_remark(model.span, model.step, model.step_count, model.t)))
+        return self._with_progress(
             record_run,
             run,
             Path(folder),
             first=0,
-            steps=None if run.goal else model.step_count,
+            steps=None if run.plan else model.step_count,
             save_every=model.save_every,
             model=text,
             certificate=self.certificate,
@@ -166,29 +166,31 @@ class Recording:
             raise click.UsageError("--span and --steps exclude each other")
         recorded = load_run(folder)
         manifest, further = recorded.manifest, {}
-        if manifest.goal and span is not None:
-            further["t_end"] = manifest.t + math.copysign(span, manifest.goal.t_end - manifest.t)
+        if manifest.plan and span is not None:
+            further["t_end"] = manifest.t + math.copysign(span, manifest.plan.t_end - manifest.t)
         elif span is not None and manifest.interface.energy_parameter:
             raise click.UsageError(
                 "a recorded run in transformed time needs a number of steps: give --steps, not --span"
             )
         elif span is not None:
             steps = max(1, round(span / abs(manifest.h)))
-            tell("\n".join(whole_steps(span, manifest.h, steps, manifest.t)))
-        goal = manifest.steps if steps is None else steps
-        return self._watched(resume_run, Path(folder), first=recorded.steps, steps=goal, **further)
+            tell("\n".join(span_remark(span, manifest.h, steps, manifest.t)))
+        plan = manifest.steps if steps is None else steps
+        return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
 
-    def _watched(self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any) -> RecordedOutcome:
+    def _with_progress(
+        self, act: Any, *arguments: Any, first: int, steps: int | None, **settings: Any
+    ) -> RecordedOutcome:
         """Record or resume with a progress bar; SIGINT and SIGTERM end the run at a checkpoint."""
-        pace = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
-        settings |= {name: value for name, value in pace.items() if value is not None}
+        checkpoint_interval = {"checkpoint_seconds": self.seconds, "checkpoint_steps": self.steps}
+        settings |= {name: value for name, value in checkpoint_interval.items() if value is not None}
         folder, failure, began = arguments[-1], None, time.perf_counter()
-        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as reach:
+        with interruptions() as caught, progress_bar(0 if steps is None else steps - first) as show_progress:
             try:
                 act(
                     *arguments,
                     steps=steps,
-                    progress=lambda done: reach(done - first),
+                    progress=lambda done: show_progress(done - first),
                     stop=lambda: bool(caught),
                     **settings,
                 )
@@ -205,18 +207,18 @@ class Recording:
         )
 
 
-def standing(recorded: RecordedRun) -> str:
+def describe_progress(recorded: RecordedRun) -> str:
     """Return two lines: the integrator of a run in a folder, and its progress."""
     manifest = recorded.manifest
     done, t = counted(recorded.steps, "step"), manifest.t + recorded.steps * manifest.h
-    if manifest.goal:
-        how = f"of {manifest.goal.tau:g} in tau" if manifest.goal.tau else "of adaptive size"
-        way = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
-        way += "" if recorded.finished else f" (of {manifest.goal.t_end:g})"
+    if manifest.plan:
+        how = f"of {manifest.plan.tau:g} in tau" if manifest.plan.tau else "of adaptive size"
+        progress_text = f"{done} {how} from t = {manifest.t:g} to t = {recorded.t[-1]:g}"
+        progress_text += "" if recorded.finished else f" (of {manifest.plan.t_end:g})"
     else:
         far = "all" if recorded.finished else f"of {manifest.steps}"
         if manifest.interface.energy_parameter:
             done, t = f"{done} in tau", float(recorded.t[-1])
-        way = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
-    kept = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"
-    return f"{' '.join(manifest.interface.title.split())}\n{way}; {kept}"
+        progress_text = f"{done} ({far}) of {manifest.h:g} from t = {manifest.t:g} to t = {t:g}"
+    continuation = f"{counted(len(recorded), 'state')} saved in '{recorded.folder}'"
+    return f"{' '.join(manifest.interface.title.split())}\n{progress_text}; {continuation}"

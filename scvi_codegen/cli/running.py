@@ -11,23 +11,23 @@ import numpy as np
 
 from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
-from scvi_codegen.cli.memory import check_memory, check_room
-from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
-from scvi_codegen.cli.wording import counted, duration, in_known_digits, whole_steps
+from scvi_codegen.cli.formatting import counted, duration, in_known_digits, span_remark
+from scvi_codegen.cli.memory import check_memory, check_run_memory
+from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model, allowed_error
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, unwarned
-from scvi_codegen.runtime.driven import with_end
-from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
+from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
 from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
 from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.longest_step import too_wrong
+from scvi_codegen.runtime.largest_step import accuracy_message
 from scvi_codegen.runtime.observation import Observation
-from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.run_loop import first_step_size
+from scvi_codegen.runtime.runs_with_inputs import with_final_state
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
 
 __all__ = [
     "RunOutcome",
@@ -39,7 +39,7 @@ __all__ = [
     "worst_step",
 ]
 
-PORTION_SECONDS = 0.2
+CHUNK_SECONDS = 0.2
 """Target duration of a chunk in seconds; bounds the delay of Ctrl-C."""
 SHOWN_COORDINATES = 6
 """Largest number of coordinates that the final state lists."""
@@ -73,12 +73,12 @@ class RunOutcome:
 
         In transformed time the last saved state lies inside the last step, before the state of the run.
         """
-        run, kept = self.run, self.trajectory
-        inside = run.stepper.interface.energy_parameter and (kept.t[-1] - run.t) * run.h > 0.0
-        return (float(kept.t[-1]), kept.q[-1], kept.p[-1]) if inside else (run.t, run.q, run.p)
+        run, saved = self.run, self.trajectory
+        inside = run.stepper.interface.energy_parameter and (saved.t[-1] - run.t) * run.h > 0.0
+        return (float(saved.t[-1]), saved.q[-1], saved.p[-1]) if inside else (run.t, run.q, run.p)
 
 
-@unwarned()
+@without_accuracy_warnings()
 def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> RunOutcome:
     """Integrate a model with a progress bar until its end, a failed step or a signal.
 
@@ -91,12 +91,12 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     began = time.perf_counter()
     run = model.start(model.stepper(solver=solver), options=options)
     if model.system.clock is not None and model.ends_at_time:
-        return _by_clock(model, run, time.perf_counter() - began)
+        return _in_transformed_time(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
-    with interruptions() as caught, progress_bar(_length(model)) as reach:
-        work, pieces = _Portions(model, run, caught, reach), []
-        for steps in model.stretches(run):
-            pieces.append(work.stretch(steps))
+    with interruptions() as caught, progress_bar(_length(model)) as show_progress:
+        work, pieces = _Chunks(model, run, caught, show_progress), []
+        for steps in model.input_segments(run):
+            pieces.append(work.segment(steps))
             if work.failure is not None or work.stopped:
                 break
     pieces = pieces or [run.record(0)]
@@ -112,7 +112,7 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     )
 
 
-class _Portions:
+class _Chunks:
     """Integration of a run in short chunks between which signals are handled; ends before a step that fails.
 
     Attributes:
@@ -121,12 +121,12 @@ class _Portions:
         stopped: True if a signal arrived first.
     """
 
-    def __init__(self, model: Model, run: Run, caught: Sequence[int], reach: Callable[[int], None]) -> None:
-        self.model, self.run, self.caught, self.reach = model, run, caught, reach
+    def __init__(self, model: Model, run: Run, caught: Sequence[int], show_progress: Callable[[int], None]) -> None:
+        self.model, self.run, self.caught, self.show_progress = model, run, caught, show_progress
         self.size, self.seconds, self.stopped = 1, 0.0, False
         self.failure: StepFailedError | None = None
 
-    def stretch(self, steps: int | None) -> Trajectory:
+    def segment(self, steps: int | None) -> Trajectory:
         """Advance ``steps`` steps, or up to the target time of the run (``None``), and return the states."""
         run, pieces = self.run, [self.run.record(0, save_every=self.model.save_every)]
         last = None if steps is None else run.steps + steps
@@ -134,11 +134,11 @@ class _Portions:
             self.stopped = bool(self.caught)
             if self.stopped:
                 break
-            pieces.append(self._portion(self.size if last is None else min(self.size, last - run.steps)))
+            pieces.append(self._chunk(self.size if last is None else min(self.size, last - run.steps)))
         joined = _joined(pieces)
-        return with_end(joined, run) if self.model.system.inputs else joined
+        return with_final_state(joined, run) if self.model.system.inputs else joined
 
-    def _portion(self, steps: int) -> Trajectory:
+    def _chunk(self, steps: int) -> Trajectory:
         model, run = self.model, self.run
         began = time.perf_counter()
         try:
@@ -147,21 +147,21 @@ class _Portions:
             self.failure, piece = error, Trajectory.before(error)
         elapsed = time.perf_counter() - began
         self.seconds += elapsed
-        self.reach(_reached(model, run))
-        check_room(model, run.steps)
-        self.size = max(1, int(self.size * min(2.0, PORTION_SECONDS / max(elapsed, 1e-6))))
+        self.show_progress(_reached(model, run))
+        check_run_memory(model, run.steps)
+        self.size = max(1, int(self.size * min(2.0, CHUNK_SECONDS / max(elapsed, 1e-6))))
         return piece
 
 
-def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
+def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
     """Integrate with steps of tau, dt = g dtau, to the end of the model's time span."""
     end, began, failure = model.t + model.covered, time.perf_counter(), None
     observed = Observation(run, save_every=model.save_every, end=end)
-    with interruptions() as caught, progress_bar(PARTS) as reach:
+    with interruptions() as caught, progress_bar(BAR_LENGTH) as show_progress:
 
         def look(_: int) -> None:
-            check_room(model, run.steps)
-            reach(min(PARTS, int(PARTS * (run.t - model.t) / model.covered)))
+            check_run_memory(model, run.steps)
+            show_progress(min(BAR_LENGTH, int(BAR_LENGTH * (run.t - model.t) / model.covered)))
 
         try:
             trajectory = observed.advance(None, look, lambda: bool(caught))
@@ -181,19 +181,19 @@ def _by_clock(model: Model, run: Run, preparation: float) -> RunOutcome:
 def _missed(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
     """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
     allowed = allowed_error(model)
-    if allowed is None or not model.paced:
+    if allowed is None or not model.has_time_transformation:
         return None
-    return too_wrong(trajectory.step_error, trajectory.worst_step_time, allowed)
+    return accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)
 
 
 def _length(model: Model) -> int:
-    """Return the length of the progress bar: the number of steps, or ``PARTS`` for the time span."""
-    return PARTS if _by_time(model) else model.step_count
+    """Return the length of the progress bar: the number of steps, or ``BAR_LENGTH`` for the time span."""
+    return BAR_LENGTH if _by_time(model) else model.step_count
 
 
 def _reached(model: Model, run: Run) -> int:
     """Return the progress in units of :func:`_length`."""
-    return int(PARTS * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
+    return int(BAR_LENGTH * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
 
 
 def _by_time(model: Model) -> bool:
@@ -208,9 +208,10 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
     lines = [
         model.system.name,
         f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
-        f"{counted(run.steps, 'step')} {of_length(model.h, run)} from t = {model.t:g} to t = {outcome.end[0]:g}; "
+        f"{counted(run.steps, 'step')} {describe_step_size(model.h, run)} "
+        f"from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} saved",
-        *([] if _by_time(model) else whole_steps(model.span, model.step, model.step_count, model.t)),
+        *([] if _by_time(model) else span_remark(model.span, model.step, model.step_count, model.t)),
     ]
     if run.steps:
         lines.append(f"{_speed(outcome, model.save_every)}; prepared in {outcome.preparation:.2f} s")
@@ -224,7 +225,7 @@ def _geometry(model: Model, run: Run) -> str:
     """Return whether the map is symplectic; adaptive steps destroy this property."""
     if not is_symplectic(model.method, model.system):
         return "not symplectic"
-    return "symplectic" if run.goal is None else "symplectic only at fixed step size"
+    return "symplectic" if run.plan is None else "symplectic only at fixed step size"
 
 
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
@@ -235,13 +236,13 @@ def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
 
 
-def of_length(h: float | None, run: Run) -> str:
+def describe_step_size(h: float | None, run: Run) -> str:
     """Return a description of the step sizes of a run."""
     if run.stepper.interface.energy_parameter:
         return f"of {run.h:g} in tau"
-    if run.goal and run.goal.tau:
-        return f"of {run.goal.tau:g} in tau by the reversible controller"
-    return f"of adaptive size ({run.rejected_steps} rejected)" if run.goal or h is None else f"of {h:g}"
+    if run.plan and run.plan.tau:
+        return f"of {run.plan.tau:g} in tau by the reversible controller"
+    return f"of adaptive size ({run.rejected_steps} rejected)" if run.plan or h is None else f"of {h:g}"
 
 
 def _speed(outcome: RunOutcome, save_every: int) -> str:
@@ -298,11 +299,11 @@ def final_state(names: Sequence[str], positions: Array, momenta: Array, known: K
 def _how_known(known: Known | None) -> str:
     if known is None:
         return "accuracy unknown: no second run to compare with"
-    said = "in the digits confirmed by a second run"
+    message = "in the digits confirmed by a second run"
     return (
-        f"{said}; chaotic: neighbouring trajectories diverge tenfold every {known.tenfold:.2g}"
+        f"{message}; chaotic: neighbouring trajectories diverge tenfold every {known.tenfold:.2g}"
         if known.chaotic
-        else said
+        else message
     )
 
 
@@ -312,7 +313,7 @@ def _joined(pieces: list[Trajectory]) -> Trajectory:
     last, t = pieces[-1], np.concatenate([first.t, *(piece.t[1:] for piece in rest)])
     return replace(
         last,
-        h=first_length(last.goal, t) if last.goal else last.h,
+        h=first_step_size(last.plan, t) if last.plan else last.h,
         t=t,
         q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
         p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),

@@ -11,11 +11,11 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, tell
-from scvi_codegen.cli.memory import check_states
-from scvi_codegen.cli.progress import PARTS, interruptions, progress_bar
+from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, tell
+from scvi_codegen.cli.formatting import counted, duration, span_remark
+from scvi_codegen.cli.memory import check_state_memory
+from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
-from scvi_codegen.cli.wording import counted, duration, whole_steps
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import allowed_error
@@ -26,16 +26,16 @@ from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory, check_npz
 
-__all__ = ["refuse", "run_sums", "solved_by"]
+__all__ = ["reject_options", "run_indexed", "with_solver"]
 
-MOST_SHOWN = 4
+MAX_LISTED = 4
 """Largest number of entries of an array that the final state lists."""
-INSTEAD = {"advise": "give --tolerance"}
+ALTERNATIVES = {"advise": "give --tolerance"}
 """Alternatives to options that indexed systems do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SumsOutcome:
+class IndexedOutcome:
     """Result of a run: saved states, state of the run, seconds of preparation and of steps, and why it ended."""
 
     trajectory: IndexedTrajectory
@@ -47,7 +47,7 @@ class SumsOutcome:
     interrupted: bool
 
 
-def refuse(what: dict[str, object]) -> None:
+def reject_options(what: dict[str, object]) -> None:
     """Reject options, by name, that indexed systems do not have.
 
     Raises:
@@ -55,16 +55,16 @@ def refuse(what: dict[str, object]) -> None:
     """
     for name, value in what.items():
         if value not in (None, False):
-            instead = INSTEAD.get(name, "omit it, or unroll the sums (unroll_sums)")
+            instead = ALTERNATIVES.get(name, "omit it, or unroll the sums (unroll_sums)")
             raise click.UsageError(f"--{name.replace('_', '-')} is not available for indexed models: {instead}")
 
 
-def solved_by(solver: str, model: IndexedModel) -> IndexedModel:
+def with_solver(solver: str, model: IndexedModel) -> IndexedModel:
     """Return the model with the solver of the command line; with ``"auto"`` the model's own solver stays."""
     return model if solver == "auto" else replace(model, solver=solver)
 
 
-def run_sums(
+def run_indexed(
     model: IndexedModel,
     output: str | None,
     plot: str | None,
@@ -94,25 +94,25 @@ def run_sums(
         tell(f"wrote {path}")
 
 
-def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int | None) -> SumsOutcome:
+def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int | None) -> IndexedOutcome:
     began, controlled = time.perf_counter(), model.h is None
     steps = math.inf if controlled else model.step_count
     if not controlled:
-        check_states(sum(np.size(values) for values in model.q.values()), model.step_count, model.save_every)
+        check_state_memory(sum(np.size(values) for values in model.q.values()), model.step_count, model.save_every)
     stepper = model.stepper()
     run, failure = model.start(stepper, options=options, threads=threads), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
     record = IndexedRecord(run)
-    with interruptions() as caught, progress_bar(PARTS if controlled else model.step_count) as reach:
+    with interruptions() as caught, progress_bar(BAR_LENGTH if controlled else model.step_count) as show_progress:
 
-        def told(done: int) -> None:
-            reach(int(PARTS * (run.t - model.t) / model.covered) if controlled else done)
+        def report_progress(done: int) -> None:
+            show_progress(int(BAR_LENGTH * (run.t - model.t) / model.covered) if controlled else done)
 
         try:
-            record.follow(steps, model.save_every, progress=told, stop=lambda: bool(caught))
+            record.follow(steps, model.save_every, progress=report_progress, stop=lambda: bool(caught))
         except StepFailedError as error:
             failure = error
-    return SumsOutcome(
+    return IndexedOutcome(
         trajectory=record.trajectory(),
         run=run,
         stepper=stepper,
@@ -123,7 +123,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
     )
 
 
-def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
+def _summary(model: IndexedModel, outcome: IndexedOutcome) -> Iterator[str]:
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     sizes = ", ".join(f"{name} = {size}" for name, size in run.sizes.items())
     count = sum(values.size for values in run.q.values())
@@ -132,10 +132,10 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
     geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
     yield f"{method.title}; {order}, {geometry}"
     kept = counted(len(trajectory.t), "state")
-    lengths = "of adaptive size" if run.goal else f"of {run.h:g}"
+    lengths = "of adaptive size" if run.plan else f"of {run.h:g}"
     yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} saved"
     if model.h is not None:
-        yield from whole_steps(model.span, model.step, model.step_count, model.t)
+        yield from span_remark(model.span, model.step, model.step_count, model.t)
     if run.steps:
         each = outcome.seconds / run.steps
         yield (
@@ -148,11 +148,11 @@ def _summary(model: IndexedModel, outcome: SumsOutcome) -> Iterator[str]:
         yield from worst_step(trajectory)
     yield "final state"
     for name, values in run.q.items():
-        shown = ", ".join(f"{x:.9g}" for x in values.reshape(-1)[:MOST_SHOWN])
-        yield f"  {name} = {shown}{', ..' if values.size > MOST_SHOWN else ''}"
+        shown = ", ".join(f"{x:.9g}" for x in values.reshape(-1)[:MAX_LISTED])
+        yield f"  {name} = {shown}{', ..' if values.size > MAX_LISTED else ''}"
 
 
-def _energy(model: IndexedModel, outcome: SumsOutcome) -> str:
+def _energy(model: IndexedModel, outcome: IndexedOutcome) -> str:
     if why := model.system.changes_energy:
         energy = _energies(outcome)[:, 2]
         change = float(np.abs(energy - energy[0]).max())
@@ -160,23 +160,23 @@ def _energy(model: IndexedModel, outcome: SumsOutcome) -> str:
     return f"relative energy error: {_energy_error(outcome):.2e} at most"
 
 
-def _energies(outcome: SumsOutcome) -> Numbers:
+def _energies(outcome: IndexedOutcome) -> Numbers:
     """Return the energies of all saved states and of the final state, which may not be saved."""
     return np.vstack([outcome.trajectory.energies, outcome.run.energies])
 
 
-def _energy_error(outcome: SumsOutcome) -> float:
+def _energy_error(outcome: IndexedOutcome) -> float:
     return replace(outcome.trajectory, energies=_energies(outcome)).energy_error()
 
 
-def _map_changes(outcome: SumsOutcome) -> Iterator[tuple[str, float]]:
+def _map_changes(outcome: IndexedOutcome) -> Iterator[tuple[str, float]]:
     """Return the largest change of each momentum map."""
     maps = np.vstack([outcome.trajectory.momentum_maps(), outcome.run.momentum_maps])
     changes = np.abs(maps - maps[0]).max(axis=0)
     return zip(outcome.stepper.momentum_map_names, changes.tolist(), strict=True)
 
 
-def _numbers(model: IndexedModel, outcome: SumsOutcome) -> dict[str, Any]:
+def _numbers(model: IndexedModel, outcome: IndexedOutcome) -> dict[str, Any]:
     """Return the document of ``--json``."""
     run, trajectory = outcome.run, outcome.trajectory
     failure = "interrupted" if outcome.interrupted else None

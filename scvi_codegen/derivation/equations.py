@@ -23,19 +23,19 @@ from scvi_codegen.derivation.entries import entries
 from scvi_codegen.derivation.matrix_form import MatrixForm, matrix_form
 from scvi_codegen.derivation.notation import LARGEST_SHOWN, Equation, TableEntry, html, latex, text_lines
 from scvi_codegen.display.cards import card, listed, plain
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.given.kinds import SWITCH, takes
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import Block, PointFamily, Row, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Row, StageGroup, StageSystem, Table
+from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.tables.precision import Number
+from scvi_codegen.validation.argument_types import SWITCH, checks_arguments
 
 __all__ = ["StepEquations", "derive"]
 
@@ -138,7 +138,8 @@ class StepEquations:
             variables = "positions and momenta" if self.system.auxiliaries else "the coordinates"
             yield f"\nconserved (momentum maps of symmetries affine in {variables}, which are what is searched)"
         for symmetry in self.symmetries:
-            yield f"  {symmetry}{'' if self.method.exactness.keeps(symmetry) else '  (not guaranteed by this method)'}"
+            guaranteed = self.method.exactness.conserves(symmetry)
+            yield f"  {symmetry}{'' if guaranteed else '  (not guaranteed by this method)'}"
 
     def __repr__(self) -> str:
         count = len(self.equations)
@@ -160,7 +161,7 @@ class StepEquations:
         return card(f"{self.system.name}: {self.method.title}", facts, *shown, *more)
 
 
-@takes(system=SYSTEM, radicals=SWITCH)
+@checks_arguments(system=SYSTEM, radicals=SWITCH)
 def derive(system: MechanicalSystem, method: Method | str, *, radicals: bool = False) -> StepEquations:
     """Return the closed form of one step in the notation of the paper.
 
@@ -198,7 +199,7 @@ class _Writer:
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages = system, stages
         names = [q.name for q in system.coordinates]
-        self.taken = {
+        self.reserved = {
             symbol.name for symbol in (*system.coordinates, *system.velocities, *system.auxiliaries, *system.parameters)
         }
         self.step = self._symbol("h")
@@ -215,7 +216,7 @@ class _Writer:
 
     def _symbol(self, name: str) -> sympy.Symbol:
         """Return a symbol of the derivation, with underscores before its name if the system has one of that name."""
-        while name in self.taken:
+        while name in self.reserved:
             name = f"_{name}"
         return sympy.Symbol(name, real=True)
 
@@ -245,9 +246,9 @@ class _Writer:
         for block, symbols in zip(self.stages.blocks, self.unknowns, strict=True):
             rest, moving = (_rational(x) for x in block.straight)
             for i, symbol in enumerate(symbols):
-                still = block.size is not None
-                moved = 0 if still else moving * self.step ** (1 - block.power) * self.v[i]
-                guess[symbol] = sympy.S.Zero if still else rest * self.q[i] + moved + block.momentum * self.p[i]
+                is_multiplier = block.size is not None
+                moved = 0 if is_multiplier else moving * self.step ** (1 - block.power) * self.v[i]
+                guess[symbol] = sympy.S.Zero if is_multiplier else rest * self.q[i] + moved + block.momentum * self.p[i]
         return guess
 
     def _rows(self) -> list[list[list[sympy.Expr]]]:
@@ -270,7 +271,7 @@ class _Writer:
             return self._named(name, row.momentum)
         return _rational(row.momentum)
 
-    def _scatter(self, family: PointFamily, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
+    def _scatter(self, family: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
         arguments = self._arguments(family, n)
         weight = self._named(family.weight_names[n], family.weights[n]) * self._growth(family, n)
         for scatter in family.scatters:
@@ -283,18 +284,18 @@ class _Writer:
                 for i, value in enumerate(values):
                     rows[r][i].append(factor * value)
 
-    def _growth(self, family: PointFamily, n: int) -> sympy.Expr:
+    def _growth(self, family: StageGroup, n: int) -> sympy.Expr:
         """Return the factor of a weight due to damping."""
         if self.stages.damping == 0:
             return sympy.S.One
         return sympy.exp(self.stages.damping * self._abscissa(family, n) * self.step)
 
-    def _abscissa(self, family: PointFamily, n: int) -> sympy.Expr:
+    def _abscissa(self, family: StageGroup, n: int) -> sympy.Expr:
         """Return the abscissa of point n on the step, by its name."""
         prefix, abscissa = "d" if family.name == "quadrature" else "c", family.abscissae[n]
         return self._named("" if abscissa in (0, 1) else f"{prefix}_{n + 1}", abscissa)
 
-    def _arguments(self, family: PointFamily, n: int) -> dict[sympy.Symbol, sympy.Expr]:
+    def _arguments(self, family: StageGroup, n: int) -> dict[sympy.Symbol, sympy.Expr]:
         replaced = {}
         if any(self.system.time in result.free_symbols for result in family.results):
             replaced[self.system.time] = self.time + self._abscissa(family, n) * self.step

@@ -8,11 +8,11 @@ from sympy import Expr, latex
 
 from scvi_codegen.formulas.indexed_latex import latex_entry, latex_sums
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.ir.indexed import HeldSteps, IndexedProgram
+from scvi_codegen.ir.indexed import ConstrainedSteps, IndexedProgram
+from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
-from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 from scvi_codegen.lowering.indexed import lower_indexed
-from scvi_codegen.mechanics.indexed.constraints import constraint_text, pushes_of
+from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms, constraint_text
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
@@ -51,7 +51,7 @@ def _text(system: IndexedSystem) -> Iterator[str]:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:
         yield f"  {constraint_text(term)}"
-        pushed = pushes_of(term, system.coordinates, system.time)
+        pushed = constraint_force_terms(term, system.coordinates, system.time)
         yield from (f"    on {access}: lambda*({slope})" for access, slope in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
@@ -78,13 +78,13 @@ def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
         yield from _held(program.held)
     elif program.splitting:
         yield from _splitting(program.splitting)
-    elif isinstance(program.sweep, SeparableSweep):
+    elif isinstance(program.sweep, SeparableIteration):
         yield from _separable(program.sweep)
     elif program.sweep:
         yield from _hamiltonian(program.sweep)
 
 
-def _held(of: HeldSteps) -> Iterator[str]:
+def _held(of: ConstrainedSteps) -> Iterator[str]:
     yield "(m its mass, F the force on it, G the slopes of the constraints g, q, p going on from part to part):"
     for part in of.parts:
         yield f"  p = p + {_number(part)}*h/2 (F + G^T lambda),  q = q + {_number(part)}*h p/m  with  g(q) = 0"
@@ -100,7 +100,7 @@ def _splitting(of: Splitting) -> Iterator[str]:
             yield f"  q += h*({_number(drift)})*p/m"
 
 
-def _separable(of: SeparableSweep) -> Iterator[str]:
+def _separable(of: SeparableIteration) -> Iterator[str]:
     yield "(m its mass, F_n the force on it at the points X_n of all):"
     for n in range(of.points):
         terms = _combination(of.product[n], "F", of.points)
@@ -109,7 +109,7 @@ def _separable(of: SeparableSweep) -> Iterator[str]:
     yield f"  p' = p + h*({_combination(of.end_momentum, 'F', of.points)})"
 
 
-def _hamiltonian(of: HamiltonianSweep) -> Iterator[str]:
+def _hamiltonian(of: HamiltonianIteration) -> Iterator[str]:
     yield "(V_n = H_p and F_n = -H_q at the points Q_n, P_n of all):"
     rows = (("Q", "q", of.position, of.position_weights, "V"), ("P", "p", of.momentum, of.momentum_weights, "F"))
     for n in range(of.points):

@@ -137,14 +137,14 @@ class Curve:
     def _uniformly_accelerated(self) -> Curve:
         rest = np.array([mp.zero] * len(self.position), dtype=object)
         at = (self.position, self.velocity, self.t, rest)
-        acceleration = -solver(self.motion.residual_slopes(*at)[2])(self.motion.residual(*at))
+        acceleration = -solver(self.motion.residual_jacobian(*at)[2])(self.motion.residual(*at))
         return replace(self, z=np.array([acceleration * self.h] * len(self.grid.abscissae), dtype=object))
 
     def _solved(self, digits: int) -> Curve:
         """Return the solution with the same initial position and velocity."""
 
         def linearised(z: Array) -> Solve:
-            return solver(replace(self, z=z)._slopes()[0])
+            return solver(replace(self, z=z)._residual_jacobians()[0])
 
         return replace(self, z=newton(lambda z: replace(self, z=z)._residual(), linearised, self.z, digits))
 
@@ -174,9 +174,9 @@ class Curve:
     def _residual(self) -> Array:
         return np.array([self.motion.residual(*point) for point in self._points()], dtype=object)
 
-    def _slopes(self) -> tuple[Floats, Floats]:
+    def _residual_jacobians(self) -> tuple[Floats, Floats]:
         """Return the derivatives of all residuals with respect to z (square) and to v0."""
-        by_q, by_v, by_a = np.array([self.motion.residual_slopes(*point) for point in self._points()]).swapaxes(0, 1)
+        by_q, by_v, by_a = np.array([self.motion.residual_jacobian(*point) for point in self._points()]).swapaxes(0, 1)
         h, A, c = float(self.h), self.grid.matrix, self.grid.abscissae.astype(float)
         blocks = np.einsum("ij,iab->iajb", A, by_v) + h * np.einsum("ij,iab->iajb", A @ A, by_q)
         size = np.arange(len(c))
@@ -186,7 +186,7 @@ class Curve:
 
     def _bordered(self) -> Solve:
         """Return a solver for (v0, z) that eliminates z; its Schur complement is dq1/dv0, the Jacobi field."""
-        by_z, by_v0 = self._slopes()
+        by_z, by_v0 = self._residual_jacobians()
         m = len(self.position)
         inverted = inverse(by_z)
         response, border = inverted @ by_v0, np.kron(self.grid.row @ self.grid.matrix, np.eye(m))

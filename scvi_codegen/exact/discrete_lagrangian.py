@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
 from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import MAPPING, NUMBERS, Kind, of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import Number, Vector, mp
+from scvi_codegen.validation.argument_types import MAPPING, NUMBERS, ArgumentType, checks_arguments, of
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["ExactStep", "exact_discrete_lagrangian", "exact_map"]
 
@@ -31,12 +31,12 @@ MOST_DIGITS = 50
 POINTS = (10, 15, 22, 32)
 """Gauss points per piece; all are tried on the fewest pieces for which a solution is found, then only the last."""
 PIECES = (1, 2, 4, 8, 16)
-MOST_STRAIGHT = 2
+MAX_STRAIGHT_PIECES = 2
 """Maximum number of pieces for which the straight line is the initial guess; more have not helped."""
 
 Values = Mapping[str, Any] | Sequence[Any] | None
 LAGRANGIAN = of("a LagrangianSystem", LagrangianSystem)
-VALUES = Kind("values by name or a list of all", lambda value: MAPPING.holds(value) or NUMBERS.holds(value))
+VALUES = ArgumentType("values by name or a list of all", lambda value: MAPPING.accepts(value) or NUMBERS.accepts(value))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ class ExactStep:
     __repr__ = summary("action", "error")
 
 
-@takes(system=LAGRANGIAN, parameters=VALUES)
+@checks_arguments(system=LAGRANGIAN, parameters=VALUES)
 def exact_discrete_lagrangian(
     system: LagrangianSystem,
     q0: Sequence[Any],
@@ -106,7 +106,7 @@ def exact_discrete_lagrangian(
     def solve(grid: Grid) -> Curve:
         nonlocal velocity
         motion, times = problem.motion, (problem.t, problem.h)
-        if velocity is None and grid.pieces > MOST_STRAIGHT:
+        if velocity is None and grid.pieces > MAX_STRAIGHT_PIECES:
             raise NotConvergedError("Newton's iteration from the straight line does not converge")
         if velocity is None:
             first = Curve.straight(motion, grid, *times, start, end)
@@ -120,7 +120,7 @@ def exact_discrete_lagrangian(
     return problem.answer(solve, f"no trajectory from q0 = {_shown(start)} to q1 = {_shown(end)} was found: {hint}")
 
 
-@takes(system=LAGRANGIAN, parameters=VALUES)
+@checks_arguments(system=LAGRANGIAN, parameters=VALUES)
 def exact_map(
     system: LagrangianSystem,
     q0: Sequence[Any],

@@ -26,9 +26,9 @@ from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["ExactMotion", "Numbers", "exact_motion", "numbers"]
 
-MOST_PROJECTIONS = 6
+MAX_PROJECTIONS = 6
 """Number of Newton projections onto constraints; each doubles the correct digits of a state given in doubles."""
-MOST_COLUMNS, MOST_HALVINGS = 24, 12
+MAX_COLUMNS, MAX_HALVINGS = 24, 12
 DIGITS = 45
 ACCURACY = mp.mpf(10) ** -DIGITS
 
@@ -64,19 +64,19 @@ class ExactMotion:
         return Tape([self.system.formula], self.symbols)
 
     @cached_property
-    def _slopes(self) -> list[sympy.Expr]:
+    def _momentum_expressions(self) -> list[sympy.Expr]:
         """Derivatives dL/dv, or dH/dp."""
         return [self.system.formula.diff(x) for x in self.second]
 
     @cached_property
     def _by_second(self) -> Tape:
-        return Tape(self._slopes, self.symbols)
+        return Tape(self._momentum_expressions, self.symbols)
 
     @cached_property
     def _curvature(self) -> list[list[sympy.Expr]]:
         """Derivatives of dL/dv with respect to v, q and t, one row each."""
         variables = (*self.second, *self.system.coordinates, self.system.time)
-        return [[slope.diff(x) for x in variables] for slope in self._slopes]
+        return [[derivative.diff(x) for x in variables] for derivative in self._momentum_expressions]
 
     @cached_property
     def _mass(self) -> Tape:
@@ -87,21 +87,25 @@ class ExactMotion:
     @cached_property
     def _by_position(self) -> list[sympy.Expr]:
         """Derivatives dL/dq + f - gamma p, or dH/dq - f + gamma p."""
-        slopes = [self.system.formula.diff(q) for q in self.system.coordinates]
+        derivatives = [self.system.formula.diff(q) for q in self.system.coordinates]
         sign = -1 if self.hamiltonian else 1
         if self.system.damping != 0:
-            momenta = self.system.auxiliaries or self._slopes
-            slopes = [x - sign * self.system.damping * p for x, p in zip(slopes, momenta, strict=True)]
-        return [x + sign * f for x, f in zip(slopes, self.system.forces, strict=True)] if self.system.forces else slopes
+            momenta = self.system.auxiliaries or self._momentum_expressions
+            derivatives = [x - sign * self.system.damping * p for x, p in zip(derivatives, momenta, strict=True)]
+        return (
+            [x + sign * f for x, f in zip(derivatives, self.system.forces, strict=True)]
+            if self.system.forces
+            else derivatives
+        )
 
     @cached_property
     def _right_hand_side(self) -> Tape:
         """Right-hand side: dL/dq + f and the derivatives of dL/dv; or dH/dq - f and dH/dp."""
-        others = self._slopes if self.hamiltonian else [entry for row in self._curvature for entry in row]
+        others = self._momentum_expressions if self.hamiltonian else [entry for row in self._curvature for entry in row]
         return Tape([*self._by_position, *others], self.symbols)
 
     @cached_property
-    def _holding(self) -> Tape:
+    def _constraint_tape(self) -> Tape:
         """Constraint Jacobian G, row by row; d/dt of the rates at constant v; the constraints; their rates.
 
         A nonholonomic constraint contributes its derivatives with respect to v, 0 for the constraint, and itself as
@@ -116,8 +120,8 @@ class ExactMotion:
         rolling = [any(g.has(x) for x in v) for g in given]
         bound = [sympy.S.Zero if own else g for g, own in zip(given, rolling, strict=True)]
         rates = [g if own else rate(g) for g, own in zip(given, rolling, strict=True)]
-        slopes = [moving.diff(x) for moving in rates for x in v]
-        return Tape([*slopes, *map(rate, rates), *bound, *rates], self.symbols)
+        derivatives = [moving.diff(x) for moving in rates for x in v]
+        return Tape([*derivatives, *map(rate, rates), *bound, *rates], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
@@ -164,23 +168,23 @@ class ExactMotion:
             return np.concatenate([found[m:], -found[:m]])
         mass, applied = self._mass_and_applied(q, second, t)
         if self.system.constraints:
-            return np.concatenate([second, self._held(mass, applied, q, second, t)[:m]])
+            return np.concatenate([second, self._constrained_accelerations(mass, applied, q, second, t)[:m]])
         return np.concatenate([second, _solved(mass, applied)])
 
     def _mass_and_applied(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return L_vv and the applied force (L_vv times unconstrained accelerations) at (q, v) of a Lagrangian."""
         m, found = len(q), self._values(self._right_hand_side, q, v, t)
-        slopes = found[m:].reshape(m, 2 * m + 1)
-        return slopes[:, :m], found[:m] - slopes[:, m : 2 * m] @ v - slopes[:, 2 * m]
+        derivatives = found[m:].reshape(m, 2 * m + 1)
+        return derivatives[:, :m], found[:m] - derivatives[:, m : 2 * m] @ v - derivatives[:, 2 * m]
 
-    def _held(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
+    def _constrained_accelerations(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """Return (m + c,) accelerations, and multipliers with which constraints have zero second derivatives."""
-        slopes, (growth, _, _) = self._bound(q, v, t)
-        return _solved(_saddle(mass, slopes), np.concatenate([applied, -growth]))
+        derivatives, (growth, _, _) = self._constraint_terms(q, v, t)
+        return _solved(_saddle(mass, derivatives), np.concatenate([applied, -growth]))
 
-    def _bound(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
+    def _constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
-        m, count, found = len(q), len(self.system.constraints), self._values(self._holding, q, v, t)
+        m, count, found = len(q), len(self.system.constraints), self._values(self._constraint_tape, q, v, t)
         return found[: count * m].reshape(count, m), found[count * m :].reshape(3, count)
 
     def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
@@ -190,17 +194,17 @@ class ExactMotion:
             return q, p
         m, still = len(q), numbers(np.zeros(len(q)))
         v = self.velocity(q, p, t)
-        for _ in range(MOST_PROJECTIONS):
-            mass, (slopes, (_, g, _)) = self._mass_and_applied(q, v, t)[0], self._bound(q, v, t)
-            q = q + _solved(_saddle(mass, slopes), np.concatenate([still, -g]))[:m]
-        mass, (slopes, (_, _, rate)) = self._mass_and_applied(q, v, t)[0], self._bound(q, v, t)
-        v = v + _solved(_saddle(mass, slopes), np.concatenate([still, -rate]))[:m]
+        for _ in range(MAX_PROJECTIONS):
+            mass, (derivatives, (_, g, _)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
+            q = q + _solved(_saddle(mass, derivatives), np.concatenate([still, -g]))[:m]
+        mass, (derivatives, (_, _, rate)) = self._mass_and_applied(q, v, t)[0], self._constraint_terms(q, v, t)
+        v = v + _solved(_saddle(mass, derivatives), np.concatenate([still, -rate]))[:m]
         return q, self.momentum(q, v, t)
 
     def multipliers(self, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """Return the (c,) constraint multipliers at a state."""
         mass, applied = self._mass_and_applied(q, v, t)
-        return self._held(mass, applied, q, v, t)[len(q) :]
+        return self._constrained_accelerations(mass, applied, q, v, t)[len(q) :]
 
     def rates(self, q: Numbers, p: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return (m,) velocities and forces: the rates of q and p by Hamilton's equations."""
@@ -216,19 +220,19 @@ class ExactMotion:
     def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
         """Return the (m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
         m, found = len(q), self._values(self._right_hand_side, q, v, t)
-        slopes = found[m:].reshape(m, 2 * m + 1)
-        residual: Numbers = slopes[:, :m] @ a + slopes[:, m : 2 * m] @ v + slopes[:, 2 * m] - found[:m]
+        derivatives = found[m:].reshape(m, 2 * m + 1)
+        residual: Numbers = derivatives[:, :m] @ a + derivatives[:, m : 2 * m] @ v + derivatives[:, 2 * m] - found[:m]
         return residual
 
-    def residual_slopes(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
+    def residual_jacobian(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
         """Return the (3, m, m) derivatives of the residual by position, velocity and acceleration, in doubles."""
-        places, tape = self._slopes_of_residual
+        places, tape = self._residual_jacobian_tape
         matrices = np.zeros((len(q), 3 * len(q)))
         matrices[places] = [float(value) for value in tape([*q, *v, *a, t, *self.parameters])]
         return np.stack(np.split(matrices, 3, axis=1))
 
     @cached_property
-    def _slopes_of_residual(self) -> tuple[tuple[list[int], list[int]], Tape]:
+    def _residual_jacobian_tape(self) -> tuple[tuple[list[int], list[int]], Tape]:
         """Rows and columns of the non-zero derivatives of the residual, and their values."""
         q, v, t = self.system.coordinates, self.second, self.system.time
         a = tuple(sympy.Dummy(real=True) for _ in q)
@@ -249,23 +253,23 @@ class ExactMotion:
         """
         q, p, h, t = numbers(q), numbers(p), mp.mpf(h), mp.mpf(t)
         start = np.concatenate([q, p if self.hamiltonian else self.velocity(q, p, t)])
-        end = self._followed(start, h, t, MOST_HALVINGS)
+        end = self._integrated_flow(start, h, t, MAX_HALVINGS)
         position, second = np.split(end, 2)
         return position, second if self.hamiltonian else self.momentum(position, second, t + h)
 
-    def _followed(self, start: Numbers, h: Number, t: Number, halvings: int) -> Numbers:
+    def _integrated_flow(self, start: Numbers, h: Number, t: Number, halvings: int) -> Numbers:
         found = self._extrapolated(start, h, t)
         if found is not None:
             return found
         if not halvings:
             raise StateError("the exact trajectory cannot be computed over one step: it may contain a singularity")
-        middle = self._followed(start, h / 2, t, halvings - 1)
-        return self._followed(middle, h / 2, t + h / 2, halvings - 1)
+        middle = self._integrated_flow(start, h / 2, t, halvings - 1)
+        return self._integrated_flow(middle, h / 2, t + h / 2, halvings - 1)
 
     def _extrapolated(self, start: Numbers, h: Number, t: Number) -> Numbers | None:
         """Return the Aitken-Neville extrapolation in (h / n)^2 for n = 2, 4, 6, ..; ``None`` without convergence."""
         row: list[Numbers] = []
-        for k in range(1, MOST_COLUMNS + 1):
+        for k in range(1, MAX_COLUMNS + 1):
             new = [self._midpoints(start, h, t, 2 * k)]
             for j, old in enumerate(row, 1):
                 new.append(new[-1] + (new[-1] - old) / (mp.mpf(k) ** 2 / (k - j) ** 2 - 1))
@@ -283,11 +287,11 @@ class ExactMotion:
         return now
 
 
-def _saddle(mass: Numbers, slopes: Numbers) -> Numbers:
+def _saddle(mass: Numbers, derivatives: Numbers) -> Numbers:
     """Return the saddle-point matrix [mass, -slopes^T; slopes, 0]."""
-    count, m = slopes.shape
+    count, m = derivatives.shape
     matrix = numbers(np.zeros((m + count, m + count)))
-    matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -slopes.T, slopes
+    matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -derivatives.T, derivatives
     return matrix
 
 

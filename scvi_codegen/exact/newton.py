@@ -21,10 +21,10 @@ Array: TypeAlias = NDArray[Any]
 Floats: TypeAlias = NDArray[np.float64]
 Solve: TypeAlias = Callable[[Array], Array]
 
-MOST_ITERATIONS = 60
+MAX_NEWTON_ITERATIONS = 60
 STALE = 1e-3
 """Convergence factor of the updates above which the Jacobian is recomputed."""
-LEAST_FRACTION = 1e-4
+MIN_FRACTION = 1e-4
 
 
 class NotConvergedError(ArithmeticError):
@@ -51,7 +51,7 @@ def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digi
     """
     scale, value, solve = largest(x), residual(x), linearised(x)
     update = solve(value)
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_NEWTON_ITERATIONS):
         size = largest(update)
         scale = max(scale, largest(x), size)
         if size <= scale * mp.mpf(10) ** -(digits + 2):
@@ -60,13 +60,13 @@ def newton(residual: Solve, linearised: Callable[[Array], Solve], x: Array, digi
         if largest(update) > stale * size:
             solve = linearised(x)
             update = solve(value)
-    raise NotConvergedError(f"no convergence in {MOST_ITERATIONS} iterations")
+    raise NotConvergedError(f"no convergence in {MAX_NEWTON_ITERATIONS} iterations")
 
 
 def damped(residual: Solve, solve: Solve, x: Array, update: Array) -> tuple[Array, Array, Array]:
     """Return the first of the damped steps 1, 1/2, 1/4 ... that shortens the next update with the same Jacobian."""
     fraction, size = 1.0, largest(update)
-    while fraction > LEAST_FRACTION:
+    while fraction > MIN_FRACTION:
         moved = x - update * mp.mpf(fraction)
         try:
             value = residual(moved)

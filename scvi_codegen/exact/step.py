@@ -26,7 +26,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shapes import Velocities
-from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["DerivedStep", "SolvedStep", "compiled_equations", "derived_step"]
@@ -146,7 +146,7 @@ class DerivedStep:
         rates = [self.rate(self._point(family, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]
         return known.h * mp.fdot(shape.weights, rates)
 
-    def action_slopes(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
+    def action_gradient(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
         """Return the (m,) and (unknowns,) central differences of the generating function by q0 and the unknowns.
 
         ``None`` if a group of points has no scalar.
@@ -159,7 +159,7 @@ class DerivedStep:
         def action(values: Numbers) -> Number:
             return self._action(values[m:], _Known(values[:m], known.p, known.h, known.t))
 
-        slopes = np.empty_like(joined)
+        derivatives = np.empty_like(joined)
         for place in range(len(joined)):
             width = mp.mpf(10) ** -18 * max(1, abs(joined[place]))
             ends = []
@@ -167,8 +167,8 @@ class DerivedStep:
                 moved = joined.copy()
                 moved[place] += sign * width
                 ends.append(action(moved))
-            slopes[place] = (ends[0] - ends[1]) / (2 * width)
-        return slopes[:m], slopes[m:]
+            derivatives[place] = (ends[0] - ends[1]) / (2 * width)
+        return derivatives[:m], derivatives[m:]
 
     def _action(self, z: Numbers, known: _Known) -> Number:
         total = mp.zero
@@ -180,7 +180,7 @@ class DerivedStep:
                 scalar = self.scalars[f]
                 assert scalar is not None  # checked above
                 (value,) = scalar(self._point(family, n, arguments[n], known))
-                grown = self._growth(family.abscissae[n], known)
+                grown = self._damping_factor(family.abscissae[n], known)
                 total += scale * weight * grown * known.h ** (1 + family.scalar_power) * value
         return total
 
@@ -213,19 +213,19 @@ class DerivedStep:
             total = total + z[self.blocks[b]] * (line[b + 1] * known.h ** self.stages.blocks[b].power)
         return total
 
-    def _point(self, family: PointFamily, n: int, arguments: Numbers, known: _Known) -> list[Number]:
+    def _point(self, family: StageGroup, n: int, arguments: Numbers, known: _Known) -> list[Number]:
         return [*arguments, known.t + family.abscissae[n] * known.h, *self.motion.parameters]
 
     def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
         return np.array(self.kernels[f](self._point(self.stages.families[f], n, arguments, known)), dtype=object)
 
-    def _factor(self, family: PointFamily, s: int, n: int, r: Any, known: _Known) -> Number:
+    def _factor(self, family: StageGroup, s: int, n: int, r: Any, known: _Known) -> Number:
         scatter = family.scatters[s]
         scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
-        grown = self._growth(family.abscissae[n], known)
+        grown = self._damping_factor(family.abscissae[n], known)
         return scale * family.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
 
-    def _growth(self, c: Number, known: _Known) -> Number:
+    def _damping_factor(self, c: Number, known: _Known) -> Number:
         """Return the factor e^(gamma c h) of a weight at the point c of the step, where gamma is the damping rate."""
         (rate,) = self.damping(self.motion.parameters)
         return mp.exp(rate * c * known.h)
@@ -254,10 +254,10 @@ class DerivedStep:
         for f, family in enumerate(self.stages.families):
             arguments = self._arguments(f, z, known)
             for n in range(len(family.abscissae)):
-                slopes = self._kernel_slopes(f, n, arguments[n], known)
+                derivatives = self._kernel_jacobian(f, n, arguments[n], known)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(family.gathers):
-                        own = slopes[self.results[f][s], self.arguments[f][g]]
+                        own = derivatives[self.results[f][s], self.arguments[f][g]]
                         moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
                         for r in np.flatnonzero(rows[n, :-1]):
                             factor = self._factor(family, s, n, r, known) * rows[n, r] * moved
@@ -266,14 +266,14 @@ class DerivedStep:
                                 matrix[self.rows[r], self.blocks[b]] += own * entry
         return matrix
 
-    def _kernel_slopes(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
+    def _kernel_jacobian(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
         values = self._kernel(f, n, arguments, known)
-        slopes = numbers(np.zeros((len(values), len(arguments))))
+        derivatives = numbers(np.zeros((len(values), len(arguments))))
         for i in range(len(arguments)):
             moved, width = arguments.copy(), WIDTH * max(1, abs(arguments[i]))
             moved[i] += width
-            slopes[:, i] = (self._kernel(f, n, moved, known) - values) / width
-        return slopes
+            derivatives[:, i] = (self._kernel(f, n, moved, known) - values) / width
+        return derivatives
 
     def _inverse(self, exact: Numbers, known: _Known) -> Numbers:
         """Return the inverse in double precision, with rows and columns scaled to size 1; later updates correct it."""
@@ -289,7 +289,9 @@ class DerivedStep:
 
     def _end(self, z: Numbers, rows: Numbers, known: _Known) -> SolvedStep:
         q = self._gathered(numbers(self.stages.end_position.entries[0]), self.system.dimension, z, known)
-        return SolvedStep(unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]] / self._growth(mp.one, known)))
+        return SolvedStep(
+            unknowns=tuple(z), q=tuple(q), p=tuple(rows[self.rows[-1]] / self._damping_factor(mp.one, known))
+        )
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:

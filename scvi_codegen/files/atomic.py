@@ -41,8 +41,8 @@ def replaced(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     with tempfile.TemporaryDirectory(
         prefix=f".{target.name}.", dir=target.parent, ignore_cleanup_errors=True
-    ) as beside:
-        made, aside = Path(beside) / target.name, Path(beside) / "replaced"
+    ) as temporary_folder:
+        made, aside = Path(temporary_folder) / target.name, Path(temporary_folder) / "replaced"
         yield made
         _sync(made)
         if target.is_dir():

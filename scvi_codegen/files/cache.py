@@ -22,7 +22,6 @@ from pathlib import Path
 
 import platformdirs
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import BuildError, CacheWarning, warn
 from scvi_codegen.files.atomic import remove
 
@@ -134,7 +133,8 @@ class CacheInfo:
     size: int
     limit: int
 
-    __repr__ = summary("folder", "integrators", "size", "limit")
+    def __repr__(self) -> str:
+        return f"CacheInfo(folder='{self.folder}', integrators={self.integrators}, size={self.size})"
 
     def __str__(self) -> str:
         limit = f"of {_readable(self.limit)}" if self.limit else "without a limit"

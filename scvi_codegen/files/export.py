@@ -169,8 +169,8 @@ def _names(states: States) -> list[str]:
 def _columns(states: States) -> Iterator[Iterator[NDArray[Any]]]:
     """Yield the columns of :func:`_names`, (n,) each, chunk by chunk."""
     for t, q, p, iterations in states.pieces():
-        found = {} if states.quantities is None else states.quantities(t, q, p)
-        more = (*found["velocity"].T, found["energy"]) if found else ()
+        derived = {} if states.quantities is None else states.quantities(t, q, p)
+        more = (*derived["velocity"].T, derived["energy"]) if derived else ()
         yield iter((t, *q.T, *p.T, iterations, *more))
 
 

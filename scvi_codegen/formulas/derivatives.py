@@ -83,9 +83,9 @@ class _Accumulation:
         inner = [self.of(argument) for argument in node.args]
         return _combined(
             [
-                (factor, slopes)
-                for position, slopes in enumerate(inner)
-                if slopes and (factor := _partial(node, position)) is not S.Zero
+                (factor, derivatives)
+                for position, derivatives in enumerate(inner)
+                if derivatives and (factor := _partial(node, position)) is not S.Zero
             ]
         )
 
@@ -93,9 +93,9 @@ class _Accumulation:
 def _combined(pairs: Sequence[tuple[Expr, _Gradient]]) -> _Gradient:
     """Return the sum of factor times gradient: the chain rule."""
     parts: dict[int, list[Expr]] = {}
-    for factor, slopes in pairs:
-        for index, slope in slopes.items():
-            parts.setdefault(index, []).append(slope if factor is S.One else Mul(factor, slope))
+    for factor, derivatives in pairs:
+        for index, derivative in derivatives.items():
+            parts.setdefault(index, []).append(derivative if factor is S.One else Mul(factor, derivative))
     total = {index: Add(*terms) for index, terms in parts.items()}
     return {index: entry for index, entry in total.items() if entry is not S.Zero}
 

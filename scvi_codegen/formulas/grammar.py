@@ -105,7 +105,7 @@ def parsed(parser: Parser) -> Expr:
         raise ExpressionError(message, text, parser.column) from error
 
 
-def _vanishes(part: Expr) -> bool:
+def _is_zero(part: Expr) -> bool:
     """Return whether a constant is 0; formulas with symbols are not tested, which SymPy would do slowly."""
     return bool(part.is_number and part.is_zero)
 
@@ -223,7 +223,7 @@ class Parser:
         while True:
             factor_column = self.column
             sign, factor = self.signed()
-            if inverse and _vanishes(factor):
+            if inverse and _is_zero(factor):
                 self.refuse("division by zero", factor_column)
             factor = Pow(factor, -1) if inverse else factor
             number, rest = (factor, S.One) if factor.is_Rational else (S.One, factor)
@@ -260,7 +260,7 @@ class Parser:
         problem = exponent_problem(exponent)
         if problem:
             self.refuse(problem, exponent_column)
-        if _vanishes(base) and not exponent.is_positive:
+        if _is_zero(base) and not exponent.is_positive:
             self.refuse("division by zero: 0 to a power that is not positive", operator.column)
         if exponent.is_Rational and bits(base.as_coeff_Mul(rational=True)[0]) * abs(exponent) > MAX_BITS:
             self.refuse(f"a constant exceeds {MAX_BITS} bits here, more than any C double can represent", column)

@@ -28,7 +28,7 @@ _TOKEN = re.compile(
     r"|(?P<operator>\*\*|\.\.|[-+*/(),\[\]<])",
     re.ASCII,
 )
-MOST_WRITTEN_OUT, MOST_NESTED = 64, 4096
+MAX_UNROLLED_TERMS, MAX_NESTED_TERMS = 64, 4096
 """Maximum number of terms of one sum within a sum, and of all such nested sums."""
 
 Bound: TypeAlias = Loop | int
@@ -247,11 +247,11 @@ class IndexedParser(_Indices):
         for loop in loops:
             length = max(0, loop.end.number - loop.first.number)
             count = count * (length - 1) // 2 if loop.behind else count * length
-        if not 0 < count <= MOST_WRITTEN_OUT:
-            self.refuse(f"a sum over whole numbers must have 1 to {MOST_WRITTEN_OUT} terms, not {count}", column)
+        if not 0 < count <= MAX_UNROLLED_TERMS:
+            self.refuse(f"a sum over whole numbers must have 1 to {MAX_UNROLLED_TERMS} terms, not {count}", column)
         self.nested *= count
-        if self.nested > MOST_NESTED:
-            message = f"nested sums over whole numbers may have at most {MOST_NESTED} terms, not {self.nested}"
+        if self.nested > MAX_NESTED_TERMS:
+            message = f"nested sums over whole numbers may have at most {MAX_NESTED_TERMS} terms, not {self.nested}"
             self.refuse(f"{message}: use a named size of an array instead of the number", column)
         rows: list[dict[str, int]] = [{}]
         for loop in loops:

@@ -22,7 +22,7 @@ from sympy.core.function import AppliedUndef
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.vocabulary import FUNCTIONS
 
-__all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "given_name", "identifier", "number", "symbol"]
+__all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "identifier", "name_of_key", "number", "symbol"]
 
 C_KEYWORDS = frozenset(
     """
@@ -67,7 +67,7 @@ def _letter(character: str) -> str:
     return letter.lower() if words[1] == "SMALL" else letter.capitalize()
 
 
-def given_name(key: object) -> str:
+def name_of_key(key: object) -> str:
     """Return the name of a parameter that is a symbol, a function of time or text."""
     if isinstance(key, (Symbol, AppliedUndef)):
         return str(key.name)

@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy
 
-from scvi_codegen.formulas.parts import parts
+from scvi_codegen.formulas.subexpressions import parts
 from scvi_codegen.formulas.vocabulary import LARGEST, NAME_OF, shortened
 from scvi_codegen.tables.precision import Number, mp
 

@@ -13,10 +13,10 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import evaluated
 from scvi_codegen.formulas.symbols import DOT, TIME, identifier, symbol
 
-__all__ = ["Translation", "given_expression"]
+__all__ = ["Translation", "sympy_expression"]
 
 
-def given_expression(value: Any, what: str) -> Expr:
+def sympy_expression(value: Any, what: str) -> Expr:
     """Return a SymPy expression; numbers are converted.
 
     Raises:
@@ -77,7 +77,7 @@ class Translation:
             self._velocity(coordinate, None if velocities is None else velocities[index])
         self.momenta = tuple(self._coordinate(momentum, "momentum") for momentum in momenta)
         self.parameters = tuple(self._parameter(parameter) for parameter in parameters)
-        self._given_functions((expression, *others), {*parameters, *inputs})
+        self._add_named_functions((expression, *others), {*parameters, *inputs})
         for free in self.free:
             if free not in self.rules:
                 self._add(free, identifier(free.name))
@@ -140,7 +140,7 @@ class Translation:
                 if free.name == coordinate.name + DOT:
                     self._add(free, name)
 
-    def _given_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
+    def _add_named_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
         """Add the functions of time that have the name of a parameter or an input."""
         found = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
         for function in sorted(found, key=str):

@@ -6,17 +6,17 @@ from typing import Any
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow, imported
-from scvi_codegen.given.kinds import SWITCH, of, takes
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
 
 __all__ = ["casadi_flow"]
 
 ARGUMENTS = ("q", "p", "parameters", "t", "h")
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper), hessian=SWITCH)
 def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, hessian: bool = False) -> Any:
     """Return a fixed number of steps of a stepper as a ``casadi.Function``.
 
@@ -51,10 +51,10 @@ def casadi_flow(stepper: Stepper, *, steps: int, save_every: int | None = None, 
     library = building.load(source, flags=stepper.flags)
     name, m = casadi_name(source.prefix), stepper.dimension
     sizes = (m, m, len(stepper.parameters), 1, 1)
-    given = [ca.MX.sym(word, size) for word, size in zip(ARGUMENTS, sizes, strict=True)]
-    states = ca.external(name, str(library.path))(ca.vertcat(*given))
+    arguments = [ca.MX.sym(word, size) for word, size in zip(ARGUMENTS, sizes, strict=True)]
+    states = ca.external(name, str(library.path))(ca.vertcat(*arguments))
     states = states if flow.save_every else states[:, -1]
-    found = [states[:m, :], states[m:, :]]
+    result = [states[:m, :], states[m:, :]]
     missing = float("nan")
     defaults = [missing, missing, missing if stepper.parameters else 0.0, 0.0, missing]
-    return ca.Function(name, given, found, [*ARGUMENTS], ["q1", "p1"], {"default_in": defaults})
+    return ca.Function(name, arguments, result, [*ARGUMENTS], ["q1", "p1"], {"default_in": defaults})

@@ -14,15 +14,15 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
-from scvi_codegen.mechanics.constraints import constraint_rates, positions_held
+from scvi_codegen.mechanics.constraints import constraint_rates, holonomic_expressions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["Ends", "numeric", "own_parameters", "read"]
+__all__ = ["EndConditions", "numeric", "own_parameters", "read"]
 
 
 @dataclass(frozen=True)
-class Ends:
+class EndConditions:
     """Functions of q, v, p, t and the parameters, without inputs, at the beginning or the end of a step."""
 
     ca: Any
@@ -52,16 +52,16 @@ class Ends:
         return self._function(bound)
 
     @cached_property
-    def held(self) -> Any:
+    def constraint_residual(self) -> Any:
         """Residual of the constraints g(q) = 0 and of their time derivatives.
 
         Raises:
             MethodError: if they contain an input.
         """
-        found = [each for each in (*positions_held(self.system), *constraint_rates(self.system)) if each != 0]
-        if any(each.free_symbols - {*self.symbols} for each in found):
+        result = [each for each in (*holonomic_expressions(self.system), *constraint_rates(self.system)) if each != 0]
+        if any(each.free_symbols - {*self.symbols} for each in result):
             raise MethodError("a constraint depends on an input and would jump with it: use inputs only in forces")
-        return self._function(found)
+        return self._function(result)
 
     def momentum(self, q: Any, v: Any, t: Any, parameters: Any) -> Any:
         """Return the momentum of a velocity: exact if H is quadratic in p, otherwise an initial guess."""
@@ -71,25 +71,25 @@ class Ends:
         """Return the velocity of a momentum: exact if L is quadratic in v, otherwise an initial guess."""
         return self._updated("by_v", q=q, v=self.ca.DM.zeros(*q.shape), p=p, t=t, parameters=parameters)
 
-    def _updated(self, slopes: str, **values: Any) -> Any:
+    def _updated(self, derivative: str, **values: Any) -> Any:
         """Return the result of one Newton update from 0."""
-        found = self._slopes(**values)
-        return -self.ca.solve(found[slopes], found["residual"], "qr")
+        result = self._legendre_derivatives(**values)
+        return -self.ca.solve(result[derivative], result["residual"], "qr")
 
     @cached_property
-    def _slopes(self) -> Any:
+    def _legendre_derivatives(self) -> Any:
         """Residual of :attr:`legendre`, and its derivatives with respect to v and p."""
-        given = self.legendre.sx_in()
-        residual = self.legendre(*given)
-        results = [residual, *(self.ca.jacobian(residual, given[place]) for place in (1, 2))]
-        return self.ca.Function("slopes", given, results, self.legendre.name_in(), ["residual", "by_v", "by_p"])
+        arguments = self.legendre.sx_in()
+        residual = self.legendre(*arguments)
+        results = [residual, *(self.ca.jacobian(residual, arguments[place]) for place in (1, 2))]
+        return self.ca.Function("slopes", arguments, results, self.legendre.name_in(), ["residual", "by_v", "by_p"])
 
     def _function(self, expressions: Sequence[Expr]) -> Any:
         m, ca = self.system.dimension, self.ca
         shapes = {"q": m, "v": m, "p": m, "t": 1, "parameters": len(own_parameters(self.system))}
-        given = [ca.SX.sym(name, size) for name, size in shapes.items()]
-        found = numeric(ca, expressions, self.symbols)(*ca.vertsplit(ca.vertcat(*given)))
-        return ca.Function("at_end", given, [ca.vertcat(*found)], [*shapes], ["value"])
+        arguments = [ca.SX.sym(name, size) for name, size in shapes.items()]
+        result = numeric(ca, expressions, self.symbols)(*ca.vertsplit(ca.vertcat(*arguments)))
+        return ca.Function("at_end", arguments, [ca.vertcat(*result)], [*shapes], ["value"])
 
 
 def own_parameters(system: MechanicalSystem) -> Mapping[Symbol, float]:
@@ -108,6 +108,10 @@ def numeric(ca: Any, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> 
     """Return expressions as a function of CasADi's symbols, with common subexpressions shared."""
     names = {name: getattr(ca, name) for name in FUNCTIONS}
     constants = {name: float(value) for name, value in CONSTANTS.items()} | {"e": float(sympy.E)}
-    given: dict[str, Any] = {"modules": [names | constants], "cse": True, "dummify": True}  # a symbol may be called e
-    function: Callable[..., list[Any]] = sympy.lambdify(symbols, list(expressions), **given)
+    arguments: dict[str, Any] = {
+        "modules": [names | constants],
+        "cse": True,
+        "dummify": True,
+    }  # a symbol may be called e
+    function: Callable[..., list[Any]] = sympy.lambdify(symbols, list(expressions), **arguments)
     return function

@@ -15,15 +15,15 @@ from typing import Any
 from scvi_codegen.errors import ArgumentError, MethodError
 from scvi_codegen.formulas.inputs import PARTS
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.frameworks.casadi_ends import Ends, numeric, own_parameters, read
+from scvi_codegen.frameworks.casadi_ends import EndConditions, numeric, own_parameters, read
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import SWITCH, TEXTS, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import PointFamily, StageSystem, Table
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem, Table
+from scvi_codegen.validation.argument_types import SWITCH, TEXTS, checks_arguments
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["casadi_step", "straight"]
 
@@ -33,7 +33,7 @@ HIGHEST = len(PARTS) - 2
 """Highest degree of inputs within a step; compiled steps have cubics."""
 
 
-@takes(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
+@checks_arguments(ArgumentError, system=SYSTEM, along=TEXTS, solved=SWITCH)
 def casadi_step(
     system: MechanicalSystem, method: Method | str, *, degree: int = 0, along: Sequence[str] = (), solved: bool = False
 ) -> Any:
@@ -72,12 +72,12 @@ def casadi_step(
     if checked_count(degree, "degree", least=0) > HIGHEST:
         raise MethodError(f"degree must be at most {HIGHEST} (polynomial inputs), not {degree}")
     stages = discretise(system, as_method(method, system))
-    written = _Written(ca, system, stages, degree)
+    written = _StageExpressions(ca, system, stages, degree)
     *rows, p1 = written.rows()
     values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))
     found = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
     step = ca.Function("step", written.given, found, [*ARGUMENTS], [*RESULTS])
-    return _solved(ca, Ends(ca, system), stages, step) if solved else step
+    return _solved(ca, EndConditions(ca, system), stages, step) if solved else step
 
 
 def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
@@ -90,7 +90,7 @@ def straight(stages: StageSystem, q: Any, v: Any, p: Any, h: Any) -> list[Any]:
     ]
 
 
-def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
+def _solved(ca: Any, ends: EndConditions, stages: StageSystem, step: Any) -> Any:
     """Return the step with its equations solved, without the argument stages and the result residual."""
     symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
     unknowns = symbols.pop("stages")
@@ -104,7 +104,7 @@ def _solved(ca: Any, ends: Ends, stages: StageSystem, step: Any) -> Any:
     return ca.Function("step", [*given.values()], [results[name] for name in names], [*given], names)
 
 
-class _Written:
+class _StageExpressions:
     """Stage system in CasADi's symbols: gather arguments, evaluate kernels, scatter results into rows."""
 
     def __init__(self, ca: Any, system: MechanicalSystem, stages: StageSystem, degree: int) -> None:
@@ -124,19 +124,19 @@ class _Written:
         momenta = (*(row.momentum for row in self.stages.rows), self.stages.end_momentum)
         powers = (*(row.power for row in self.stages.rows), 0)
         rows = [float(c) * self.p if c else self.ca.SX(size, 1) for c, size in zip(momenta, sizes, strict=True)]
-        for family in self.stages.families:
-            kernel = self._kernel(family)
-            for n, weight in enumerate(family.weights):
-                results = iter(kernel(*self._arguments(family, n), *self._surroundings(family.abscissae[n])))
-                for scatter in family.scatters:
+        for group in self.stages.families:
+            kernel = self._kernel(group)
+            for n, weight in enumerate(group.weights):
+                results = iter(kernel(*self._arguments(group, n), *self._surroundings(group.abscissae[n])))
+                for scatter in group.scatters:
                     values = self.ca.vertcat(*(next(results) for _ in scatter.results))
                     for r, entry in enumerate(scatter.table.entries[n]):
                         if entry:
-                            factor = float(scatter.scale * weight * entry) * self._growth(family.abscissae[n])
+                            factor = float(scatter.scale * weight * entry) * self._damping_factor(group.abscissae[n])
                             rows[r] += factor * self.h ** (scatter.power + powers[r]) * values
-        return [*rows[:-1], rows[-1] / self._growth(1)]
+        return [*rows[:-1], rows[-1] / self._damping_factor(1)]
 
-    def _growth(self, abscissa: Any) -> Any:
+    def _damping_factor(self, abscissa: Any) -> Any:
         """Return the factor e^(gamma c h) of the weight at abscissa c in a system with damping gamma."""
         if self.stages.damping == 0:
             return 1.0
@@ -154,35 +154,35 @@ class _Written:
             MethodError: if the action is not a quadrature of L along a curve.
         """
         system = self.system
-        families = [family for family in self.stages.families if family.in_action]
+        groups = [group for group in self.stages.families if group.in_action]
         known = {*system.coordinates, *system.velocities}
-        if not families or any(family.scalar_power or not known <= {*family.arguments} for family in families):
+        if not groups or any(group.scalar_power or not known <= {*group.arguments} for group in groups):
             raise MethodError(
                 "this method has no quadrature along its curve, so formulas cannot be integrated: use an SVI, SCVI or "
                 "Gauss method"
             )
-        held = tuple(symbol(name) for name in system.inputs)
-        around = (system.time, *own_parameters(system), *held)
+        inputs_constant = tuple(symbol(name) for name in system.inputs)
+        around = (system.time, *own_parameters(system), *inputs_constant)
         formulas = read(texts, (*known, *system.auxiliaries, *around))
         columns, weights = [], []
-        for family in families:
-            values = numeric(self.ca, formulas, (*family.arguments, *around))
-            for n, (c, weight) in enumerate(zip(family.abscissae, family.weights, strict=True)):
+        for group in groups:
+            values = numeric(self.ca, formulas, (*group.arguments, *around))
+            for n, (c, weight) in enumerate(zip(group.abscissae, group.weights, strict=True)):
                 pushed = [parts[0] for parts in self._input_parts(float(c))]
-                own = (*self._arguments(family, n), self._time(c), *self.ca.vertsplit(self.parameters), *pushed)
+                own = (*self._arguments(group, n), self._time(c), *self.ca.vertsplit(self.parameters), *pushed)
                 columns.append(self.ca.vertcat(*values(*own)))
                 weights.append(float(weight))
         return self.ca.horzcat(*columns), self.ca.SX(weights)
 
-    def _kernel(self, family: PointFamily) -> Callable[..., list[Any]]:
+    def _kernel(self, group: StageGroup) -> Callable[..., list[Any]]:
         """Return results as a function of arguments, time and parameters, inputs expanded at the point's time."""
         from_here = {symbol(f"{name}_t"): self.system.time for name in self.system.inputs}
-        results = [result.xreplace(from_here) for result in family.results]
-        return numeric(self.ca, results, (*family.arguments, self.system.time, *self.system.parameters))
+        results = [result.xreplace(from_here) for result in group.results]
+        return numeric(self.ca, results, (*group.arguments, self.system.time, *self.system.parameters))
 
-    def _arguments(self, family: PointFamily, n: int) -> list[Any]:
+    def _arguments(self, group: StageGroup, n: int) -> list[Any]:
         """Return the arguments of the kernel of a stage group at its point n."""
-        parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in family.gathers]
+        parts = [self._gathered(g.table, n, power=g.power, scale=float(g.scale)) for g in group.gathers]
         return list(self.ca.vertsplit(self.ca.vertcat(*parts)))
 
     def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:

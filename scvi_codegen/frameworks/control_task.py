@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import MethodError, StateError, closest
-from scvi_codegen.frameworks.casadi_ends import Ends
+from scvi_codegen.frameworks.casadi_ends import EndConditions
 from scvi_codegen.frameworks.casadi_step import casadi_step, straight
-from scvi_codegen.frameworks.controlled import ControlledMotion
+from scvi_codegen.frameworks.controlled_trajectory import ControlledMotion
 from scvi_codegen.frameworks.nonlinear_program import NonlinearProgram
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
@@ -78,7 +78,7 @@ class Task:
             constraints=[
                 (states[:, 1:] - ca.vertcat(q1, p1), 0.0, 0.0),
                 (residual, 0.0, 0.0),
-                *([(self.ends.held(*first), 0.0, 0.0)] if self.system.constraints else []),
+                *([(self.ends.constraint_residual(*first), 0.0, 0.0)] if self.system.constraints else []),
                 *self._at_end(first, self.start),
                 *self._at_end(last, self.end),
                 *((along[row, :], *self.between[text]) for row, text in enumerate(self.between, 1)),
@@ -96,8 +96,8 @@ class Task:
 
     def _input_limits(self) -> tuple[Array, Array]:
         """Return least and largest values, a row for each input."""
-        found = [interval(name, self.bounds.get(name, (None, None))) for name in self.system.inputs]
-        return np.array([[least] for least, _ in found]), np.array([[largest] for _, largest in found])
+        result = [interval(name, self.bounds.get(name, (None, None))) for name in self.system.inputs]
+        return np.array([[least] for least, _ in result]), np.array([[largest] for _, largest in result])
 
     def _at_end(self, side: Sequence[Any], conditions: Conditions) -> Iterator[tuple[Any, float, float]]:
         """Yield the Legendre transform and the conditions at one end."""
@@ -106,9 +106,9 @@ class Task:
             yield self.ends.formula(text)(*side), *interval(text, value)
 
     @cached_property
-    def ends(self) -> Ends:
+    def ends(self) -> EndConditions:
         """Formulas at both ends."""
-        return Ends(self.ca, self.system)
+        return EndConditions(self.ca, self.system)
 
     def first(self, guess: Mapping[str, Any]) -> dict[str, Any]:
         """Return initial values of all unknowns: positions as guessed, momenta and stages computed from them."""
@@ -138,13 +138,13 @@ class Task:
         known = [sum(limit) / 2 for limit in limits if np.isfinite(limit).all()]
         return known if len(known) == 2 else (known or [0.0]) * 2
 
-    def motion(self, program: NonlinearProgram, found: Any, stats: Mapping[str, Any]) -> ControlledMotion:
+    def motion(self, program: NonlinearProgram, result: Any, stats: Mapping[str, Any]) -> ControlledMotion:
         """Return the solution, with the multipliers of the step equations as costates."""
         m, n = self.system.dimension, self.steps
-        values = program.split(found["x"])
+        values = program.split(result["x"])
         states = values["states"]
         states[np.abs(states) < ZERO * np.abs(states).max(axis=1, keepdims=True)] = 0.0
-        slopes = -np.asarray(found["lam_g"]).ravel()[: 2 * m * n].reshape(n, 2 * m)
+        costate_values = -np.asarray(result["lam_g"]).ravel()[: 2 * m * n].reshape(n, 2 * m)
         inputs = values["inputs"].reshape(len(self.system.inputs), n, self.degree + 1)
         return ControlledMotion(
             t=self.t + np.linspace(0.0, values["duration"].item(), n + 1),
@@ -152,8 +152,8 @@ class Task:
             p=states[m:].T,
             coefficients=dict(zip(self.system.inputs, inputs, strict=True)),
             coordinates=tuple(each.name for each in self.system.coordinates),
-            cost=float(found["f"]),
-            costates=slopes,
+            cost=float(result["f"]),
+            costates=costate_values,
             iterations=int(stats["iter_count"]),
             status=str(stats["return_status"]),
             solved=bool(stats["success"]),

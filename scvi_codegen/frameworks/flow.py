@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MissingLibraryError, StateError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.inputs import check_inputs_given, parameter_index
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Flow", "imported"]
 
@@ -60,7 +60,7 @@ class Flow:
         return self.save_every or self.steps
 
     @property
-    def kept(self) -> int:
+    def saved_states(self) -> int:
         """Number of saved states."""
         return self.steps // self.spacing + 1
 

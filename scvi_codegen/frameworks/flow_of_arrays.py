@@ -10,7 +10,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import Flow
-from scvi_codegen.given.kinds import takes
+from scvi_codegen.validation.argument_types import checks_arguments
 
 __all__ = ["ArrayFlow", "Arrays"]
 
@@ -40,7 +40,7 @@ class ArrayFlow(Flow):
     def _along(self, x: Any) -> Any:
         """Return (.., saved, 2m) states of the flows from (.., n) arguments each."""
 
-    @takes(StateError)
+    @checks_arguments(StateError)
     def __call__(self, q: Any, p: Any, *, h: Any, t: Any = 0.0, parameters: Any = None) -> tuple[Any, Any]:
         """Return the final state, or with ``save_every`` all saved states.
 
@@ -60,15 +60,15 @@ class ArrayFlow(Flow):
         """
         m, values = self.stepper.dimension, self.parameter_values(parameters)
         count = len(self.stepper.parameters)
-        given = (
+        arguments = (
             [self._number(value, "a parameter") for value in values]
             if isinstance(values, list)
             else [self._vector(values, count, "parameters")]
         )
         ends = [self._number(t, "t"), self._number(h, "h")]
-        found = self._along(self._beside(self._vector(q, m, "q"), self._vector(p, m, "p"), *given, *ends))
-        found = found if self.save_every else found[..., -1, :]
-        return found[..., :m], found[..., m:]
+        result = self._along(self._concatenated(self._vector(q, m, "q"), self._vector(p, m, "p"), *arguments, *ends))
+        result = result if self.save_every else result[..., -1, :]
+        return result[..., :m], result[..., m:]
 
     def _number(self, value: Any, name: str) -> Any:
         """Return a number as an array (.., 1)."""
@@ -80,7 +80,7 @@ class ArrayFlow(Flow):
             raise StateError(f"{name} must have shape (.., {length}), not {tuple(array.shape)}")
         return array
 
-    def _beside(self, *parts: Any) -> Any:
+    def _concatenated(self, *parts: Any) -> Any:
         """Broadcast (.., n) arrays and concatenate them along the last axis."""
         try:
             batch = np.broadcast_shapes(*(tuple(part.shape[:-1]) for part in parts))

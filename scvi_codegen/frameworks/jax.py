@@ -9,18 +9,18 @@ from typing import Any
 from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
-from scvi_codegen.given.kinds import of, takes
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND, with_xla_flow
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import checks_arguments, of
 
 __all__ = ["JaxFlow", "jax_flow"]
 
 _registered: set[str] = set()
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper))
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
 def jax_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> JaxFlow:
     """Return a fixed number of steps of a stepper as a function of JAX.
 

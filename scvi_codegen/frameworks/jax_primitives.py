@@ -65,89 +65,97 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
 
     def batched(arguments: Sequence[Any], axes: Sequence[Any], **static: Any) -> tuple[Any, int]:
         count = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
-        place = arguments[0].ndim - 1 if axes[0] is None else 0
+        axis_index = arguments[0].ndim - 1 if axes[0] is None else 0
         x = arguments[0] if axes[0] is None else jnp.moveaxis(arguments[0], axes[0], 0)
         given = [
-            _repeated(each, count, place) if axis is None else jnp.moveaxis(each, axis, place)
+            _repeated(each, count, axis_index) if axis is None else jnp.moveaxis(each, axis, axis_index)
             for each, axis in zip(arguments[1:], axes[1:], strict=True)
         ]
         if axes[0] is not None:
             return primitive().bind(x, *given, **static), 0
-        beside = [each.reshape(*each.shape[:place], -1, *each.shape[place + 2 :]) for each in given]
-        found = primitive().bind(x, *beside, **static)
-        return found.reshape(*given[0].shape[: place + 2], *found.shape[place + 1 :]), place
+        stacked = [each.reshape(*each.shape[:axis_index], -1, *each.shape[axis_index + 2 :]) for each in given]
+        found = primitive().bind(x, *stacked, **static)
+        return found.reshape(*given[0].shape[: axis_index + 2], *found.shape[axis_index + 1 :]), axis_index
 
     return batched
 
 
-def _repeated(given: Any, count: int, place: int) -> Any:
+def _repeated(given: Any, count: int, axis_index: int) -> Any:
     """Return the array repeated along a new axis of length ``count``."""
-    return jnp.broadcast_to(jnp.expand_dims(given, place), (*given.shape[:place], count, *given.shape[place:]))
+    return jnp.broadcast_to(
+        jnp.expand_dims(given, axis_index), (*given.shape[:axis_index], count, *given.shape[axis_index:])
+    )
 
 
 STATES: Primitive = _primitive("states", lambda x, n, size: (*x[:-1], n, size), _states_batched)
-PUSH: Primitive = _primitive("push", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: PUSH))
-PULL: Primitive = _primitive("pull", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: PULL))
-BEND: Primitive = _primitive("bend", lambda x, w, v, *_: v, _linear_batched(lambda: BEND))
+JVP: Primitive = _primitive("push", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: JVP))
+VJP: Primitive = _primitive("pull", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: VJP))
+VJP_DERIVATIVE: Primitive = _primitive("bend", lambda x, w, v, *_: v, _linear_batched(lambda: VJP_DERIVATIVE))
 
 
-def _states_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+def _states_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
     found = STATES.bind(*given, **static)
-    if type(changes[0]) is ad.Zero:
+    if type(tangents[0]) is ad.Zero:
         return found, ad.Zero.from_primal_value(found)
-    pushed = PUSH.bind(given[0], jnp.expand_dims(changes[0], -2), **static)
+    pushed = JVP.bind(given[0], jnp.expand_dims(tangents[0], -2), **static)
     return found, jnp.squeeze(pushed, -3)
 
 
-def _push_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    if type(changes[0]) is not ad.Zero:
+def _jvp_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    if type(tangents[0]) is not ad.Zero:
         raise MethodError(
             "a flow has no forward-over-forward second derivatives (jacfwd of jacfwd, jacrev of jacfwd) and no third "
             "derivatives: use jax.hessian, or jacfwd or jacrev of jacrev"
         )
-    return PUSH.bind(*given, **static), PUSH.bind(given[0], changes[1], **static)
+    return JVP.bind(*given, **static), JVP.bind(given[0], tangents[1], **static)
 
 
-def _pull_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    (x, slopes), (of_x, of_slopes), parts = given, changes, []
-    if type(of_slopes) is not ad.Zero:
-        parts.append(PULL.bind(x, of_slopes, **static))
+def _vjp_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    (x, cotangents), (of_x, of_cotangents), parts = given, tangents, []
+    if type(of_cotangents) is not ad.Zero:
+        parts.append(VJP.bind(x, of_cotangents, **static))
     if type(of_x) is not ad.Zero:
         second = static | {"target": SECOND[static["target"]]()}
-        parts.append(BEND.bind(x, slopes, _repeated(of_x, slopes.shape[x.ndim - 1], x.ndim - 1), **second))
-    return PULL.bind(x, slopes, **static), sum(parts[1:], parts[0])
+        parts.append(
+            VJP_DERIVATIVE.bind(x, cotangents, _repeated(of_x, cotangents.shape[x.ndim - 1], x.ndim - 1), **second)
+        )
+    return VJP.bind(x, cotangents, **static), sum(parts[1:], parts[0])
 
 
-def _bend_pushed(given: Sequence[Any], changes: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    if type(changes[0]) is not ad.Zero:
+def _vjp_derivative_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    if type(tangents[0]) is not ad.Zero:
         raise MethodError("a flow has no third derivatives")
-    (x, slopes, moved), (_, of_slopes, of_moved), found = given, changes, []
-    if type(of_slopes) is not ad.Zero:
-        found.append(BEND.bind(x, of_slopes, moved, **static))
+    (x, cotangents, moved), (_, of_cotangents, of_moved), found = given, tangents, []
+    if type(of_cotangents) is not ad.Zero:
+        found.append(VJP_DERIVATIVE.bind(x, of_cotangents, moved, **static))
     if type(of_moved) is not ad.Zero:
-        found.append(BEND.bind(x, slopes, of_moved, **static))
-    return BEND.bind(*given, **static), sum(found[1:], found[0])
+        found.append(VJP_DERIVATIVE.bind(x, cotangents, of_moved, **static))
+    return VJP_DERIVATIVE.bind(*given, **static), sum(found[1:], found[0])
 
 
 def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
-    def transpose(slopes: Any, x: Any, given: Any, **static: Any) -> tuple[None, Any]:
-        if type(slopes) is ad.Zero:
+    def transpose(cotangents: Any, x: Any, given: Any, **static: Any) -> tuple[None, Any]:
+        if type(cotangents) is ad.Zero:
             return None, ad.Zero(given.aval)
-        return None, other.bind(x, slopes, **static)
+        return None, other.bind(x, cotangents, **static)
 
     return transpose
 
 
-def _bend_transposed(slopes: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
+def _vjp_derivative_transposed(cotangents: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
     """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
     if ad.is_undefined_primal(own):
         raise MethodError("a flow has no forward-over-forward second derivatives: use jacfwd or jacrev of jacrev")
-    if type(slopes) is ad.Zero:
+    if type(cotangents) is ad.Zero:
         return None, None, ad.Zero(moved.aval)
-    return None, None, BEND.bind(x, own, slopes, **static)
+    return None, None, VJP_DERIVATIVE.bind(x, own, cotangents, **static)
 
 
-ad.primitive_jvps[STATES] = _states_pushed
-ad.primitive_jvps[PUSH], ad.primitive_jvps[PULL], ad.primitive_jvps[BEND] = _push_pushed, _pull_pushed, _bend_pushed
-ad.primitive_transposes[BEND] = _bend_transposed
-ad.primitive_transposes[PUSH], ad.primitive_transposes[PULL] = _transposed(PULL), _transposed(PUSH)
+ad.primitive_jvps[STATES] = _states_jvp
+ad.primitive_jvps[JVP], ad.primitive_jvps[VJP], ad.primitive_jvps[VJP_DERIVATIVE] = (
+    _jvp_jvp,
+    _vjp_jvp,
+    _vjp_derivative_jvp,
+)
+ad.primitive_transposes[VJP_DERIVATIVE] = _vjp_derivative_transposed
+ad.primitive_transposes[JVP], ad.primitive_transposes[VJP] = _transposed(VJP), _transposed(JVP)

@@ -41,16 +41,16 @@ class NonlinearProgram:
         solver = self.ca.nlpsol("program", "ipopt", program, {**QUIET, **options})
         low, high = (self._vector(self._limits(side)) for side in (0, 1))
         least, largest = (self._spread(side) for side in (1, 2))
-        found = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
-        return found, solver.stats()
+        result = solver(x0=self._vector(first), lbx=low, ubx=high, lbg=least, ubg=largest)
+        return result, solver.stats()
 
     def split(self, vector: Any) -> dict[str, Array]:
         """Return the values of the unknowns by name, each in its shape."""
-        flat, found, begin = np.asarray(vector).ravel(), {}, 0
+        flat, result, begin = np.asarray(vector).ravel(), {}, 0
         for name, each in self.unknowns.items():
-            found[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
+            result[name] = flat[begin : begin + each.numel()].reshape(each.shape, order="F")
             begin += each.numel()
-        return found
+        return result
 
     @cached_property
     def x(self) -> Any:

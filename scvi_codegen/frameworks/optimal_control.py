@@ -15,20 +15,20 @@ import numpy as np
 from scvi_codegen.errors import ControlError, MethodError, StateError
 from scvi_codegen.frameworks.casadi_ends import own_parameters
 from scvi_codegen.frameworks.control_task import Conditions, Task, check_known, interval
-from scvi_codegen.frameworks.controlled import ControlledMotion
+from scvi_codegen.frameworks.controlled_trajectory import ControlledMotion
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import MAPPING, TEXT, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.validation.argument_types import MAPPING, TEXT, checks_arguments
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["optimal_control"]
 
 
-@takes(
+@checks_arguments(
     StateError,
     system=SYSTEM,
     start=MAPPING,

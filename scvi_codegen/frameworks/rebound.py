@@ -12,16 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.frameworks.flow import imported
-from scvi_codegen.given.kinds import of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.validation.argument_types import checks_arguments, of
 
 __all__ = ["GravitatingBodies", "from_rebound", "to_rebound"]
 
 AXES = "xyz"
 NEWTON = ("basic", "compensated")
 """REBOUND's names of pairwise gravity by direct summation."""
-AGREES = 1e-11
+RELATIVE_TOLERANCE = 1e-11
 """Relative tolerance of the comparison of a Lagrangian with Newton's at random states."""
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def from_rebound(simulation: Any) -> GravitatingBodies:
     return GravitatingBodies(system, q, velocity, float(simulation.t), units)
 
 
-@takes(SystemDefinitionError, system=of("a LagrangianSystem", LagrangianSystem))
+@checks_arguments(SystemDefinitionError, system=of("a LagrangianSystem", LagrangianSystem))
 def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t: float = 0.0) -> Any:
     """Return a ``rebound.Simulation`` of bodies that attract each other by Newton's law.
 
@@ -119,9 +119,9 @@ def _check_plain(simulation: Any) -> None:
         "variational particles": bool(simulation.N_var),
         "additional forces: write them as terms of L, or forces=": bool(simulation._additional_forces),
     }
-    found = [what for what, there in oddities.items() if there]
-    if found:
-        raise SystemDefinitionError(f"only gravity between masses is supported; this simulation has {found[0]}")
+    result = [what for what, there in oddities.items() if there]
+    if result:
+        raise SystemDefinitionError(f"only gravity between masses is supported; this simulation has {result[0]}")
 
 
 def _padded(value: ArrayLike, name: str, bodies: int, axes: int) -> Array:
@@ -155,20 +155,20 @@ def _attraction(system: LagrangianSystem) -> tuple[int, float, list[float]]:
 
 def _fitted(formula: Callable[[Array, Array], float], m: int, axes: int) -> tuple[float, Array]:
     """Return G and the masses; G = 0 if L has another form."""
-    places, motions = np.random.default_rng(1).normal(size=(2, 4, m))
+    positions, motions = np.random.default_rng(1).normal(size=(2, 4, m))
     rest = np.zeros(m)
-    masses = np.array([2.0 * (formula(places[0], v) - formula(places[0], rest)) for v in np.eye(m)[::axes]])
+    masses = np.array([2.0 * (formula(positions[0], v) - formula(positions[0], rest)) for v in np.eye(m)[::axes]])
     if not np.all(masses > 0.0):
         return 0.0, masses
-    shapes = np.array([_inverse_distances(q.reshape(-1, axes), masses) for q in places])
-    G = formula(places[0], rest) / shapes[0]
+    shapes = np.array([_inverse_distances(q.reshape(-1, axes), masses) for q in positions])
+    G = formula(positions[0], rest) / shapes[0]
     kinetic = 0.5 * motions**2 @ np.repeat(masses, axes)
-    found = [[formula(q, rest), formula(q, v)] for q, v in zip(places, motions, strict=True)]
-    agrees = np.allclose(found, np.transpose([G * shapes, kinetic + G * shapes]), rtol=AGREES, atol=0.0)
+    result = [[formula(q, rest), formula(q, v)] for q, v in zip(positions, motions, strict=True)]
+    agrees = np.allclose(result, np.transpose([G * shapes, kinetic + G * shapes]), rtol=RELATIVE_TOLERANCE, atol=0.0)
     return float(G) if agrees else 0.0, masses
 
 
-def _inverse_distances(places: Array, masses: Array) -> float:
+def _inverse_distances(positions: Array, masses: Array) -> float:
     """Return the sum over pairs of m m' / r."""
     pairs = combinations(range(len(masses)), 2)
-    return sum(float(masses[i] * masses[j] / np.linalg.norm(places[i] - places[j])) for i, j in pairs)
+    return sum(float(masses[i] * masses[j] / np.linalg.norm(positions[i] - positions[j])) for i, j in pairs)

@@ -9,13 +9,13 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
-from scvi_codegen.given.kinds import of, takes
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import checks_arguments, of
 
 __all__ = ["TorchFlow", "torch_flow"]
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper))
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper))
 def torch_flow(stepper: Stepper, *, steps: int, save_every: int | None = None) -> TorchFlow:
     """Return a fixed number of steps of a stepper as a differentiable function of PyTorch.
 

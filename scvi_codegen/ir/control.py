@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import NumberTable
 
-__all__ = ["Control", "Ladder"]
+__all__ = ["AdaptivePredictor", "Control"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,20 +16,20 @@ class Control:
 
     Attributes:
         mantissas: 2^(k / rungs) for the levels of an octave.
-        ladder: predictor of the fixed-point iteration, ``None`` without one.
+        predictor: predictor of the fixed-point iteration, ``None`` without one.
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the
-            ladder.
+            predictor.
     """
 
     mantissas: tuple[float, ...] = ()
-    ladder: Ladder | None = None
+    predictor: AdaptivePredictor | None = None
     stage_growth: float = 0.0
     density: Kernel | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ladder:
+class AdaptivePredictor:
     """Predictor tables of the fixed-point iteration for varying step sizes, and the growth of the error estimate.
 
     Attributes:

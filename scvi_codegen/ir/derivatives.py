@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.ir.families import Family
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
+from scvi_codegen.ir.stage_groups import LoweredStageGroup
 
-__all__ = ["Derivatives", "GivenSlopes", "LinearClock", "SweptSlopes"]
+__all__ = ["Derivatives", "InputDerivatives", "PointDerivatives", "TimeDerivatives"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GivenSlopes:
+class InputDerivatives:
     """Nonzero derivatives of the results of a stage group with respect to parameters and time.
 
     Attributes:
@@ -25,7 +25,7 @@ class GivenSlopes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinearClock:
+class TimeDerivatives:
     """Derivatives of the time of a time-transformed step, and of the energy that is its parameter.
 
     Attributes:
@@ -41,7 +41,7 @@ class LinearClock:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SweptSlopes:
+class PointDerivatives:
     """Kernels of tangent and adjoint vectors by fixed-point iteration; entries are never empty.
 
     Attributes:
@@ -56,8 +56,8 @@ class SweptSlopes:
     slopes: Kernel
     beside: int
     products: tuple[Kernel, Kernel]
-    given: GivenSlopes
-    masses: GivenSlopes | None = None
+    given: InputDerivatives
+    masses: InputDerivatives | None = None
     steps: int = 32
 
     @property
@@ -83,15 +83,15 @@ class Derivatives:
     """
 
     program: Program
-    by_given: tuple[GivenSlopes, ...]
+    by_given: tuple[InputDerivatives, ...]
     curvatures: tuple[Kernel | None, ...] = ()
-    damping: GivenSlopes | None = None
-    clock: LinearClock | None = None
-    swept: SweptSlopes | None = None
+    damping: InputDerivatives | None = None
+    clock: TimeDerivatives | None = None
+    swept: PointDerivatives | None = None
     lanes: int = 8
 
     @property
-    def families(self) -> tuple[tuple[Family, GivenSlopes, Kernel | None], ...]:
+    def families(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
         """Stage groups with the derivatives of their kernels, and second derivatives, if requested and nonzero."""
         bends = self.curvatures or (None,) * len(self.by_given)
         return tuple(zip(self.program.families, self.by_given, bends, strict=True))
@@ -99,7 +99,7 @@ class Derivatives:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels that the program lacks."""
-        given: tuple[GivenSlopes, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
+        given: tuple[InputDerivatives, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
         given += (self.swept.masses,) if self.swept and self.swept.masses else ()
         return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)

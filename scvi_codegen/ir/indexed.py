@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from scvi_codegen.indices import Access, Array, Loop
 from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number
-from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep, Splitting
 
-__all__ = ["HeldSteps", "IndexedProgram", "LoopedKernel"]
+__all__ = ["ConstrainedSteps", "IndexedProgram", "LoopedKernel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +40,7 @@ class LoopedKernel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeldSteps:
+class ConstrainedSteps:
     """Constrained steps by RATTLE.
 
     Attributes:
@@ -92,10 +92,10 @@ class IndexedProgram:
     forces: tuple[LoopedKernel, ...]
     masses: tuple[LoopedKernel, ...]
     constants: tuple[LoopedKernel, ...]
-    sweep: SeparableSweep | HamiltonianSweep | None
+    sweep: SeparableIteration | HamiltonianIteration | None
     splitting: Splitting | None
     control: Control | None = None
-    held: HeldSteps | None = None
+    held: ConstrainedSteps | None = None
     products: tuple[LoopedKernel, ...] = ()
     diagonals: tuple[LoopedKernel, ...] = ()
     reach: int = 0

@@ -12,7 +12,7 @@ from scvi_codegen.tables.precision import DIGITS, Matrix, Vector, mp, settled
 
 __all__ = ["Number", "NumberTable", "exact_number", "lower_matrix", "lower_vector"]
 
-PROMISED = 50
+TABLE_DIGITS = 50
 """Digits of a table; the last of the 60 that it is computed with are rounding errors, and a 1 has to be exactly 1."""
 
 Number: TypeAlias = Any
@@ -22,13 +22,13 @@ NumberTable: TypeAlias = tuple[tuple[Number, ...], ...]
 
 
 def lower_vector(numbers: Vector) -> tuple[Number, ...]:
-    """Return the numbers of a table to :data:`PROMISED` digits; zeros except for rounding become 0."""
-    with mp.workdps(PROMISED):
+    """Return the numbers of a table to :data:`TABLE_DIGITS` digits; zeros except for rounding become 0."""
+    with mp.workdps(TABLE_DIGITS):
         return tuple(settled(x) for x in numbers)
 
 
 def lower_matrix(entries: Matrix) -> NumberTable:
-    """Return the rows of a table to :data:`PROMISED` digits."""
+    """Return the rows of a table to :data:`TABLE_DIGITS` digits."""
     return tuple(lower_vector(line) for line in entries)
 
 

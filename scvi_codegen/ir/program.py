@@ -12,15 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.ir.constraints import Constraints, Rattle
-from scvi_codegen.ir.families import Family
+from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.sweep import Sweep
-from scvi_codegen.ir.sweeps import Splitting
+from scvi_codegen.ir.stage_groups import LoweredStageGroup
 
 __all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
 
-WORTH_REMEMBERING = 32
+LEAST_REUSED_UNKNOWNS = 32
 """Number of unknowns from which on factors of the Newton matrix are reused in later steps.
 
 New factors cost as much as the additional iterations with old ones at 16 unknowns (Kepler problem, degree 8), twice as
@@ -83,7 +83,7 @@ class Program:
         blocks: number of unknowns B at each site.
         families: stage groups of the equations that Newton's method solves; none without it.
         places: (sites,) position of each site in matrices, in a bandwidth-reducing ordering.
-        mass_places: (m,) the same for the coordinates alone.
+        mass_positions: (m,) the same for the coordinates alone.
         bandwidth: largest distance of coupled sites in that ordering.
         momentum_rows: (B,) coefficient of p0 in each row.
         end_position: (B,) weights of q1 = q0 + h sum_b beta_b z_b.
@@ -123,9 +123,9 @@ class Program:
     parameter_defaults: tuple[float, ...]
     sites: int
     blocks: int
-    families: tuple[Family, ...]
+    families: tuple[LoweredStageGroup, ...]
     places: tuple[int, ...]
-    mass_places: tuple[int, ...]
+    mass_positions: tuple[int, ...]
     bandwidth: int
     momentum_rows: tuple[Number, ...]
     end_position: tuple[Number, ...]
@@ -139,7 +139,7 @@ class Program:
     hamiltonian: bool
     momentum_maps: tuple[MomentumMap, ...]
     momentum_kernel: Kernel | None
-    sweep: Sweep | None
+    sweep: FixedPointIteration | None
     splitting: Splitting | None
     newton: bool
     acts: bool
@@ -187,15 +187,15 @@ class Program:
         return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands, *bound)
 
     @property
-    def held_places(self) -> tuple[int, ...]:
+    def constraint_positions(self) -> tuple[int, ...]:
         """Position of each constraint among the constraints, in the order of the sites."""
         own = self.places[self.dimension :]
         return tuple(sorted(own).index(place) for place in own)
 
     @property
-    def held_reach(self) -> int:
+    def constraint_reach(self) -> int:
         """Largest distance of coupled constraints in this order."""
-        places = self.held_places
+        places = self.constraint_positions
         return max(abs(places[k] - places[j]) for k, j in self.rattle.entries) if self.rattle else 0
 
     @property
@@ -221,19 +221,19 @@ class Program:
         return max(points, self.unknowns + self.point if self.newton else 0)
 
     @property
-    def remembers_factors(self) -> bool:
+    def reuses_factors(self) -> bool:
         """True if Newton's method starts a step with the factors of the previous one: not if new ones cost little.
 
         Nor with constraints, whose derivatives rotate with the motion: old factors then reduce the residual only
         tenfold per iteration.
         """
-        worth = self.unknowns >= WORTH_REMEMBERING and not self.constraints
+        worth = self.unknowns >= LEAST_REUSED_UNKNOWNS and not self.constraints
         return self.newton and not self.splitting and worth
 
     @property
     def point(self) -> int:
         """Numbers that describe where the factors were computed: time, q0 with its compensation, unknowns."""
-        return 1 + 2 * self.dimension + self.unknowns if self.remembers_factors else 0
+        return 1 + 2 * self.dimension + self.unknowns if self.reuses_factors else 0
 
     def matrix_size(self, sites: int, blocks: int) -> int:
         """Return the size of a matrix with ``blocks`` unknowns per site: its band with fill-in, or all of it."""

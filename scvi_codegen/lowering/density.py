@@ -14,8 +14,8 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.ir.control import Control
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.monitors import monitor_function
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 
 __all__ = ["density_of"]
 
@@ -25,16 +25,16 @@ def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
 
     Args:
         system: in physical time.
-        monitor: as in :func:`~scvi_codegen.mechanics.monitors.monitor_function`, also with functions of time.
+        monitor: as in :func:`~scvi_codegen.mechanics.time_rescaling.time_rescaling_function`, or of time.
 
     Raises:
         SystemDefinitionError: for an invalid time-rescaling function.
     """
-    g = monitor_function(system, monitor, in_time=True)
+    g = time_rescaling_function(system, monitor, in_time=True)
     forms = forms_of(system)
     rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
     if system.auxiliaries:
-        rates |= dict(zip(system.auxiliaries, forms.thrust, strict=True))
+        rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
     rates[system.time] = sympy.S.One
     variables = list(rates)
     change = sympy.Add(*(slope * rates[variables[i]] for i, slope in gradient(g, variables).items()))

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.ir.derivatives import Derivatives, GivenSlopes, LinearClock
+from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, TimeDerivatives
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.swept_slopes import swept_slopes
+from scvi_codegen.lowering.point_derivatives import point_derivatives_of
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 
 __all__ = ["derivatives_of"]
 
@@ -27,52 +27,54 @@ def derivatives_of(
     Args:
         second: whether second derivatives are included.
     """
-    given = tuple(_given_slopes(system, family.name, family.results, family.arguments) for family in stages.families)
+    given = tuple(
+        _input_derivatives(system, family.name, family.results, family.arguments) for family in stages.families
+    )
     return Derivatives(
         program=program,
         by_given=given,
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
-        damping=_given_slopes(system, "damping", (stages.damping,), ()) if program.damping else None,
-        clock=_linear_clock(system, stages.families[0].arguments) if system.clock else None,
-        swept=swept_slopes(system, program.sweep) if program.sweep else None,
+        damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
+        clock=_time_derivatives(system, stages.families[0].arguments) if system.clock else None,
+        swept=point_derivatives_of(system, program.sweep) if program.sweep else None,
     )
 
 
-def _given_slopes(
+def _input_derivatives(
     system: MechanicalSystem, name: str, results: Sequence[Expr], arguments: Sequence[Symbol]
-) -> GivenSlopes:
+) -> InputDerivatives:
     entries = jacobian(results, (*system.parameters, system.time))
     if not entries:
-        return GivenSlopes(entries=(), kernel=None)
+        return InputDerivatives(entries=(), kernel=None)
     kernel = system_kernel(
         system,
-        f"{name}_by_given",
+        f"{name}_by_inputs",
         entries.values(),
         of=arguments,
         purpose="Nonzero derivatives with respect to parameters and time.",
     )
-    return GivenSlopes(entries=tuple(entries), kernel=kernel)
+    return InputDerivatives(entries=tuple(entries), kernel=kernel)
 
 
-def _linear_clock(system: MechanicalSystem, arguments: Sequence[Symbol]) -> LinearClock:
+def _time_derivatives(system: MechanicalSystem, arguments: Sequence[Symbol]) -> TimeDerivatives:
     assert system.clock is not None
     rate = system.clock.rate
     slopes = gradient(rate, (*arguments, *system.parameters))
-    return LinearClock(
+    return TimeDerivatives(
         entries=tuple(slopes),
         kernel=system_kernel(
             system,
-            "rate_slopes",
+            "rate_derivatives",
             (rate,),
             of=arguments,
             slopes=slopes.values(),
             purpose="The rate of time and its nonzero derivatives with respect to arguments and parameters.",
         ),
-        level=_level_slopes(system),
+        level=_energy_derivatives(system),
     )
 
 
-def _level_slopes(system: MechanicalSystem) -> Kernel:
+def _energy_derivatives(system: MechanicalSystem) -> Kernel:
     """Kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE is the change of K / rate."""
     assert system.clock is not None
     m, energy = system.dimension, system.clock.energy
@@ -83,7 +85,7 @@ def _level_slopes(system: MechanicalSystem) -> Kernel:
     by_p = forms_of(system).legendre if system.auxiliaries else system.velocities
     return system_kernel(
         system,
-        "level_slopes",
+        "energy_derivatives",
         [slope / system.clock.rate for slope in (*by_others[:m], *by_p, *by_others[m:])],
         of=forms_of(system).legendre_arguments,
         purpose="Gradient of the energy with respect to q, p and parameters at "
@@ -91,7 +93,7 @@ def _level_slopes(system: MechanicalSystem) -> Kernel:
     )
 
 
-def _curvature(system: MechanicalSystem, family: PointFamily) -> Kernel | None:
+def _curvature(system: MechanicalSystem, family: StageGroup) -> Kernel | None:
     """Kernel of the Hessian-vector product of multipliers . results, as the gradient of a directional derivative."""
     depends = (*family.arguments, *system.parameters, system.time)
     multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(family.results))]

@@ -16,15 +16,15 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
-from scvi_codegen.ir.sweeps import HamiltonianSweep, SeparableSweep
-from scvi_codegen.lowering.indexed_constraints import held_steps
-from scvi_codegen.lowering.indexed_kernels import given_of, kernel_of
+from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration
+from scvi_codegen.lowering.indexed_constraints import constrained_steps
+from scvi_codegen.lowering.indexed_kernels import constants_of, kernel_of
 from scvi_codegen.lowering.lattices import reach_of
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.choice import sweep_of
-from scvi_codegen.lowering.solvers.ladder import control_of_sweep
-from scvi_codegen.lowering.solvers.separable import separable_sweep
+from scvi_codegen.lowering.solvers.choice import iteration_of
+from scvi_codegen.lowering.solvers.predictor_tables import control_of_iteration
+from scvi_codegen.lowering.solvers.separable import separable_iteration
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.masses import MassTerm
@@ -61,7 +61,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         MethodError: for a method that is neither explicit nor solved by fixed-point iteration over positions.
     """
     one = one_coordinate(system)
-    held = held_steps(system, discretise(one, method), method) if system.constraints else None
+    held = constrained_steps(system, discretise(one, method), method) if system.constraints else None
     splitting = None if held else splitting_of(one, method)
     if splitting and system.velocities:
         raise MethodError(
@@ -69,7 +69,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
             "Runge-Kutta method"
         )
     kernels = [_force(system, term, number) for number, term in enumerate(system.potentials)]
-    kernels += [_pushing(system, force, number) for number, force in enumerate(system.forces, len(kernels))]
+    kernels += [_generalised_force(system, force, number) for number, force in enumerate(system.forces, len(kernels))]
     forces = tuple(kernels)
     products, diagonals = curvature(system) if newton else ((), ())
     if newton and (splitting or held or system.momenta or system.velocities or not products):
@@ -107,13 +107,17 @@ def with_control(program: IndexedProgram) -> IndexedProgram | None:
     """Return the program with adaptive steps; ``None`` if there is no error estimate."""
     if program.sweep is None or not program.error_power:
         return None
-    return replace(program, control=control_of_sweep(program.sweep))
+    return replace(program, control=control_of_iteration(program.sweep))
 
 
-def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableSweep | HamiltonianSweep:
+def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableIteration | HamiltonianIteration:
     stages = discretise(one, method)
-    found = separable_sweep(StepProblem(one, stages.shape), velocities=True) if velocities else sweep_of(one, stages)
-    if isinstance(found, SeparableSweep | HamiltonianSweep):
+    found = (
+        separable_iteration(StepProblem(one, stages.shape), velocities=True)
+        if velocities
+        else iteration_of(one, stages)
+    )
+    if isinstance(found, SeparableIteration | HamiltonianIteration):
         return found
     explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
     raise MethodError(
@@ -133,7 +137,7 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
         loops=term.loops,
         slots=tuple(arrays[slot] for slot in u),
         targets=tuple(arrays[slot] for slot in u),
-        given=given_of(term.slots, u),
+        given=constants_of(term.slots, u),
         kernel=kernel_of(
             system, f"force_{number}", values, term.slots, u, "Derivatives with respect to its coordinates."
         ),
@@ -142,7 +146,7 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
     return replace(looped, scalar=scalar)
 
 
-def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedKernel:
+def _generalised_force(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedKernel:
     """Return the kernel of a generalised force."""
     moving = (*system.state, *system.velocities)
     u = [slot for slot, access in force.slots if access.array in moving]
@@ -152,19 +156,19 @@ def _pushing(system: IndexedSystem, force: IndexedForce, number: int) -> LoopedK
         loops=force.loops,
         slots=tuple(access for slot, access in force.slots if slot in u),
         targets=tuple(access for access, _ in force.targets),
-        given=given_of(force.slots, u),
+        given=constants_of(force.slots, u),
         kernel=kernel_of(system, f"force_{number}", values, force.slots, u, "Forces."),
     )
 
 
 def curvature(system: IndexedSystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
     """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
-    found = [_derived(system, term, number) for number, term in enumerate(_acting(system))]
+    found = [_derived(system, term, number) for number, term in enumerate(_all_forces(system))]
     pairs = [pair for pair in found if pair]
     return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
 
 
-def _acting(system: IndexedSystem) -> Iterator[IndexedForce]:
+def _all_forces(system: IndexedSystem) -> Iterator[IndexedForce]:
     """Yield all forces, those of the potentials by their slots."""
     for term in system.potentials:
         moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
@@ -187,7 +191,7 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
         for row, (access, _) in zip(rows, force.targets, strict=True)
     ]
     accesses, targets = tuple(access for _, access in moving), tuple(access for access, _ in force.targets)
-    given, text = given_of(force.slots, u), comment_text(f"derivatives of {force}")
+    given, text = constants_of(force.slots, u), comment_text(f"derivatives of {force}")
     both = [*force.slots, *zip(w, accesses, strict=True)]
     product = LoopedKernel(
         text=text,
@@ -217,7 +221,7 @@ def _constant(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKe
         loops=term.loops,
         slots=(),
         targets=(),
-        given=given_of(term.slots, ()),
+        given=constants_of(term.slots, ()),
         kernel=kernel_of(system, f"constant_{number}", [term.formula], term.slots, (), "The term."),
     )
 
@@ -228,6 +232,6 @@ def _mass(system: IndexedSystem, term: MassTerm, number: int) -> LoopedKernel:
         loops=term.loops,
         slots=(),
         targets=(term.access,),
-        given=given_of(term.slots, ()),
+        given=constants_of(term.slots, ()),
         kernel=kernel_of(system, f"mass_{number}", [term.formula], term.slots, (), "A mass."),
     )

@@ -22,21 +22,26 @@ from dataclasses import replace
 from sympy import Symbol
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.indexed import HeldSteps, LoopedKernel
+from scvi_codegen.ir.indexed import ConstrainedSteps, LoopedKernel
 from scvi_codegen.ir.numbers import lower_vector
-from scvi_codegen.lowering.indexed_kernels import given_of, kernel_of
+from scvi_codegen.lowering.indexed_kernels import constants_of, kernel_of
 from scvi_codegen.lowering.program import comment_text
-from scvi_codegen.mechanics.indexed.constraints import bend_of, constraint_text, held_slots, slopes_of
+from scvi_codegen.mechanics.indexed.constraints import (
+    constraint_gradient,
+    constraint_second_rate,
+    constraint_text,
+    coordinate_accesses,
+)
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["held_steps"]
+__all__ = ["constrained_steps"]
 
 
-def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> HeldSteps:
+def constrained_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
     """Return the kernels and fractions of constrained steps.
 
     Raises:
@@ -49,7 +54,7 @@ def held_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> He
         )
     pairs = list(_kernels(system))
     conditions, bends = (tuple(kernels) for kernels in zip(*pairs, strict=True))
-    return HeldSteps(conditions=conditions, bends=bends, parts=lower_vector(_parts(stages, method)))
+    return ConstrainedSteps(conditions=conditions, bends=bends, parts=lower_vector(_parts(stages, method)))
 
 
 def _parts(stages: StageSystem, method: Method) -> Vector:
@@ -68,20 +73,20 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
 def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
     """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
     for number, term in enumerate(system.constraints):
-        held = held_slots(term, system.coordinates)
+        held = coordinate_accesses(term, system.coordinates)
         u, accesses = [slot for slot, _ in held], tuple(access for _, access in held)
         v = tuple(Symbol(f"{slot.name} along", real=True) for slot in u)
-        *slopes, rate = slopes_of(term, system.coordinates, system.time)
+        *slopes, rate = constraint_gradient(term, system.coordinates, system.time)
         values = [term.formula, rate, *slopes]
         condition = LoopedKernel(
             text=comment_text(constraint_text(term)),
             loops=term.loops,
             slots=accesses,
             targets=accesses,
-            given=given_of(term.slots, u),
+            given=constants_of(term.slots, u),
             kernel=kernel_of(system, f"condition_{number}", values, term.slots, u, "g, g_t, and the derivatives of g."),
         )
         both = [*term.slots, *zip(v, accesses, strict=True)]
-        second = [bend_of(term, system.coordinates, system.time, v)]
+        second = [constraint_second_rate(term, system.coordinates, system.time, v)]
         bend = kernel_of(system, f"bend_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
         yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=bend)

@@ -12,10 +12,10 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 
-__all__ = ["given_of", "kernel_of"]
+__all__ = ["constants_of", "kernel_of"]
 
 
-def given_of(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
+def constants_of(slots: Sequence[tuple[Symbol, Access]], u: Sequence[Symbol]) -> tuple[Access, ...]:
     """Return the entries that are not variables."""
     return tuple(access for slot, access in slots if slot not in u)
 

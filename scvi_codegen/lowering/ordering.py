@@ -32,20 +32,20 @@ def places(pairs: Pairs, count: int) -> tuple[int, ...]:
     >>> places([(0, 2), (1, 2)], 3)
     (2, 0, 1)
     """
-    met = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
-    given = tuple(range(count))
-    if bandwidth(met, given) <= 1 or 2 * len(met) == count * (count - 1):
-        return given
-    found = _cuthill_mckee(met, count)
-    return found if bandwidth(met, found) < bandwidth(met, given) else given
+    coupled = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
+    original = tuple(range(count))
+    if bandwidth(coupled, original) <= 1 or 2 * len(coupled) == count * (count - 1):
+        return original
+    found = _cuthill_mckee(coupled, count)
+    return found if bandwidth(coupled, found) < bandwidth(coupled, original) else original
 
 
-def _cuthill_mckee(met: set[tuple[int, int]], count: int) -> tuple[int, ...]:
+def _cuthill_mckee(coupled: set[tuple[int, int]], count: int) -> tuple[int, ...]:
     # Imported here because SciPy is slow to import and most systems do not need it.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    rows, columns = np.array(sorted(met | {(j, i) for i, j in met})).T
+    rows, columns = np.array(sorted(coupled | {(j, i) for i, j in coupled})).T
     graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
     order = reverse_cuthill_mckee(graph, symmetric_mode=True)
     return tuple(int(place) for place in np.argsort(order))

@@ -9,22 +9,22 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.ir.constraints import Rattle
-from scvi_codegen.ir.families import Family
+from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
-from scvi_codegen.ir.sweep import Sweep
-from scvi_codegen.ir.sweeps import Splitting
+from scvi_codegen.ir.stage_groups import LoweredStageGroup
 from scvi_codegen.lowering.constraints import lowered_constraints
-from scvi_codegen.lowering.families import has_action, lowered_family
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.ordering import bandwidth, places
-from scvi_codegen.lowering.sites import sites_of
 from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
-from scvi_codegen.mechanics.exchanges import exchanges
+from scvi_codegen.lowering.stage_groups import has_action, lowered_stage_group
+from scvi_codegen.lowering.unknown_layout import layout_of
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.work_and_impulse import exchanges
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
@@ -41,7 +41,7 @@ def lower(
     stages: StageSystem,
     *,
     prefix: str,
-    sweep: Sweep | None = None,
+    sweep: FixedPointIteration | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
     rattle: Rattle | None = None,
@@ -53,20 +53,20 @@ def lower(
         system, method: the system and the method.
         stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
-        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.sweep_of`).
+        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.iteration_of`).
         splitting: the explicit solver that replaces both
             (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
         newton: whether Newton's method is included; with it the discrete Legendre transforms.
         rattle: tables of RATTLE, which is tried before Newton's method, if applicable.
         symmetries: whose momentum maps are included.
     """
-    m, sites = system.dimension, sites_of(stages, system.dimension)
+    m, sites = system.dimension, layout_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
-    mass = forms_of(system).legendre_slopes
-    families = tuple(lowered_family(system, family, sites) for family in stages.families) if newton else ()
+    mass = forms_of(system).legendre_jacobian
+    families = tuple(lowered_stage_group(system, family, sites) for family in stages.families) if newton else ()
     constraints = lowered_constraints(system)
-    met = [*mass, *_meetings(families)]
-    order = places(met, sites.count)
+    coupled = [*mass, *_coupled_coordinates(families)]
+    order = places(coupled, sites.count)
     polynomial = method.exactness.curve != 0
     return Program(
         prefix=prefix,
@@ -79,8 +79,8 @@ def lower(
         blocks=len(blocks),
         families=families,
         places=order,
-        mass_places=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
-        bandwidth=bandwidth(met, order),
+        mass_positions=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
+        bandwidth=bandwidth(coupled, order),
         momentum_rows=lower_vector(tuple(row.momentum for row in rows)),
         end_position=lower_vector(stages.end_position.columns([b + 1 for b in sites.columns[m]]).entries[0]),
         straight=tuple(int(block.straight[1]) for block in blocks),
@@ -114,7 +114,7 @@ def lower(
 
 def _momentum_map(symmetry: Symmetry, method: Method) -> MomentumMap:
     name, formula = comment_text(symmetry.name), comment_text(symmetry.formula)
-    return MomentumMap(name=name, formula=formula, exact=method.exactness.keeps(symmetry))
+    return MomentumMap(name=name, formula=formula, exact=method.exactness.conserves(symmetry))
 
 
 def _numbers(system: MechanicalSystem, method: Method, count: int) -> tuple[str, str, str]:
@@ -203,7 +203,7 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
         "legendre",
         forms.legendre,
         of=forms.legendre_arguments,
-        slopes=forms.legendre_slopes.values(),
+        slopes=forms.legendre_jacobian.values(),
         purpose="H_p and H_pp at u = (q, p)."
         if system.auxiliaries
         else "Momenta L_v and mass matrix L_vv at u = (q, v).",
@@ -232,7 +232,7 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
     )
 
 
-def _meetings(families: Sequence[Family]) -> list[tuple[int, int]]:
+def _coupled_coordinates(families: Sequence[LoweredStageGroup]) -> list[tuple[int, int]]:
     """Return the pairs of coordinates with a nonzero derivative."""
     return [pair for family in families for block in family.blocks for pair in block.entries]
 

@@ -11,12 +11,12 @@ from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Constant, IndexedSum, Load
 from scvi_codegen.ir.numbers import exact_number
 from scvi_codegen.ir.program import Program
-from scvi_codegen.mechanics.rolled import Rolled, RolledTerms
+from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
 __all__ = ["with_sums"]
 
 
-def with_sums(program: Program, of: Rolled) -> Program | None:
+def with_sums(program: Program, of: SplitSystem) -> Program | None:
     """Return the program of ``of.rest`` with the forces and the energy of the term groups.
 
     ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
@@ -34,17 +34,17 @@ def with_sums(program: Program, of: Rolled) -> Program | None:
     )
 
 
-def _forces(of: Rolled, family: RolledTerms, number: int) -> IndexedSum:
+def _forces(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:
     return _summed(of, f"pull_{number}", family, family.slopes, ())
 
 
-def _energy(of: Rolled, family: RolledTerms, number: int) -> IndexedSum:
+def _energy(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:
     value = -family.formula if of.rest.auxiliaries else family.formula
     return _summed(of, f"term_{number}", family, (value,), ((0,),) * len(family.places))
 
 
 def _summed(
-    of: Rolled, name: str, family: RolledTerms, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+    of: SplitSystem, name: str, family: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
 ) -> IndexedSum:
     system = of.rest
     places = {parameter: k for k, parameter in enumerate(system.parameters)}

@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = [
-    "along_motion",
     "check_constraints",
+    "constraint_jacobian",
     "constraint_multipliers",
     "constraint_rates",
-    "constraint_slopes",
     "constraints_of",
     "holonomic",
-    "positions_held",
-    "velocities_held",
-    "with_reactions",
+    "holonomic_expressions",
+    "nonholonomic_expressions",
+    "time_derivatives",
+    "with_constraint_forces",
 ]
 
 
@@ -63,8 +63,8 @@ def check_constraints(system: MechanicalSystem) -> None:
                 f"the constraint '{name}' contains no coordinate: constraints are g(q, t) = 0, or A(q, t) "
                 "v + b(q, t) = 0. Remove it, or write the condition in terms of the coordinates"
             )
-    for k, i in jacobian(list(constraint_slopes(system).values()), system.velocities):
-        name = names[list(constraint_slopes(system))[k][0]]
+    for k, i in jacobian(list(constraint_jacobian(system).values()), system.velocities):
+        name = names[list(constraint_jacobian(system))[k][0]]
         raise SystemDefinitionError(
             f"the constraint '{name}' is not linear in the velocity {system.velocities[i]}: "
             "constraints must have the form g(q, t) = 0, or A(q, t) v + b(q, t) = 0"
@@ -85,16 +85,16 @@ def check_constraints(system: MechanicalSystem) -> None:
 
 def _dependent(system: MechanicalSystem) -> int:
     """Return the index of the first constraint dependent on earlier ones at every sampled point, or 0."""
-    slopes, count = constraint_slopes(system), len(system.constraints)
+    derivatives, count = constraint_jacobian(system), len(system.constraints)
     tape, first = None, 0
     for point in sample_points(system.coordinates, (system.time,), system.constants):
-        tape = tape or Tape(list(slopes.values()), list(point))
+        tape = tape or Tape(list(derivatives.values()), list(point))
         try:
             values = tape(list(point.values()))
         except ArithmeticError:
             continue
         matrix = np.zeros((count, system.dimension))
-        for (i, j), value in zip(slopes, values, strict=True):
+        for (i, j), value in zip(derivatives, values, strict=True):
             matrix[i, j] = float(value)
         if row_rank(matrix) == count:
             return 0
@@ -112,41 +112,43 @@ def holonomic(system: MechanicalSystem, g: Expr) -> bool:
     return not g.free_symbols & set(system.velocities)
 
 
-def positions_held(system: MechanicalSystem) -> tuple[Expr, ...]:
+def holonomic_expressions(system: MechanicalSystem) -> tuple[Expr, ...]:
     """Return g of each holonomic constraint, and 0 for each nonholonomic one."""
     return tuple(g if holonomic(system, g) else sympy.S.Zero for g in system.constraints)
 
 
-def velocities_held(system: MechanicalSystem) -> tuple[Expr, ...]:
+def nonholonomic_expressions(system: MechanicalSystem) -> tuple[Expr, ...]:
     """Return A v + b of each nonholonomic constraint, and 0 for each holonomic one."""
     return tuple(sympy.S.Zero if holonomic(system, g) else g for g in system.constraints)
 
 
 def constraint_rates(system: MechanicalSystem) -> tuple[Expr, ...]:
     """Return the velocity form of each constraint: g_q v + g_t, or A v + b."""
-    return tuple(map(sympy.Add, along_motion(system, positions_held(system)), velocities_held(system)))
+    return tuple(
+        map(sympy.Add, time_derivatives(system, holonomic_expressions(system)), nonholonomic_expressions(system))
+    )
 
 
-def constraint_slopes(system: MechanicalSystem) -> dict[tuple[int, int], Expr]:
+def constraint_jacobian(system: MechanicalSystem) -> dict[tuple[int, int], Expr]:
     """Return the non-zero entries of the constraint Jacobian G by (constraint, coordinate)."""
     return jacobian(constraint_rates(system), system.velocities)
 
 
-def along_motion(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[Expr, ...]:
+def time_derivatives(system: MechanicalSystem, functions: Sequence[Expr]) -> tuple[Expr, ...]:
     """Return d/dt of functions of (q, t) along a trajectory, as expressions in (q, v, t); v is held constant."""
     rates = dict(zip(system.coordinates, system.velocities, strict=True)) | {system.time: sympy.S.One}
     variables = tuple(rates)
     found = []
     for function in functions:
-        slopes = gradient(function, variables)
-        found.append(sympy.Add(*(slope * rates[variables[j]] for j, slope in slopes.items())))
+        derivatives = gradient(function, variables)
+        found.append(sympy.Add(*(derivative * rates[variables[j]] for j, derivative in derivatives.items())))
     return tuple(found)
 
 
-def with_reactions(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Expr, ...]:
+def with_constraint_forces(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Expr, ...]:
     """Return the forces plus the constraint forces G^T lambda, m expressions."""
     terms: list[list[Expr]] = [[force] for force in forces]
     factors = constraint_multipliers(system)
-    for (k, i), slope in constraint_slopes(system).items():
-        terms[i].append(slope * factors[k])
+    for (k, i), derivative in constraint_jacobian(system).items():
+        terms[i].append(derivative * factors[k])
     return tuple(sympy.Add(*row) for row in terms)

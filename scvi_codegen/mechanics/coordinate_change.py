@@ -12,13 +12,13 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import DOT, check_names, symbol
-from scvi_codegen.given.kinds import MAPPING, NAMES, of, takes
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.validation.argument_types import MAPPING, NAMES, checks_arguments, of
 
 __all__ = ["change_coordinates"]
 
 
-@takes(system=of("a LagrangianSystem", LagrangianSystem), old=MAPPING, coordinates=NAMES)
+@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), old=MAPPING, coordinates=NAMES)
 def change_coordinates(
     system: LagrangianSystem, old: Mapping[str, str], *, coordinates: Sequence[str]
 ) -> LagrangianSystem:
@@ -78,13 +78,13 @@ def _projected(
     """Return the generalised forces on the new coordinates, f_u = q_u^T f_q (equal virtual work)."""
     forces = [sympy.S.Zero] * len(new) if system.forces else []
     for q, force in zip(system.coordinates, system.forces, strict=False):
-        for i, slope in gradient(positions.get(q, q), new).items():
-            forces[i] += slope * force.xreplace(replaced)
+        for i, derivative in gradient(positions.get(q, q), new).items():
+            forces[i] += derivative * force.xreplace(replaced)
     return tuple(forces)
 
 
 def _rate(position: Expr, variables: tuple[Symbol, ...], time: Symbol) -> Expr:
     """Return the time derivative of ``position`` along a curve of the new coordinates."""
-    slopes = gradient(position, (*variables, time))
+    derivatives = gradient(position, (*variables, time))
     rates = (*(symbol(variable.name + DOT) for variable in variables), sympy.S.One)
-    return sympy.Add(*(slope * rates[i] for i, slope in slopes.items()))
+    return sympy.Add(*(derivative * rates[i] for i, derivative in derivatives.items()))

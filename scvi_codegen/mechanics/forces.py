@@ -22,7 +22,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.symbols import given_name
+from scvi_codegen.formulas.symbols import name_of_key
 
 __all__ = ["dissipative_forces", "forces_by_coordinate"]
 
@@ -43,7 +43,7 @@ def forces_by_coordinate(
     if not isinstance(given, Mapping):
         raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {given!r}")
     names = [q.name for q in coordinates]
-    forces = {given_name(key): value for key, value in given.items()}
+    forces = {name_of_key(key): value for key, value in given.items()}
     for name in forces:
         if name not in names:
             hint = f"{closest(name, names)} Coordinates: {', '.join(names)}"
@@ -54,10 +54,10 @@ def forces_by_coordinate(
 
 def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple[Expr, ...]:
     """Return the forces -dD/dv of Rayleigh's dissipation function D(q, v, t)."""
-    slopes = gradient(dissipation, velocities)
-    if not slopes:
+    derivatives = gradient(dissipation, velocities)
+    if not derivatives:
         raise SystemDefinitionError(
             f"the dissipation {dissipation} contains no velocity: Rayleigh's function D(q, v) defines "
             "the forces -dD/dv. Add velocities, or remove it"
         )
-    return tuple(-slopes.get(i, sympy.S.Zero) for i in range(len(velocities)))
+    return tuple(-derivatives.get(i, sympy.S.Zero) for i in range(len(velocities)))

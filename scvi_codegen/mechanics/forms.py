@@ -57,16 +57,16 @@ class Forms:
     @cached_property
     def momentum(self) -> tuple[Expr, ...]:
         """P = L_v, m expressions."""
-        return self._slopes(self.system.lagrangian, self.system.velocities)
+        return self._gradient_tuple(self.system.lagrangian, self.system.velocities)
 
     @cached_property
     def force(self) -> tuple[Expr, ...]:
         """L_q plus the generalised forces, m expressions."""
-        slopes = self._slopes(self.system.lagrangian, self.system.coordinates)
+        slopes = self._gradient_tuple(self.system.lagrangian, self.system.coordinates)
         return tuple(map(sympy.Add, slopes, self.system.forces)) if self.system.forces else slopes
 
     @cached_property
-    def thrust(self) -> tuple[Expr, ...]:
+    def momentum_rate(self) -> tuple[Expr, ...]:
         """Rate of change of the momenta, m expressions: :attr:`force` minus the damping gamma p."""
         if self.system.damping == 0:
             return self.force
@@ -85,7 +85,7 @@ class Forms:
     @cached_property
     def constitutive(self) -> tuple[Expr, ...]:
         """Constitutive residual L_p = v - H_p, m expressions (paper (35f)); empty for a Lagrangian."""
-        return self._slopes(self.system.lagrangian, self.system.auxiliaries)
+        return self._gradient_tuple(self.system.lagrangian, self.system.auxiliaries)
 
     @cached_property
     def legendre_arguments(self) -> tuple[Symbol, ...]:
@@ -97,10 +97,10 @@ class Forms:
         """Legendre transform in closed form, m expressions: p = L_v at (q, v), or v = H_p at (q, p)."""
         if not self.system.auxiliaries:
             return self.momentum
-        return self._slopes(self.system.formula, self.system.auxiliaries)
+        return self._gradient_tuple(self.system.formula, self.system.auxiliaries)
 
     @cached_property
-    def legendre_slopes(self) -> Entries:
+    def legendre_jacobian(self) -> Entries:
         """Jacobian of ``legendre``: L_vv, or H_pp."""
         return jacobian(self.legendre, self.system.auxiliaries) if self.system.auxiliaries else self.mass
 
@@ -120,10 +120,12 @@ class Forms:
         """
         system = self.system
         variables = (*system.velocities, *system.coordinates, system.time, *system.auxiliaries)
-        rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.thrust)
+        rates = (*accelerations(system), *system.velocities, sympy.S.One, *self.momentum_rate)
         if system.auxiliaries:
             return _along(self.constitutive, variables, rates)
-        return tuple(rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.thrust, strict=True))
+        return tuple(
+            rate - f for rate, f in zip(_along(self.momentum, variables, rates), self.momentum_rate, strict=True)
+        )
 
     @cached_property
     def applied_force(self) -> tuple[Expr, ...]:
@@ -162,10 +164,10 @@ class Forms:
         by_velocity = _along(system.forces, system.velocities, factors)
         variables = (*system.velocities, *system.coordinates, system.time)
         rates = (*accelerations(system), *system.velocities, sympy.S.One)
-        swept = _along(by_velocity, variables, rates)
+        rates_by_velocity = _along(by_velocity, variables, rates)
         still = (sympy.S.Zero,) * m
         return (
-            tuple(x - y for x, y in zip(swept, by_position, strict=True)),
+            tuple(x - y for x, y in zip(rates_by_velocity, by_position, strict=True)),
             by_velocity,
             still,
             tuple(-f for f in system.forces),
@@ -212,7 +214,7 @@ class Forms:
         return tuple(found[1:])
 
     @staticmethod
-    def _slopes(scalar: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+    def _gradient_tuple(scalar: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
         slopes = gradient(scalar, variables)
         return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))
 

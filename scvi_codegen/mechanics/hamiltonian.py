@@ -15,14 +15,12 @@ from typing import Any
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.symbols import TIME, check_names, given_name, number, symbol
-from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.given.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, of, takes
+from scvi_codegen.formulas.symbols import TIME, check_names, name_of_key, number, symbol
+from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
@@ -31,8 +29,20 @@ from scvi_codegen.mechanics.legendre import legendre_dual
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import (
+    FORMULA,
+    FORMULAS,
+    MAPPED,
+    MAPPING,
+    NAMES,
+    TEXT,
+    TEXTS,
+    checks_arguments,
+    of,
+)
 
-__all__ = ["HamiltonianSystem", "hamiltonian_of", "lagrangian_of", "lagrangian_twin"]
+__all__ = ["HamiltonianSystem", "equivalent_lagrangian", "hamiltonian_of", "lagrangian_of"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +81,7 @@ class HamiltonianSystem(MechanicalSystem):
         self._check("Hamiltonian", self.momenta, "a momentum")
 
     @classmethod
-    @takes(
+    @checks_arguments(
         SystemDefinitionError,
         name=TEXT,
         coordinates=NAMES,
@@ -142,7 +152,7 @@ class HamiltonianSystem(MechanicalSystem):
         return system
 
     @classmethod
-    @takes(
+    @checks_arguments(
         SystemDefinitionError,
         name=TEXT,
         coordinates=FORMULAS,
@@ -179,10 +189,10 @@ class HamiltonianSystem(MechanicalSystem):
             damping: damping rate of all momenta, an expression in parameters.
             inputs: functions of time, symbols or names whose values are passed to each run.
         """
-        hamiltonian = given_expression(hamiltonian, "Hamiltonian")
-        acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
-        rate = damping_rate(damping, lambda given: given_expression(given, "damping"))
-        own = tuple(given_name(each) for each in inputs)
+        hamiltonian = sympy_expression(hamiltonian, "Hamiltonian")
+        acting = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        rate = damping_rate(damping, lambda given: sympy_expression(given, "damping"))
+        own = tuple(name_of_key(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
         translation = Translation(
             hamiltonian,
@@ -238,7 +248,7 @@ class HamiltonianSystem(MechanicalSystem):
         return rf"$\displaystyle H = {sympy.latex(self.hamiltonian)}$"
 
 
-@takes(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
+@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
 def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
     """Return the Hamiltonian p . v - L of a Lagrangian, with v eliminated by p = dL/dv (paper, section 1.1).
 
@@ -266,7 +276,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
         )
     symbols = tuple(symbol(name) for name in names)
     hamiltonian = legendre_dual(system, system.velocities, symbols)
-    velocities = dict(zip(system.velocities, _slopes(hamiltonian, symbols), strict=True))
+    velocities = dict(zip(system.velocities, _gradient_tuple(hamiltonian, symbols), strict=True))
     return HamiltonianSystem(
         name=system.name,
         coordinates=system.coordinates,
@@ -282,7 +292,7 @@ def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = 
     )
 
 
-@takes(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
+@checks_arguments(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
 def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ()) -> LagrangianSystem:
     """Return the Lagrangian p . v - H of a Hamiltonian, with p eliminated by v = dH/dp (paper, section 1.1).
 
@@ -318,7 +328,7 @@ def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
             "Lagrangian: use the Hamiltonian, or a formula in coordinates only"
         )
     lagrangian = legendre_dual(system, system.momenta, system.velocities)
-    momenta = dict(zip(system.momenta, _slopes(lagrangian, system.velocities), strict=True))
+    momenta = dict(zip(system.momenta, _gradient_tuple(lagrangian, system.velocities), strict=True))
     return LagrangianSystem(
         name=system.name,
         coordinates=system.coordinates,
@@ -333,15 +343,15 @@ def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
     )
 
 
-def lagrangian_twin(system: MechanicalSystem) -> LagrangianSystem | None:
+def equivalent_lagrangian(system: MechanicalSystem) -> LagrangianSystem | None:
     """Return an equivalent Lagrangian system, possibly ``system`` itself; ``None`` if none is found."""
     if isinstance(system, LagrangianSystem):
         return system
-    return _twin(system) if isinstance(system, HamiltonianSystem) else None
+    return _equivalent_lagrangian(system) if isinstance(system, HamiltonianSystem) else None
 
 
 @lru_cache(maxsize=64)
-def _twin(system: HamiltonianSystem) -> LagrangianSystem | None:
+def _equivalent_lagrangian(system: HamiltonianSystem) -> LagrangianSystem | None:
     try:
         return _lagrangian_of(system)
     except SystemDefinitionError:
@@ -358,6 +368,6 @@ def _default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"p_{name}" for name in coordinates)
 
 
-def _slopes(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+def _gradient_tuple(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
     slopes = gradient(f, variables)
     return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))

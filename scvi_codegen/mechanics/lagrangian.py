@@ -9,29 +9,39 @@ from typing import TYPE_CHECKING, Any
 import sympy
 from sympy import Expr, Symbol
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
-from scvi_codegen.formulas.translation import Translation, given_expression
-from scvi_codegen.given.kinds import FORMULA, FORMULAS, MAPPED, MAPPING, NAMES, TEXT, TEXTS, Kind, takes
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
+from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import (
+    FORMULA,
+    FORMULAS,
+    MAPPED,
+    MAPPING,
+    NAMES,
+    TEXT,
+    TEXTS,
+    ArgumentType,
+    checks_arguments,
+)
 
 if TYPE_CHECKING:
     from sympy.physics.mechanics import KanesMethod, LagrangesMethod, System
 
 __all__ = ["LagrangianSystem"]
 
-LAGRANGES_METHOD = Kind("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
-KANES_METHOD = Kind("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
-BODIES = Kind("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
+LAGRANGES_METHOD = ArgumentType("a LagrangesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "lam_vec"))
+KANES_METHOD = ArgumentType("a KanesMethod of sympy.physics.mechanics", lambda value: hasattr(value, "kindiffdict"))
+BODIES = ArgumentType("a System of sympy.physics.mechanics", lambda value: hasattr(value, "actuators"))
 
 REQUIRED = "A regular Lagrangian is required: d2L/dv2 must be invertible."
 REDUNDANT = (
@@ -78,7 +88,7 @@ class LagrangianSystem(MechanicalSystem):
         return self.lagrangian
 
     @classmethod
-    @takes(
+    @checks_arguments(
         SystemDefinitionError,
         name=TEXT,
         coordinates=NAMES,
@@ -152,7 +162,7 @@ class LagrangianSystem(MechanicalSystem):
         return system
 
     @classmethod
-    @takes(
+    @checks_arguments(
         SystemDefinitionError,
         name=TEXT,
         coordinates=FORMULAS,
@@ -196,12 +206,12 @@ class LagrangianSystem(MechanicalSystem):
             constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
             inputs: functions of time, symbols or names whose values are passed to each run.
         """
-        lagrangian = given_expression(lagrangian, "Lagrangian")
-        acting = {q: given_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
-        friction = None if dissipation is None else given_expression(dissipation, "dissipation")
-        rate = damping_rate(damping, lambda given: given_expression(given, "damping"))
-        bound = constraints_of(constraints, lambda g: given_expression(g, "constraint"))
-        own = tuple(given_name(each) for each in inputs)
+        lagrangian = sympy_expression(lagrangian, "Lagrangian")
+        acting = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
+        rate = damping_rate(damping, lambda given: sympy_expression(given, "damping"))
+        bound = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
+        own = tuple(name_of_key(each) for each in inputs)
         given = with_inputs(named_parameters(parameters), own)
         beside = (*acting.values(), *(() if friction is None else (friction,)), rate, *bound)
         translation = Translation(
@@ -233,7 +243,7 @@ class LagrangianSystem(MechanicalSystem):
         return system
 
     @classmethod
-    @takes(SystemDefinitionError, method=LAGRANGES_METHOD)
+    @checks_arguments(SystemDefinitionError, method=LAGRANGES_METHOD)
     def from_lagranges_method(
         cls,
         method: LagrangesMethod,
@@ -264,7 +274,7 @@ class LagrangianSystem(MechanicalSystem):
         )
 
     @classmethod
-    @takes(SystemDefinitionError, method=KANES_METHOD)
+    @checks_arguments(SystemDefinitionError, method=KANES_METHOD)
     def from_kanes_method(
         cls,
         method: KanesMethod,
@@ -297,7 +307,7 @@ class LagrangianSystem(MechanicalSystem):
         return cls.from_sympy(name=name, parameters=parameters, inputs=inputs, **of_kanes_method(method).formulas())
 
     @classmethod
-    @takes(SystemDefinitionError, system=BODIES)
+    @checks_arguments(SystemDefinitionError, system=BODIES)
     def from_system(
         cls,
         system: System,
@@ -345,7 +355,7 @@ def _check_velocities(system: LagrangianSystem) -> None:
     free = system.lagrangian.free_symbols
     missing = tuple(velocity for velocity in system.velocities if velocity not in free)
     if missing:
-        raise SystemDefinitionError(_without_kinetic_energy(system, missing, "does not occur in the Lagrangian"))
+        raise SystemDefinitionError(_degenerate_message(system, missing, "does not occur in the Lagrangian"))
 
 
 def _check_mass_matrix(system: LagrangianSystem) -> None:
@@ -356,7 +366,7 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
     velocities, block = found
     names = ", ".join(velocity.name for velocity in velocities)
     if velocities and not block:
-        raise SystemDefinitionError(_without_kinetic_energy(system, velocities, "occurs only linearly in L"))
+        raise SystemDefinitionError(_degenerate_message(system, velocities, "occurs only linearly in L"))
     subject = f"the mass matrix d2L/dv2 of '{system.name}'"
     if not block:
         raise SystemDefinitionError(
@@ -375,7 +385,7 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
     )
 
 
-def _without_kinetic_energy(system: LagrangianSystem, velocities: Sequence[Symbol], how: str) -> str:
+def _degenerate_message(system: LagrangianSystem, velocities: Sequence[Symbol], how: str) -> str:
     """Return the error message for coordinates whose velocities occur at most linearly in L."""
     names = [velocity.name[: -len(DOT)] for velocity in velocities]
     if not hessian(system.lagrangian, system.velocities):

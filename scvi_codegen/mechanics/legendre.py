@@ -26,14 +26,16 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
     """Return the Legendre transform x . y - f(x), where y = df/dx is solved for x; f is the system's formula."""
     # f = f0 + b . x + x . C x / 2 has the transform (y - b) . C^-1 (y - b) / 2 - f0, block by block.
     f = system.formula
-    curvature = hessian(f, variables)
+    hessian_entries = hessian(f, variables)
     origin = dict.fromkeys(variables, sympy.S.Zero)
-    slopes = gradient(f, variables)
-    if all(not (entry.free_symbols & set(variables)) for entry in curvature.values()):
-        shifted = [y - slopes[i].xreplace(origin) for i, y in enumerate(duals)]
-        forms = [_inverse_form(curvature, block, shifted) for block in coupled_blocks(curvature, len(variables))]
+    derivatives = gradient(f, variables)
+    if all(not (entry.free_symbols & set(variables)) for entry in hessian_entries.values()):
+        shifted = [y - derivatives[i].xreplace(origin) for i, y in enumerate(duals)]
+        forms = [
+            _inverse_form(hessian_entries, block, shifted) for block in coupled_blocks(hessian_entries, len(variables))
+        ]
         return sympy.Add(*forms, -f.xreplace(origin))
-    solution = {x: _inverse_slope(system, slopes[i], x, duals[i], variables) for i, x in enumerate(variables)}
+    solution = {x: _inverse_derivative(system, derivatives[i], x, duals[i], variables) for i, x in enumerate(variables)}
     still, moving = f.as_independent(*variables, as_Add=True)
     dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
     positive = positive_parameters(system)
@@ -45,11 +47,11 @@ def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
 
 
-def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
+def _inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
     """Return y . C^-1 y / 2 over one block."""
     if len(block) == 1:
         (i,) = block
-        return y[i] ** 2 / (2 * curvature[i, i])
+        return y[i] ** 2 / (2 * hessian_entries[i, i])
     if len(block) > LARGEST_INVERSE:
         raise SystemDefinitionError(
             f"the Legendre transform couples {len(block)} variables, more than are inverted "
@@ -57,27 +59,29 @@ def _inverse_form(curvature: Mapping[tuple[int, int], Expr], block: Sequence[int
             "as it is"
         )
     size = len(block)
-    matrix = sympy.Matrix(size, size, lambda a, b: curvature.get((block[a], block[b]), 0))
+    matrix = sympy.Matrix(size, size, lambda a, b: hessian_entries.get((block[a], block[b]), 0))
     adjugate, determinant = matrix.adjugate(), matrix.det(method="berkowitz")
     terms = [adjugate[a, b] * y[i] * y[j] for a, i in enumerate(block) for b, j in enumerate(block)]
     return sympy.Add(*terms) / (2 * determinant)
 
 
-def _inverse_slope(system: MechanicalSystem, slope: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]) -> Expr:
+def _inverse_derivative(
+    system: MechanicalSystem, derivative: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]
+) -> Expr:
     """Return the x with y = slope(x), whose branch is checked at random points near the default parameters."""
-    if slope.free_symbols & (set(variables) - {x}):
+    if derivative.free_symbols & (set(variables) - {x}):
         raise SystemDefinitionError(
             f"the Legendre transform of '{system.name}' requires the solution of coupled nonlinear "
             "equations. Define the other function yourself, or use the system as it is"
         )
     positive = positive_parameters(system)
     back = {dummy: symbol for symbol, dummy in positive.items()}
-    for root in _roots(slope.xreplace(positive) - y, x):
+    for root in _roots(derivative.xreplace(positive) - y, x):
         found = root.xreplace(back)
-        if unsupported_part(found) is None and _holds(system, found, slope, x, y):
+        if unsupported_part(found) is None and _is_inverse(system, found, derivative, x, y):
             return found
     raise SystemDefinitionError(
-        f"SymPy does not solve {y} = {slope} for {x}, as the Legendre transform requires: define the "
+        f"SymPy does not solve {y} = {derivative} for {x}, as the Legendre transform requires: define the "
         "other function yourself"
     )
 
@@ -90,11 +94,11 @@ def _roots(expression: Expr, x: Symbol) -> list[Expr]:
         return []
 
 
-def _holds(system: MechanicalSystem, root: Expr, slope: Expr, x: Symbol, y: Symbol) -> bool:
+def _is_inverse(system: MechanicalSystem, root: Expr, derivative: Expr, x: Symbol, y: Symbol) -> bool:
     tried = 0
     for point in sample_points([x], (*system.coordinates, system.time), system.constants):
         try:
-            value = evaluate(slope, point)
+            value = evaluate(derivative, point)
             again = evaluate(root, point | {y: value})
         except ArithmeticError:
             continue

@@ -1,6 +1,6 @@
 """Time transformation (Poincare): a fixed step size in fictitious time tau, a varying one in t, and a symplectic map.
 
-With dt = g dtau, where g > 0 (:mod:`scvi_codegen.mechanics.monitors`), Poincare's transformation K = g (H - E) of an
+With dt = g dtau, g > 0 (:mod:`scvi_codegen.mechanics.time_rescaling`), Poincare's transformation K = g (H - E) of an
 autonomous Hamiltonian has the same orbits on the energy surface K = 0, that is H = E, parametrised by tau. If g
 depends on the coordinates only, its Lagrangian is
 
@@ -26,12 +26,12 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.given.kinds import takes
-from scvi_codegen.mechanics.constraints import velocities_held
+from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.monitors import monitor_function
-from scvi_codegen.mechanics.system import SYSTEM, Clock, MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem, TimeTransformation
+from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
+from scvi_codegen.validation.argument_types import checks_arguments
 
 __all__ = ["CONTROLLERS", "reparametrise", "with_monitor"]
 
@@ -43,7 +43,7 @@ ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 REVERSIBLE = 'the reversible controller: compile_stepper(..., monitor=...), controller = "reversible" in [run]'
 
 
-@takes(system=SYSTEM)
+@checks_arguments(system=SYSTEM)
 def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
     """Return the system in a fictitious time tau with dt = g dtau; holonomic constraints are unchanged.
 
@@ -79,30 +79,30 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"{acting} on '{system.name}', so its energy is not conserved, which the symplectic time "
             f"transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    if any(velocities_held(system)):
+    if any(nonholonomic_expressions(system)):
         raise SystemDefinitionError(
             f"'{system.name}' has nonholonomic constraints, which a symplectic time transformation "
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
-    level = _free_symbol(system)
-    rate = monitor_function(system, monitor)
+    energy_symbol = _free_symbol(system)
+    rate = time_rescaling_function(system, monitor)
     named = replace(
         system,
         name=f"{system.name} in transformed time",
-        parameters=(*system.parameters, level),
+        parameters=(*system.parameters, energy_symbol),
         defaults=(*system.defaults, 0.0),
-        clock=Clock(
+        clock=TimeTransformation(
             rate=rate,
-            energy=level,
+            energy=energy_symbol,
             monitor=monitor if isinstance(monitor, str) else format_expression(rate),
             plain=system,
         ),
     )
     if isinstance(named, HamiltonianSystem):
-        return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - level))
+        return replace(named, hamiltonian=_distributed(rate, named.hamiltonian - energy_symbol))
     assert isinstance(named, LagrangianSystem)
     slowed = named.lagrangian.xreplace({v: v / rate for v in named.velocities})
-    return replace(named, lagrangian=_distributed(rate, slowed + level))
+    return replace(named, lagrangian=_distributed(rate, slowed + energy_symbol))
 
 
 def with_monitor(
@@ -135,7 +135,7 @@ def with_monitor(
             f"'{system.name}' has a time transformation already, which controls its steps: leave out "
             "the reversible controller, or use the system without the transformation"
         )
-    monitor_function(system, monitor, in_time=True)  # validated here rather than at the first step
+    time_rescaling_function(system, monitor, in_time=True)  # validated here rather than at the first step
     return system, monitor
 
 

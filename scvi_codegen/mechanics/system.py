@@ -13,7 +13,7 @@ A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem
 and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
 use nothing else, and expressions derived from them only through :func:`~scvi_codegen.mechanics.forms.forms_of`.
 Matrix-free solvers also use an equivalent Lagrangian, if one is known
-(:func:`~scvi_codegen.mechanics.hamiltonian.lagrangian_twin`).
+(:func:`~scvi_codegen.mechanics.hamiltonian.equivalent_lagrangian`).
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.inputs import inputs_by_name
-from scvi_codegen.formulas.parts import key_of
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, given_name, number, symbol
+from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.writing import format_expression
-from scvi_codegen.given.kinds import of
 from scvi_codegen.mechanics.damping import check_damping
+from scvi_codegen.validation.argument_types import of
 
-__all__ = ["SYSTEM", "Clock", "MechanicalSystem", "named_parameters"]
+__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "named_parameters"]
 
-MOST_OPERATIONS = 200
+MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Clock:
+class TimeTransformation:
     """Time transformation dt = g dtau of a system that moves in fictitious time tau (:func:`reparametrise`).
 
     Attributes:
@@ -86,7 +86,7 @@ class MechanicalSystem(ABC):
     time: Symbol
     parameters: tuple[Symbol, ...]
     defaults: tuple[float, ...]
-    clock: Clock | None = None
+    clock: TimeTransformation | None = None
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
@@ -185,7 +185,7 @@ class MechanicalSystem(ABC):
     def _repr_html_(self) -> str:
         letter = "H" if self.auxiliaries else "L"
         size = sympy.count_ops(self.formula)
-        formula = mathml_terms(self.formula, Symbol(letter)) if size <= MOST_OPERATIONS else ()
+        formula = mathml_terms(self.formula, Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
         return card(
@@ -267,11 +267,11 @@ def _free(name: str, taken: set[str]) -> str:
 
 def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:
     """Return default values by name, for keys that are symbols or names."""
-    given = {given_name(key): value for key, value in (parameters or {}).items()}
+    given = {name_of_key(key): value for key, value in (parameters or {}).items()}
     if len(given) < len(parameters or {}):
         raise SystemDefinitionError("two parameters have the same name: rename one of them")
     return given
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem (an IndexedSystem goes to compile_indexed)", MechanicalSystem)
-"""Type check of mechanical systems, for :func:`~scvi_codegen.given.kinds.takes`."""
+"""Type check of mechanical systems, for :func:`~scvi_codegen.validation.argument_types.takes`."""

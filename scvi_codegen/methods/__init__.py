@@ -7,7 +7,6 @@ from inspect import Parameter, signature
 from typing import Any, Final
 
 from scvi_codegen.errors import MethodError, closest
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.methods.composition import Composition
@@ -27,6 +26,7 @@ from scvi_codegen.methods.runge_kutta import (
 )
 from scvi_codegen.methods.shooting import SCVI
 from scvi_codegen.methods.stoermer_verlet import StoermerVerlet
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "METHODS",

@@ -10,9 +10,9 @@ from scvi_codegen.methods.shapes import Accelerations
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
-    PointFamily,
     Row,
     Scatter,
+    StageGroup,
     StageSystem,
     Table,
 )
@@ -29,7 +29,7 @@ __all__ = [
     "acceleration_gathers",
     "acceleration_unknowns",
     "position_system",
-    "residual_family",
+    "residual_group",
     "single_point",
 ]
 
@@ -51,7 +51,7 @@ def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     start_table = Table.joined(minus, none, minus)
     end_table = Table.joined(Table.constant(1, 1), none, ones)
     inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
-    collocation = residual_family(
+    collocation = residual_group(
         system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
     )
     return StageSystem(
@@ -73,15 +73,15 @@ def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     )
 
 
-def residual_family(
+def residual_group(
     system: MechanicalSystem,
     abscissae: Vector,
     gathers: tuple[Gather, ...],
     residual: Scatter,
     *others: Scatter,
-) -> PointFamily:
+) -> StageGroup:
     """Return collocation nodes of weight 1 with the Euler-Lagrange residual as kernel, scattered by ``residual``."""
-    return PointFamily(
+    return StageGroup(
         name="node",
         abscissae=abscissae,
         weights=(mp.one,) * len(abscissae),
@@ -132,11 +132,11 @@ def acceleration_extrapolation(tableau: Tableau) -> Matrix:
 
 def single_point(
     system: MechanicalSystem, name: str, abscissa: Number, position: Table, *, velocity_block: int = 0
-) -> PointFamily:
+) -> StageGroup:
     """Return a single point whose velocity is the block ``velocity_block``; the caller adds the scatters."""
     columns = len(position.entries[0])
     velocity = Table.named("", [[int(b == velocity_block + 1) for b in range(columns)]])
-    return PointFamily(
+    return StageGroup(
         name=name,
         abscissae=(abscissa,),
         weights=(mp.one,),

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.display.summary import summary
 from scvi_codegen.mechanics.forms import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.acceleration_stages import VELOCITY_BLOCK, position_system, residual_family, single_point
+from scvi_codegen.methods.acceleration_stages import VELOCITY_BLOCK, position_system, residual_group, single_point
 from scvi_codegen.methods.choices import resolve_nodes
 from scvi_codegen.methods.galerkin_stages import position_block
 from scvi_codegen.methods.method import Method, Specification, degree_count
@@ -26,6 +25,7 @@ from scvi_codegen.methods.stage_system import (
     StageSystem,
     Table,
 )
+from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
 from scvi_codegen.tables.basis import (
     differentiation_matrix,
@@ -125,7 +125,7 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     size = nodes.degree
     momenta = forms_of(system).momentum
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
-    family = residual_family(
+    family = residual_group(
         system,
         nodes.abscissae[1:],
         nodal_gathers(system, nodes),
@@ -166,7 +166,7 @@ def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int =
     inner = tuple(line[1:] for line in full)
     zeros = Table.constant(size, 1)
     padding = Table.constant(size, other_blocks)
-    slope = Table.named("D", full, column=0)
+    derivative = Table.named("D", full, column=0)
     acceleration = Table.joined(
         Table.named("DD", matrix_product(inner, first), column=0),
         Table.named("DD", matrix_product(inner, inner)),
@@ -183,7 +183,7 @@ def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int =
         ),
         Gather(
             arguments=system.velocities,
-            table=Table.joined(slope, zeros, padding),
+            table=Table.joined(derivative, zeros, padding),
             power=-1,
             scale=Fraction(2),
         ),

@@ -13,17 +13,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.method import Method, Specification
-from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "DRIFT_KICK_DRIFT",
@@ -177,7 +177,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     Raises:
         MethodError: for a system that is not separable.
     """
-    twin = lagrangian_twin(system)
+    twin = equivalent_lagrangian(system)
     if twin is not None and forms_of(twin).separable:
         system = twin
     elif not forms_of(system).split:
@@ -191,7 +191,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     return StageSystem(
         blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k, _ in enumerate(moving, start=1)),
         rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k, _ in enumerate(moving, start=1)),
-        families=(_kick_family(system, kicks, drifts), _drift_family(system, drifts)),
+        families=(_kick_group(system, kicks, drifts), _drift_group(system, drifts)),
         end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (tuple(drifts[k] for k in moving),))),
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),
@@ -199,12 +199,12 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     )
 
 
-def _kick_family(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> PointFamily:
+def _kick_group(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> StageGroup:
     """Return L_q at the positions before, between and after the drifts, added to all later velocities (kicks)."""
     points, moving = ([k for k, x in enumerate(each) if x] for each in (kicks, drifts))
     drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
     before = tuple(tuple(int(n <= k) for k in moving) for n in points)
-    return PointFamily(
+    return StageGroup(
         name="kick",
         abscissae=tuple(mp.fsum(line) for line in drifted),
         weights=tuple(kicks[n] for n in points),
@@ -226,11 +226,11 @@ def _kick_family(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> Poi
     )
 
 
-def _drift_family(system: MechanicalSystem, drifts: Vector) -> PointFamily:
+def _drift_group(system: MechanicalSystem, drifts: Vector) -> StageGroup:
     """Return L_v at the velocity of each drift, which is its momentum."""
     moving = [k for k, x in enumerate(drifts) if x]
     size = len(moving)
-    return PointFamily(
+    return StageGroup(
         name="drift",
         abscissae=tuple(mp.fsum(drifts[:k]) for k in moving),
         weights=(mp.one,) * size,

@@ -36,14 +36,14 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.constraints import (
     constraint_multipliers,
     constraint_rates,
-    positions_held,
-    velocities_held,
-    with_reactions,
+    holonomic_expressions,
+    nonholonomic_expressions,
+    with_constraint_forces,
 )
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shapes import Velocities
-from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre
@@ -81,7 +81,11 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
             Row(number="end", kind="stage", momentum=-stages.end_momentum),
             *(Row(number=number, kind=kind, momentum=mp.zero, size=count) for number, kind in conditions),
         ),
-        families=(_held(system, family), *_rolling(system, stages, family), _end(system, stages, points)),
+        families=(
+            _with_multipliers(system, family),
+            *_velocity_conditions(system, stages, family),
+            _end(system, stages, points),
+        ),
         end_position=Table.joined(stages.end_position, Table.constant(1, 1 + points)),
         extrapolation=stages.extrapolation and _extrapolation(stages, family.abscissae),
     )
@@ -90,7 +94,7 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
 def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
     family, s = stages.families[0], len(stages.blocks)
     ends = (family.abscissae[0], family.abscissae[-1]) == (0, 1)
-    if any(velocities_held(system)) and ends and not _is_polynomial(family):
+    if any(nonholonomic_expressions(system)) and ends and not _is_polynomial(family):
         raise MethodError(
             f"{name} does not support the nonholonomic constraints of '{system.name}', because its curves "
             "are not polynomials: use an SVI with polynomials"
@@ -104,7 +108,7 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
     )
 
 
-def _is_polynomial(family: PointFamily) -> bool:
+def _is_polynomial(family: StageGroup) -> bool:
     """Return whether the velocity at the last point is interpolated by the others, as for a polynomial of degree s."""
     velocities, points = family.gathers[1].table.entries, family.abscissae
     others = Table(entries=velocities[:-1], names=family.gathers[1].table.names[:-1])
@@ -112,7 +116,7 @@ def _is_polynomial(family: PointFamily) -> bool:
     return all(abs(x - y) < SAME for x, y in zip(last, velocities[-1], strict=True))
 
 
-def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
+def _with_multipliers(system: MechanicalSystem, family: StageGroup) -> StageGroup:
     """Return the quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
     assert family.scalar is not None
     points, factors = len(family.abscissae), constraint_multipliers(system)
@@ -122,12 +126,12 @@ def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
     place = Table.joined(Table.constant(points, columns), one, Table.identity(points))
     gathers.append(Gather(arguments=factors, table=place, power=-1))
     scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in family.scatters]
-    scatters[0] = replace(scatters[0], results=with_reactions(system, scatters[0].results))
+    scatters[0] = replace(scatters[0], results=with_constraint_forces(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
-    held = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
-    positions = positions_held(system)
+    conditions_table = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
+    positions = holonomic_expressions(system)
     if any(positions):
-        scatters.append(Scatter(results=positions, table=held, power=-1, scale=scatters[0].scale))
+        scatters.append(Scatter(results=positions, table=conditions_table, power=-1, scale=scatters[0].scale))
     products = [factor * g for factor, g in zip(factors, positions, strict=True)]
     return replace(
         family,
@@ -135,14 +139,14 @@ def _held(system: MechanicalSystem, family: PointFamily) -> PointFamily:
         scatters=tuple(scatters),
         scalar=sympy.Add(family.scalar, *products),
         computes="L_q + G^T lambda, L_v and g",
-        forced=family.forced or any(velocities_held(system)),
+        forced=family.forced or any(nonholonomic_expressions(system)),
     )
 
 
-def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> tuple[PointFamily, ...]:
+def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, family: StageGroup) -> tuple[StageGroup, ...]:
     """Return the nonholonomic constraints at s Gauss points; empty if there are none."""
-    held, size, rows = velocities_held(system), len(stages.blocks), len(stages.rows)
-    if not any(held):
+    conditions_table, size, rows = nonholonomic_expressions(system), len(stages.blocks), len(stages.rows)
+    if not any(conditions_table):
         return ()
     points, gauss = len(family.abscissae), gauss_legendre(size)
     between = cardinal_values([2 * c - 1 for c in family.abscissae], gauss.points)
@@ -155,13 +159,13 @@ def _rolling(system: MechanicalSystem, stages: StageSystem, family: PointFamily)
     conditions = [[int(row == n) for row in range(size)] for n in range(size)]
     place = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))
     return (
-        PointFamily(
+        StageGroup(
             name="rolling",
             abscissae=gauss.abscissae,
             weights=(mp.one,) * size,
             weight_names=("",) * size,
             gathers=tuple(gathers),
-            scatters=(Scatter(results=held, table=place, power=0),),
+            scatters=(Scatter(results=conditions_table, table=place, power=0),),
             computes="Velocity constraints",
         ),
     )
@@ -184,13 +188,13 @@ def _with_end(table: Table, rows: int, points: int) -> Table:
     return Table.joined(table.columns(range(rows)), negative, Table.constant(len(table.entries), points), last)
 
 
-def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> PointFamily:
+def _end(system: MechanicalSystem, stages: StageSystem, points: int) -> StageGroup:
     """Return L_v(q1, v) and the rates of the constraints at the end of the step."""
     size, rows = len(stages.blocks), len(stages.rows)
     others, column = Table.constant(1, 1 + points), [[0] * (1 + size) + [1] + [0] * points]
     momentum = [[0] * rows + [1] + [0] * (points + 1)]
     hidden = [[0] * (rows + points) + [1, 0]]
-    return PointFamily(
+    return StageGroup(
         name="end",
         abscissae=(mp.one,),
         weights=(mp.one,),

@@ -31,7 +31,7 @@ class Exactness:
     quadrature: int = -1
     gauge: float = math.inf
 
-    def keeps(self, symmetry: Symmetry) -> bool:
+    def conserves(self, symmetry: Symmetry) -> bool:
         """Return whether the momentum map of a symmetry is conserved exactly."""
         terms = symmetry.degrees()
         if terms is None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import (
@@ -25,13 +24,14 @@ from scvi_codegen.methods.choices import (
     resolve_space,
 )
 from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.galerkin_stages import galerkin_system, nodal_quadrature_family, position_block
+from scvi_codegen.methods.galerkin_stages import galerkin_system, nodal_quadrature_group, position_block
 from scvi_codegen.methods.method import Method, Specification, degree_count
 from scvi_codegen.methods.stage_system import (
     Row,
     StageSystem,
     stationary_nodal,
 )
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import mp
@@ -209,7 +209,7 @@ class SVI(Method):
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
         return stationary_nodal(
-            families=(nodal_quadrature_family(system, self.node_set, self.rule),),
+            families=(nodal_quadrature_group(system, self.node_set, self.rule),),
             blocks=blocks,
             end_block=s - 1,
             rows=(

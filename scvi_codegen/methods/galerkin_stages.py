@@ -19,21 +19,21 @@ from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
     Row,
-    ScalarFamily,
+    ScalarStageGroup,
     StageSystem,
     Table,
     dyadic,
     stationary_increments,
 )
 from scvi_codegen.tables.basis import (
-    cardinal_slopes,
+    cardinal_derivatives,
     cardinal_values,
 )
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
 
-__all__ = ["action_families", "galerkin_system", "nodal_quadrature_family", "position_block"]
+__all__ = ["action_groups", "galerkin_system", "nodal_quadrature_group", "position_block"]
 
 
 def galerkin_system(
@@ -84,7 +84,7 @@ def galerkin_system(
         shape = replace(exact, position=position, end=end_position, weights=weights, unrounded=exact)
     gathers = _curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
-        families=action_families(system, abscissae, (weights, *derivative_weights), gathers),
+        families=action_groups(system, abscissae, (weights, *derivative_weights), gathers),
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
         end_position=end_position,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=end_position[b - 1]) for b in range(1, size + 1)),
@@ -93,9 +93,9 @@ def galerkin_system(
     )
 
 
-def action_families(
+def action_groups(
     system: MechanicalSystem, abscissae: Vector, weights: Matrix, gathers: tuple[Gather, ...]
-) -> tuple[ScalarFamily, ...]:
+) -> tuple[ScalarStageGroup, ...]:
     """Return sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at points of a curve, a family per row of weights (paper, 4.2.3).
 
     Args:
@@ -119,7 +119,7 @@ def action_families(
         )
     scalars = (system.lagrangian, *forms_of(system).rates(len(weights) - 1))
     return tuple(
-        ScalarFamily(
+        ScalarStageGroup(
             name=f"derivative_{k}" if k else "quadrature",
             abscissae=abscissae,
             weights=own,
@@ -151,24 +151,26 @@ def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Seque
     )
 
 
-def nodal_quadrature_family(
+def nodal_quadrature_group(
     system: MechanicalSystem, nodes: Nodes, rule: Quadrature, *, other_blocks: int = 0
-) -> ScalarFamily:
+) -> ScalarStageGroup:
     """Return the quadrature of L along the interpolant through Q^0 .. Q^s, in the paper's notation.
 
     The curve does not depend on the ``other_blocks`` unknowns after Q^s (velocities, multipliers).
     """
     padding = Table.constant(len(rule), other_blocks)
     values = Table.named("l", cardinal_values(nodes.points, rule.points), column=0)
-    slopes = Table.named("dl", cardinal_slopes(nodes.points, rule.points), column=0)
-    return ScalarFamily(
+    derivative_values = Table.named("dl", cardinal_derivatives(nodes.points, rule.points), column=0)
+    return ScalarStageGroup(
         name="quadrature",
         abscissae=rule.abscissae,
         weights=rule.weights,
         weight_names=tuple(f"w_{n}" for n in range(1, len(rule) + 1)),
         gathers=(
             Gather(arguments=system.coordinates, table=Table.joined(values, padding), power=0),
-            Gather(arguments=system.velocities, table=Table.joined(slopes, padding), power=-1, scale=Fraction(2)),
+            Gather(
+                arguments=system.velocities, table=Table.joined(derivative_values, padding), power=-1, scale=Fraction(2)
+            ),
         ),
         scalar=system.lagrangian,
         scale=Fraction(1, 2),

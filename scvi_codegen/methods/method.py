@@ -18,16 +18,16 @@ import sympy
 from scvi_codegen.display.cards import card, plain
 from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
-from scvi_codegen.formulas.parts import key_of
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.mechanics.constraints import velocities_held
+from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.mechanics.constraints import nonholonomic_expressions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.stage_system import PointFamily, Scatter, StageSystem, dyadic
+from scvi_codegen.methods.stage_system import Scatter, StageGroup, StageSystem, dyadic
 from scvi_codegen.tables.precision import Number, Vector, mp
-from scvi_codegen.tables.tableau import MOST_STAGES
+from scvi_codegen.tables.tableau import MAX_STAGES
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "Method",
@@ -39,7 +39,7 @@ __all__ = [
     "unit_sum",
 ]
 
-degree_count = partial(checked_count, least=1, most=MOST_STAGES, error=MethodError)
+degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodError)
 """Validation of a degree or a number of stages."""
 
 Specification = Mapping[str, str | int | bool | Sequence[float]]
@@ -161,7 +161,7 @@ def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
 
 def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
     """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    return method.symplectic and not system.forces and not any(velocities_held(system))
+    return method.symplectic and not system.forces and not any(nonholonomic_expressions(system))
 
 
 def unit_sum(weights: Sequence[Number]) -> Vector:
@@ -178,14 +178,14 @@ def unit_sum(weights: Sequence[Number]) -> Vector:
 
 
 def lagrangian_scatters(
-    family: PointFamily, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
-) -> PointFamily:
+    family: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
+) -> StageGroup:
     """Return ``family`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
     filled = (
         _with_results(force_scatter, forms_of(system).force),
         _with_results(momentum_scatter, forms_of(system).momentum),
     )
-    return PointFamily(
+    return StageGroup(
         name=family.name,
         abscissae=family.abscissae,
         weights=family.weights,

@@ -20,7 +20,7 @@ import sympy
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
@@ -67,7 +67,7 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
     )
 
 
-def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_Group]:
+def _groups(system: MechanicalSystem, f: int, family: StageGroup) -> Iterator[_Group]:
     """Yield the auxiliary variables that occur in a family, and the multipliers of their equations."""
     free = set().union(*(result.free_symbols for result in family.results))
     free |= family.scalar.free_symbols if family.scalar is not None else set()
@@ -85,13 +85,13 @@ def _groups(system: MechanicalSystem, f: int, family: PointFamily) -> Iterator[_
 
 
 def _stationary(
-    system: MechanicalSystem, family: PointFamily, symbols: Sequence[sympy.Symbol]
+    system: MechanicalSystem, family: StageGroup, symbols: Sequence[sympy.Symbol]
 ) -> tuple[sympy.Expr, ...]:
     """Return the equations of these symbols: the gradient of the family's scalar, or v - H_p if it has none."""
     if family.scalar is None:
         return forms_of(system).constitutive
-    slopes = gradient(family.scalar, symbols)
-    return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(symbols)))
+    derivatives = gradient(family.scalar, symbols)
+    return tuple(derivatives.get(i, sympy.S.Zero) for i in range(len(symbols)))
 
 
 def _block(group: _Group, n: int) -> Block:
@@ -100,8 +100,8 @@ def _block(group: _Group, n: int) -> Block:
 
 
 def _extended(
-    family: PointFamily, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
-) -> PointFamily:
+    family: StageGroup, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
+) -> StageGroup:
     """Return a family with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
     points, rows = len(family.abscissae), len(family.scatters[0].table.entries[0]) - 1
     none = Table.constant(points, len(added))

@@ -19,9 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.kinds import NUMBERS, check_kind, of, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import position_system
 from scvi_codegen.methods.exactness import Exactness
@@ -31,12 +29,13 @@ from scvi_codegen.methods.shapes import Velocities
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
-    PointFamily,
     Row,
     Scatter,
+    StageGroup,
     StageSystem,
     Table,
 )
+from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
 from scvi_codegen.tables.basis import (
     identity_matrix,
@@ -44,6 +43,7 @@ from scvi_codegen.tables.basis import (
 )
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import Tableau
+from scvi_codegen.validation.argument_types import NUMBERS, check_kind, checks_arguments, of
 
 __all__ = [
     "TABLEAU_METHODS",
@@ -164,7 +164,7 @@ class RungeKutta(Method):
 def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
-    family = PointFamily(
+    family = StageGroup(
         name="stage",
         abscissae=tableau.c,
         weights=(mp.one,) * size,
@@ -230,7 +230,7 @@ def check_form(form: str) -> None:
         raise MethodError(f"form must be 'phase-space' or 'position', not {form!r}")
 
 
-@takes(MethodError, abscissae=NUMBERS)
+@checks_arguments(MethodError, abscissae=NUMBERS)
 def CollocationRK(abscissae: Sequence[float], *, form: str = "phase-space") -> RungeKutta:
     """Return the collocation Runge-Kutta method (22)-(23) on distinct abscissae c_1 < .. < c_s, usually in [0, 1]."""
     return RungeKutta(tableaux.collocation_tableau(tuple(abscissae)), form)

@@ -20,9 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.kinds import NUMBERS, check_kind
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.choices import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.exactness import Exactness
@@ -32,14 +30,16 @@ from scvi_codegen.methods.shooting_stages import printed_increments, printed_nod
 from scvi_codegen.methods.stage_system import (
     StageSystem,
 )
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by_name
+from scvi_codegen.validation.argument_types import NUMBERS, check_kind
 
 __all__ = ["SCVI"]
 
-COLLOCATION_FAMILIES = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
+COLLOCATION_TABLEAUX = ("gauss", "radau-iia", "lobatto-iiia", "chebyshev-gauss", "chebyshev-lobatto")
 """Families of tableaux that are collocation methods."""
 
 
@@ -215,9 +215,9 @@ class SCVI(Method):
 def _resolve_abscissae(abscissae: Sequence[Any] | str, degree: int) -> Vector | str:
     """Return the validated name of a family of collocation methods, or s numbers."""
     if isinstance(abscissae, str):
-        if abscissae not in COLLOCATION_FAMILIES:
+        if abscissae not in COLLOCATION_TABLEAUX:
             raise MethodError(
-                f"there are no abscissae called {abscissae!r}: give {', '.join(COLLOCATION_FAMILIES)}, or numbers"
+                f"there are no abscissae called {abscissae!r}: give {', '.join(COLLOCATION_TABLEAUX)}, or numbers"
             )
         return abscissae
     check_kind(NUMBERS, abscissae, "abscissae", MethodError)

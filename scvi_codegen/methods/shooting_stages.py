@@ -12,19 +12,19 @@ from scvi_codegen.methods.acceleration_stages import (
     acceleration_extrapolation,
     acceleration_gathers,
     acceleration_unknowns,
-    residual_family,
+    residual_group,
 )
 from scvi_codegen.methods.collocation import nodal_blocks, nodal_gathers
-from scvi_codegen.methods.galerkin_stages import action_families, nodal_quadrature_family
+from scvi_codegen.methods.galerkin_stages import action_groups, nodal_quadrature_group
 from scvi_codegen.methods.method import lagrangian_scatters, unit_sum
 from scvi_codegen.methods.shapes import PrintedCurve, ShotCurve
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
-    PointFamily,
     Row,
-    ScalarFamily,
+    ScalarStageGroup,
     Scatter,
+    StageGroup,
     StageSystem,
     Table,
     dyadic,
@@ -32,7 +32,7 @@ from scvi_codegen.methods.stage_system import (
     stationary_nodal,
 )
 from scvi_codegen.tables.basis import (
-    cardinal_slopes,
+    cardinal_derivatives,
     cardinal_values,
     matrix_product,
 )
@@ -67,7 +67,7 @@ def shooting_increments(
         *acceleration_unknowns(size),
         *(Block(name=f"m_{i}", power=1, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
     )
-    action = action_families(
+    action = action_groups(
         system,
         rule.abscissae,
         (weights, *rule.unit_derivative_weights),
@@ -75,7 +75,7 @@ def shooting_increments(
     )
     extrapolated = acceleration_extrapolation(tableau)
     return stationary_increments(
-        families=(*action, _multiplier_family(system, tableau, rounded=rounded)),
+        families=(*action, _multiplier_group(system, tableau, rounded=rounded)),
         blocks=blocks,
         end_position=(*beta, *(mp.zero,) * size),
         rows=(
@@ -90,7 +90,7 @@ def shooting_increments(
     )
 
 
-def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: bool) -> ScalarFamily:
+def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bool) -> ScalarStageGroup:
     """Return the collocation nodes with scalar m_i . E_i, weight h^2 (unknowns v0, z, m)."""
     size = len(tableau.b)
     position, velocity, acceleration = acceleration_gathers(system, tableau.A, other_blocks=size)
@@ -102,7 +102,7 @@ def _multiplier_family(system: MechanicalSystem, tableau: Tableau, *, rounded: b
         table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
         power=-1,
     )
-    return ScalarFamily(
+    return ScalarStageGroup(
         name="node",
         abscissae=tableau.c,
         weights=(mp.one,) * size,
@@ -158,7 +158,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
     position_rows, velocities, end_row = _curve(tableau, rule)
     abscissae = nodes.abscissae
     values = cardinal_values(abscissae, rule.abscissae)
-    slopes = cardinal_slopes(abscissae, rule.abscissae)
+    derivative_values = cardinal_derivatives(abscissae, rule.abscissae)
     none = Table.constant(points, size)
 
     def first_and_sum(name: str, lines: Matrix) -> Table:
@@ -166,7 +166,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
         return Table.joined(Table.named(name, first), none, Table.named(name, both, column=2))
 
     quadrature = lagrangian_scatters(
-        PointFamily(
+        StageGroup(
             name="quadrature",
             abscissae=rule.abscissae,
             weights=rule.unit_weights,
@@ -176,10 +176,10 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
         ),
         system,
         Scatter(results=(), table=first_and_sum("s1", values), power=1),
-        Scatter(results=(), table=first_and_sum("s2", slopes), power=0),
+        Scatter(results=(), table=first_and_sum("s2", derivative_values), power=0),
     )
     inner = Table.joined(Table.constant(size, 1), Table.identity(size), Table.constant(size, 1))
-    node = residual_family(
+    node = residual_group(
         system, tableau.c, acceleration_gathers(system, tableau.A), Scatter(results=(), table=inner, power=1)
     )
     return StageSystem(
@@ -205,7 +205,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
         power=0,
     )
-    node = ScalarFamily(
+    node = ScalarStageGroup(
         name="node",
         abscissae=nodes.abscissae[1:],
         weights=(mp.one,) * size,
@@ -217,7 +217,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         forces=forms_of(system).multiplied_forces,
     )
     return stationary_nodal(
-        families=(nodal_quadrature_family(system, nodes, rule, other_blocks=1 + size), node),
+        families=(nodal_quadrature_group(system, nodes, rule, other_blocks=1 + size), node),
         blocks=(
             *nodal_blocks(nodes),
             *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
@@ -236,14 +236,14 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
 def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
     """Return (34a), (34d) and (34e) as printed, unknowns Q^1 .. Q^s and v0; (36)-(37) for the two-point pendulum."""
     size = nodes.degree
-    action = nodal_quadrature_family(system, nodes, rule, other_blocks=1)
+    action = nodal_quadrature_group(system, nodes, rule, other_blocks=1)
     none = Table.constant(len(rule), size)
 
     def ends(table: Table) -> Table:
         return Table.joined(none, table.columns([0]), table.columns([size]))
 
-    quadrature = action.point_family([ends(gather.table) for gather in action.gathers])
-    node = residual_family(
+    quadrature = action.to_stage_group([ends(gather.table) for gather in action.gathers])
+    node = residual_group(
         system,
         nodes.abscissae[1:],
         nodal_gathers(system, nodes),

@@ -34,11 +34,11 @@ from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 __all__ = [
     "Block",
     "Gather",
-    "PointFamily",
     "Row",
-    "ScalarFamily",
+    "ScalarStageGroup",
     "Scatter",
     "Shape",
+    "StageGroup",
     "StageSystem",
     "Table",
     "dyadic",
@@ -162,7 +162,7 @@ class Scatter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PointFamily:
+class StageGroup:
     """Points c_n in [0, 1] with weights, evaluated by one kernel.
 
     If the kernel is the gradient of ``scalar``, sum_n w_n h^(1 + scalar_power) scalar(u_n) is part of a generating
@@ -217,7 +217,7 @@ class StageSystem:
 
     blocks: tuple[Block, ...]
     rows: tuple[Row, ...]
-    families: tuple[PointFamily, ...]
+    families: tuple[StageGroup, ...]
     end_position: Table
     end_momentum: Number
     end_numbers: tuple[str, str]
@@ -235,7 +235,7 @@ class StageSystem:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScalarFamily:
+class ScalarStageGroup:
     """Points whose weighted sum sum_n scale w_n h^(1 + power) s(u_n) is part of a generating function.
 
     ``forces`` f_g, for the first gathers, are added to its derivatives, as in the principle of Lagrange and d'Alembert:
@@ -253,16 +253,16 @@ class ScalarFamily:
     in_action: bool = True
     forces: tuple[tuple[sympy.Expr, ...], ...] = ()
 
-    def slopes(self) -> list[tuple[Gather, tuple[sympy.Expr, ...]]]:
+    def derivatives(self) -> list[tuple[Gather, tuple[sympy.Expr, ...]]]:
         """Return the derivatives of the scalar plus the forces, one tuple of m per gather."""
-        slopes = []
+        derivatives = []
         for g, gather in enumerate(self.gathers):
             entries = gradient(self.scalar, gather.arguments)
             own = tuple(entries.get(i, sympy.S.Zero) for i in range(len(gather.arguments)))
-            slopes.append((gather, tuple(map(sympy.Add, own, self.forces[g])) if g < len(self.forces) else own))
-        return slopes
+            derivatives.append((gather, tuple(map(sympy.Add, own, self.forces[g])) if g < len(self.forces) else own))
+        return derivatives
 
-    def point_family(self, tables: Sequence[Table]) -> PointFamily:
+    def to_stage_group(self, tables: Sequence[Table]) -> StageGroup:
         """Return the family with its gradient as kernel, scattered through ``tables`` (one per gather)."""
         scatters = tuple(
             Scatter(
@@ -271,9 +271,9 @@ class ScalarFamily:
                 power=1 + self.power + gather.power,
                 scale=self.scale * gather.scale,
             )
-            for (gather, results), table in zip(self.slopes(), tables, strict=True)
+            for (gather, results), table in zip(self.derivatives(), tables, strict=True)
         )
-        return PointFamily(
+        return StageGroup(
             name=self.name,
             abscissae=self.abscissae,
             weights=self.weights,
@@ -295,7 +295,7 @@ def dyadic(entries: Sequence[Sequence[Number]]) -> Matrix:
 
 def stationary_increments(
     *,
-    families: Sequence[ScalarFamily],
+    families: Sequence[ScalarStageGroup],
     blocks: tuple[Block, ...],
     end_position: Sequence[Number],
     rows: tuple[Row, ...],
@@ -318,7 +318,7 @@ def stationary_increments(
                 for line in gather.table.entries
             ]
             tables.append(Table.named(f"s{next(number)}", lines))
-        built.append(family.point_family(tables))
+        built.append(family.to_stage_group(tables))
     return StageSystem(
         blocks=blocks,
         rows=rows,
@@ -333,7 +333,7 @@ def stationary_increments(
 
 def stationary_nodal(
     *,
-    families: Sequence[ScalarFamily],
+    families: Sequence[ScalarStageGroup],
     blocks: tuple[Block, ...],
     end_block: int,
     rows: tuple[Row, ...],
@@ -344,7 +344,7 @@ def stationary_nodal(
     Rows: p0 + dG/dq0 = 0, then dG/dz = 0 for every other block in order; p1 = dG/dq1 (paper (5), (26), (27)).
     """
     order = [0, *(b + 1 for b in range(len(blocks)) if b != end_block), end_block + 1]
-    built = [family.point_family([gather.table.columns(order) for gather in family.gathers]) for family in families]
+    built = [family.to_stage_group([gather.table.columns(order) for gather in family.gathers]) for family in families]
     unit = [int(b == end_block) for b in range(len(blocks))]
     return StageSystem(
         blocks=blocks,

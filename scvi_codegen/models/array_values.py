@@ -24,8 +24,8 @@ from sympy import Expr
 from scvi_codegen.errors import ExpressionError, ModelFileError, closest
 from scvi_codegen.files.numpy_files import loaded
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.on_arrays import on_arrays
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.formulas.vectorized import on_arrays
 from scvi_codegen.indices import Array
 from scvi_codegen.models.csv_tables import parse_table
 from scvi_codegen.models.model import real

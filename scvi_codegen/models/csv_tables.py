@@ -17,7 +17,7 @@ __all__ = ["CsvTable", "parse_table"]
 
 NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 """Pattern of numbers in ASCII digits; Python also accepts 1_0 and digits of other scripts."""
-LONGEST_SHOWN = 60
+MAX_SHOWN_LENGTH = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,8 +68,8 @@ def _row(cells: list[str], names: list[str], number: int) -> list[float]:
     values = []
     for name, cell in zip(names, cells, strict=True):
         if not NUMBER.fullmatch(cell):
-            raise ModelFileError(f"line {number}, {name}: '{cell[:LONGEST_SHOWN]}' is not a number")
+            raise ModelFileError(f"line {number}, {name}: '{cell[:MAX_SHOWN_LENGTH]}' is not a number")
         values.append(float(cell))
         if not math.isfinite(values[-1]):
-            raise ModelFileError(f"line {number}, {name}: {cell[:LONGEST_SHOWN]} is not a finite number")
+            raise ModelFileError(f"line {number}, {name}: {cell[:MAX_SHOWN_LENGTH]} is not a finite number")
     return values

@@ -25,15 +25,15 @@ from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
-from scvi_codegen.given.kinds import PATH, SWITCH, TEXT, TEXTS, takes
 from scvi_codegen.models.fmu_description import build_description, model_description
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import MODEL, example_of, model_text, prefix_of
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.rendering.fmu import with_fmu
+from scvi_codegen.rendering.program_source import ExampleRun
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.rendering.text import ExampleRun
+from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, TEXTS, checks_arguments
 from scvi_codegen.version import __version__
 
 __all__ = ["generate_fmu"]
@@ -47,7 +47,7 @@ SUFFIXES = {"darwin": ".dylib", "windows": ".dll"}
 """File suffixes of libraries other than .so."""
 
 
-@takes(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, platforms=TEXTS, force=SWITCH)
+@checks_arguments(model=MODEL, path=PATH, solver=TEXT, flags=TEXTS, platforms=TEXTS, force=SWITCH)
 def generate_fmu(
     model: Model,
     path: str | os.PathLike[str],
@@ -88,9 +88,9 @@ def generate_fmu(
     if not force:
         _refuse_to_lose(target)
     source, texts = _texts(model, prefix, solver)
-    libraries = {_place(_here(), prefix): load(source, flags=flags).path.read_bytes()}
-    for name in sorted({*platforms} - {_here()}):
-        libraries[_place(name, prefix)] = library_for(name, source, flags=flags)
+    libraries = {_library_path(_this_platform(), prefix): load(source, flags=flags).path.read_bytes()}
+    for name in sorted({*platforms} - {_this_platform()}):
+        libraries[_library_path(name, prefix)] = library_for(name, source, flags=flags)
     try:
         write_atomically(target, lambda file: _write(texts | libraries, file))
     except OSError as error:
@@ -111,7 +111,7 @@ def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, by
     start = _start(model)
     places = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
     token = _token(source.to_json(), interface, start)
-    source = with_fmu(source, interface, start, by_velocity=by_velocity, places=places, token=token)
+    source = with_fmu(source, interface, start, by_velocity=by_velocity, input_indices=places, token=token)
     described = model_text(model)
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),
@@ -124,7 +124,7 @@ def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, by
 
 def _start(model: Model) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
-    if model.h is None or model.paced:
+    if model.h is None or model.has_time_transformation:
         raise ModelFileError(
             "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a monitor"
         )
@@ -140,14 +140,14 @@ def _token(text: str, interface: Interface, start: ExampleRun) -> str:
     return f"{{{uuid.uuid5(uuid.NAMESPACE_URL, made_from)}}}"
 
 
-def _here() -> str:
+def _this_platform() -> str:
     """Return the platform of this machine, as FMI names it."""
     processor = platform.machine().lower()
     system = SYSTEMS.get(sys.platform, re.sub(r"\W", "", sys.platform))
     return f"{PROCESSORS.get(processor, processor)}-{system}"
 
 
-def _place(platform: str, prefix: str) -> str:
+def _library_path(platform: str, prefix: str) -> str:
     """Return the path of a library in the archive."""
     return f"binaries/{platform}/{prefix}{SUFFIXES.get(platform.rpartition('-')[2], '.so')}"
 

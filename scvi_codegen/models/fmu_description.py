@@ -7,8 +7,8 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from scvi_codegen.formulas.symbols import DOT, TIME
+from scvi_codegen.rendering.program_source import ExampleRun
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.rendering.text import ExampleRun
 from scvi_codegen.version import __version__
 
 __all__ = ["build_description", "model_description"]
@@ -122,11 +122,13 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def _element(reference: int, one: Variable) -> Element:
-    given = {} if one.start is None else {"start": repr(one.start)}
+    start_attributes = {} if one.start is None else {"start": repr(one.start)}
     if one.causality == "output":
-        given["initial"] = "calculated" if one.start is None else "exact"
-    told = {"name": one.name, "valueReference": str(reference), "causality": one.causality}
-    return Element("Float64", told | {"variability": one.variability, "description": one.description} | given)
+        start_attributes["initial"] = "calculated" if one.start is None else "exact"
+    attributes = {"name": one.name, "valueReference": str(reference), "causality": one.causality}
+    return Element(
+        "Float64", attributes | {"variability": one.variability, "description": one.description} | start_attributes
+    )
 
 
 def _text(root: Element) -> str:

@@ -49,7 +49,6 @@ import numpy as np
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.indexed import parse_array
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.indices import Array
 from scvi_codegen.lowering.indexed import SOLVERS, one_coordinate
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
@@ -64,13 +63,14 @@ from scvi_codegen.models.sections import (
     check_one,
     chosen_method,
     in_section,
-    laid_over,
+    merged_sections,
     names_of,
     read_method,
     read_run,
     required,
     text_of,
 )
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["read_indexed"]
 
@@ -110,7 +110,7 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
     specification = {key: value for key, value in chosen_method(document, given).items() if key != "solver"}
     solver = {"solver": SOLVERS[0], **document.get("method", {}), **given.get("method", {})}["solver"]
     parameters = _declared(document.get("parameters", {}), given.get("parameters", {}))
-    document = {**laid_over(document, given), "parameters": parameters}
+    document = {**merged_sections(document, given), "parameters": parameters}
     tables = {key: in_section("[tables]", partial(parse_array, key)) for key in document.get("tables", {})}
     system = _read_system(document)
     method = in_section("[method]", lambda: read_method(fitted(specification, one_coordinate(system))))

@@ -7,22 +7,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.lowering.indexed import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import (
+    check_adaptive,
     check_at_most_one,
-    check_controlled,
     check_error,
     check_one_of,
     check_step,
     real,
     steps_in,
 )
+from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.validation.argument_types import check_kind
+from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -87,8 +87,8 @@ class IndexedModel:
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, real(value, name))
         if self.h is None:
-            check_controlled(self.tolerance, self.span)
-            check_error(self.error, paced=False)
+            check_adaptive(self.tolerance, self.span)
+            check_error(self.error, has_time_transformation=False)
         else:
             check_step(self.h, self.span)
         if self.steps is not None:
@@ -138,26 +138,28 @@ class IndexedModel:
         threads: int | None = None,
     ) -> IndexedRun:
         """Start the run of this model at its initial state; raises as :meth:`IndexedStepper.start`."""
-        beside: dict[str, Any] = {"options": options, "threads": threads}
-        stepper, lengths = stepper or self.stepper(), self._lengths
+        run_options: dict[str, Any] = {"options": options, "threads": threads}
+        stepper, lengths = stepper or self.stepper(), self._step_arguments
         if self.error is not None:
-            found = self.confirmed(stepper, **beside)
+            found = self.confirmed(stepper, **run_options)
             lengths = {"t_end": lengths["t_end"], "tolerance": found.local_tolerance}
-        return stepper.start(**self._beginning, **lengths, **beside)
+        return stepper.start(**self._initial_arguments, **lengths, **run_options)
 
-    def confirmed(self, stepper: IndexedStepper, **beside: Any) -> GlobalError:
+    def confirmed(self, stepper: IndexedStepper, **run_options: Any) -> GlobalError:
         """Return the local tolerance for :attr:`error`, confirmed by further runs, as in :class:`Model`."""
-        found = stepper.integrate(**self._beginning, **self._lengths, **beside).confirmation
+        found = stepper.integrate(**self._initial_arguments, **self._step_arguments, **run_options).confirmation
         assert found is not None  # by construction
         return found
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """Integrate over the whole span; raises as :meth:`IndexedStepper.integrate`."""
-        lengths = self._lengths if self.h is None else {**self._lengths, "steps": self.step_count}
-        return self.stepper().integrate(**self._beginning, **lengths, save_every=self.save_every, progress=progress)
+        lengths = self._step_arguments if self.h is None else {**self._step_arguments, "steps": self.step_count}
+        return self.stepper().integrate(
+            **self._initial_arguments, **lengths, save_every=self.save_every, progress=progress
+        )
 
     @property
-    def _lengths(self) -> dict[str, Any]:
+    def _step_arguments(self) -> dict[str, Any]:
         """Arguments for the step size: h, or t_end with a tolerance."""
         if self.h is not None:
             return {"h": self.h}
@@ -165,6 +167,6 @@ class IndexedModel:
         return {"t_end": self.t + self.covered, **chosen}
 
     @property
-    def _beginning(self) -> dict[str, Any]:
+    def _initial_arguments(self) -> dict[str, Any]:
         names = ("q", "p", "velocity", "t", "parameters", "tables")
         return {name: getattr(self, name) for name in names}

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.given.kinds import PATH, SWITCH, of, takes
 from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.indexed_document import model_texts
@@ -25,11 +24,12 @@ from scvi_codegen.models.package import prefix_of, source_in
 from scvi_codegen.rendering.indexed import render_indexed_example
 from scvi_codegen.runtime.indexed_interface import read_arrays, read_state, table_limits
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.validation.argument_types import PATH, SWITCH, checks_arguments, of
 
 __all__ = ["generate_sums", "load_sums"]
 
 
-@takes(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
+@checks_arguments(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
 def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the integrator of a model of an indexed system into a folder, as :func:`generate_package` does.
 

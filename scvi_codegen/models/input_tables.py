@@ -9,8 +9,8 @@ import numpy as np
 
 from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.rendering.text import ExampleInput
-from scvi_codegen.runtime.driven import POWERS, entered, input_of, parameters_at
+from scvi_codegen.rendering.program_source import ExampleInput
+from scvi_codegen.runtime.runs_with_inputs import POWERS, first_inner_time, input_of, parameters_at
 
 __all__ = ["InputTable", "checked_tables", "tables_of_example"]
 
@@ -56,4 +56,4 @@ def tables_of_example(
         for name, each in data.items()
     )
     names = [parameter.name for parameter in system.parameters]
-    return tables, tuple(parameters_at(names, np.array(system.defaults), data, entered(*span)).tolist())
+    return tables, tuple(parameters_at(names, np.array(system.defaults), data, first_inner_time(*span)).tolist())

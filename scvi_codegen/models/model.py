@@ -8,30 +8,30 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
-from scvi_codegen.given.counts import LARGEST_COUNT, check_tolerance, checked_count
-from scvi_codegen.given.kinds import check_kind
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import check_kind
+from scvi_codegen.validation.counts import LARGEST_COUNT, check_tolerance, checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.models.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.driven import Input
     from scvi_codegen.runtime.global_error import GlobalError
     from scvi_codegen.runtime.inputs import Array
     from scvi_codegen.runtime.integrator import Integrator
     from scvi_codegen.runtime.run import Run
+    from scvi_codegen.runtime.runs_with_inputs import Input
     from scvi_codegen.runtime.stepper import Stepper
 
 __all__ = [
     "DEFAULT_METHOD",
     "Model",
-    "check_controlled",
+    "check_adaptive",
     "check_length",
     "check_one_of",
     "check_step",
@@ -56,7 +56,7 @@ class Model:
         h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps. With a time
             transformation, the step size in tau.
         tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. With a time
-            transformation, :func:`longest_step` chooses the step size in tau for it.
+            transformation, :func:`largest_step` chooses the step size in tau for it.
         error: instead of both, bound of the relative global error of all states: runs choose their local tolerance as
             ``integrate(error=)`` does, and warn if the bound is not confirmed. Requires adaptive steps.
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
@@ -146,10 +146,10 @@ class Model:
     @property
     def ends_at_time(self) -> bool:
         """True if the run ends at a time, after a number of steps that is not known in advance."""
-        return self.h is None or (self.paced and self.span is not None)
+        return self.h is None or (self.has_time_transformation and self.span is not None)
 
     @property
-    def paced(self) -> bool:
+    def has_time_transformation(self) -> bool:
         """True if there is a time transformation, so that a step size is one in tau."""
         return self.monitor is not None or self.system.clock is not None
 
@@ -209,11 +209,11 @@ class Model:
         """Return the initial parameters, including components of inputs if these are given."""
         if not self.inputs:
             return self.parameters
-        from scvi_codegen.runtime.driven import entered
+        from scvi_codegen.runtime.runs_with_inputs import first_inner_time
 
-        return self._driven(stepper)[1](entered(self.t, self.end))
+        return self._inputs_and_parameters(stepper)[1](first_inner_time(self.t, self.end))
 
-    def stretches(self, run: Run) -> Iterator[int | None]:
+    def input_segments(self, run: Run) -> Iterator[int | None]:
         """Prepare a run of this model for each segment between breakpoints of its inputs, or for the whole span.
 
         Yields:
@@ -223,19 +223,19 @@ class Model:
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
         if not self.system.inputs:
-            yield None if run.goal else self.step_count
+            yield None if run.plan else self.step_count
             return
-        from scvi_codegen.runtime.driven import stretches  # imported here, as NumPy above
+        from scvi_codegen.runtime.runs_with_inputs import prepared_segments  # imported here, as NumPy above
 
-        inputs, values = self._driven(run.stepper)
-        yield from stretches(run, inputs, self.end, values)
+        inputs, values = self._inputs_and_parameters(run.stepper)
+        yield from prepared_segments(run, inputs, self.end, values)
 
     @property
     def end(self) -> float:
         """Final time of a run with inputs."""
-        from scvi_codegen.runtime.driven import end_of
+        from scvi_codegen.runtime.runs_with_inputs import final_time
 
-        return end_of(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
+        return final_time(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
 
     def all_inputs(self) -> Mapping[str, InputTable]:
         """Return the inputs; ModelFileError unless all inputs of the system are given."""
@@ -245,9 +245,9 @@ class Model:
                 raise ModelFileError(f"the input {name} is not set: give {way}")
         return self.inputs
 
-    def _driven(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
+    def _inputs_and_parameters(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
         """Return the inputs, and the parameters as a function of time."""
-        from scvi_codegen.runtime.driven import checked_inputs, parameters_of
+        from scvi_codegen.runtime.runs_with_inputs import checked_inputs, parameters_of
 
         found = checked_inputs(stepper.interface, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
@@ -255,15 +255,15 @@ class Model:
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
         """Start the run of this model at its initial state, to be advanced :attr:`step_count` steps or to its end."""
         p, h = self.momenta(stepper), self.h
-        if h is None and self.paced:
-            from scvi_codegen.runtime.longest_step import longest_step  # imported here: not needed for reading
+        if h is None and self.has_time_transformation:
+            from scvi_codegen.runtime.largest_step import largest_step  # imported here: not needed for reading
 
             if self.system.inputs:
                 raise ModelFileError(
                     "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
                 )
             own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
-            h = longest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
+            h = largest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
         to_end = h is None or self.monitor is not None
         tolerance = self.tolerance if self.error is None else self.confirmed(stepper, options=options).local_tolerance
         return stepper.start(
@@ -298,8 +298,8 @@ class Model:
                 "span, not steps), and a system without a time transformation"
             )
         if self.h is None:
-            check_controlled(self.tolerance, self.span)
-            check_error(self.error, paced=self.paced)
+            check_adaptive(self.tolerance, self.span)
+            check_error(self.error, has_time_transformation=self.has_time_transformation)
             return
         check_step(self.h, self.span)
 
@@ -323,7 +323,7 @@ def check_step(h: float, span: float | None) -> None:
         )
 
 
-def check_controlled(tolerance: float | None, span: float | None) -> None:
+def check_adaptive(tolerance: float | None, span: float | None) -> None:
     """Raise an error for an invalid tolerance or span of adaptive steps."""
     if tolerance is not None:
         check_tolerance(tolerance, ModelFileError)
@@ -354,11 +354,11 @@ def check_at_most_one(h: float | None, tolerance: float | None, error: float | N
         )
 
 
-def check_error(error: float | None, *, paced: bool) -> None:
+def check_error(error: float | None, *, has_time_transformation: bool) -> None:
     """Raise an error for an invalid bound of the global error, and for one with a time transformation."""
     if error is not None and not 0.0 < error < 1.0:
         raise ModelFileError(f"error is {error:g}: the bound of the relative global error must be between 0 and 1")
-    if error is not None and paced:
+    if error is not None and has_time_transformation:
         raise ModelFileError(
             f"error = {error:g} requires adaptive steps, but a time transformation has fixed steps in "
             "tau: give tolerance or step instead"

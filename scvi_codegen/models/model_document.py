@@ -40,13 +40,13 @@ def document_of(model: Model) -> dict[str, Any]:
     if system.inputs:
         document["system"]["inputs"] = list(system.inputs)
     if model.inputs:
-        document["inputs"] = {name: _written_out(table) for name, table in model.inputs.items()}
+        document["inputs"] = {name: _as_lists(table) for name, table in model.inputs.items()}
     if model.parameters:
         document["parameters"] = model.parameters
     return {**document, **motion_of(model, names)}
 
 
-def _written_out(table: InputTable) -> dict[str, Any]:
+def _as_lists(table: InputTable) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in table._asdict().items()}
 
 

@@ -68,13 +68,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
-from scvi_codegen.given.kinds import PATH, of, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.monitors import monitor_function
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.reparametrisation import with_monitor
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.model import Model, check_length, real
 from scvi_codegen.models.model_document import document_of, motion_of
@@ -88,13 +87,14 @@ from scvi_codegen.models.sections import (
     chosen_method,
     formula_of,
     in_section,
-    laid_over,
+    merged_sections,
     names_of,
     read_method,
     read_run,
     required,
     text_of,
 )
+from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 
 if TYPE_CHECKING:
     from scvi_codegen.models.indexed_model import IndexedModel
@@ -123,7 +123,7 @@ NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_d
 """Required keys, or their alternatives."""
 
 
-@takes(path=PATH)
+@checks_arguments(path=PATH)
 def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
     """Read a model file, with the sections ``given`` merged over its own.
 
@@ -133,7 +133,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
     return _of_kind(path, read_model_file(path, given), Model, "load_indexed_model")
 
 
-@takes(path=PATH)
+@checks_arguments(path=PATH)
 def load_indexed_model(path: str | os.PathLike[str], given: Document | None = None) -> IndexedModel:
     """Read the model file of an indexed system (:mod:`scvi_codegen.models.indexed_file`); see :func:`load_model`.
 
@@ -168,7 +168,7 @@ def _of_kind(path: str | os.PathLike[str], model: object, kind: type[Kind], othe
     return model
 
 
-@takes(model=of("a Model", Model), path=PATH)
+@checks_arguments(model=of("a Model", Model), path=PATH)
 def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     """Write a model file atomically; reading it returns an equal model.
 
@@ -239,13 +239,13 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     if given.get("sizes"):
         raise ModelFileError('[sizes] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
     if "monitor" in given.get("system", {}) and "error" in document.get("run", {}):
-        _check_kept(document["run"]["error"], given.get("run", {}))
-    document, given = _with_own_step(document), _with_own_step(given)
+        _check_error_bound(document["run"]["error"], given.get("run", {}))
+    document, given = _without_inherited_step(document), _without_inherited_step(given)
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
-        document = laid_over(motion_of(Model.from_problem(entry), names), document)
+        document = merged_sections(motion_of(Model.from_problem(entry), names), document)
     chosen = chosen_method(document, given)
-    document = {**laid_over(document, given), "method": chosen}
+    document = {**merged_sections(document, given), "method": chosen}
     if entry is None:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
@@ -253,14 +253,14 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         plain = _read_system(document, entry)
     system, monitor = _read_monitor(plain, document)
-    warn_of_mistakes(system, () if monitor is None else (monitor_function(system, monitor, in_time=True),))
+    warn_of_mistakes(system, () if monitor is None else (time_rescaling_function(system, monitor, in_time=True),))
     state = _read_state(document["initial"], system)
     method = read_method(fitted(document["method"], system))
     inputs = _read_inputs(document.get("inputs", {}), folder)
     return Model(system=system, method=method, monitor=monitor, inputs=inputs, **state, **read_run(document["run"]))
 
 
-def _with_own_step(layer: Document) -> Document:
+def _without_inherited_step(layer: Document) -> Document:
     """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau."""
     run = layer.get("run", {})
     if "monitor" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
@@ -268,7 +268,7 @@ def _with_own_step(layer: Document) -> Document:
     return {**layer, "run": {**run, "tolerance": None}}
 
 
-def _check_kept(error: Any, run: Section) -> None:
+def _check_error_bound(error: Any, run: Section) -> None:
     """Raise an error for a time transformation added to a model with ``error``, unless that is replaced."""
     if not {"step", "tolerance"} & run.keys():
         raise ModelFileError(

@@ -23,15 +23,15 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
-from scvi_codegen.given.kinds import PATH, SWITCH, TEXT, Kind, takes
 from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.rendering.source import PREFIX, Interface, Source, check_interface, included
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
     from scvi_codegen.models.model import Model
-    from scvi_codegen.rendering.text import Embedded, ExampleRun
+    from scvi_codegen.rendering.program_source import Embedded, ExampleRun
 
 __all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_package", "model_text", "prefix_of"]
 
@@ -45,10 +45,10 @@ OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"
 """Folder names that would collide with ``main.c`` or shadow imports of the package."""
 
 
-MODEL = Kind("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
+MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
 
 
-@takes(model=MODEL, folder=PATH, solver=TEXT, force=SWITCH)
+@checks_arguments(model=MODEL, folder=PATH, solver=TEXT, force=SWITCH)
 def generate_package(
     model: Model,
     folder: str | os.PathLike[str],
@@ -84,7 +84,7 @@ def generate_package(
     return target
 
 
-@takes(folder=PATH)
+@checks_arguments(folder=PATH)
 def load_package(folder: str | os.PathLike[str]) -> Stepper:
     """Return the stepper of a generated folder, compiled from the C code in it (from the cache if that is unchanged).
 
@@ -179,7 +179,7 @@ def prefix_of(folder: Path) -> str:
 def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return texts by file name, ``interface.json`` last."""
     from scvi_codegen.compiler import generate_source
-    from scvi_codegen.rendering.text import render_example
+    from scvi_codegen.rendering.program_source import render_example
 
     source, interface = generate_source(
         model.system,
@@ -208,7 +208,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
 def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     """Return the example run: the whole run of the model with about twenty lines of output at most."""
     from scvi_codegen.models.input_tables import tables_of_example
-    from scvi_codegen.rendering.text import ExampleRun
+    from scvi_codegen.rendering.program_source import ExampleRun
 
     clock = model.system.clock
     if model.h is None and (clock or model.monitor is not None):
@@ -256,10 +256,10 @@ def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
     """Return the (m,) initial momenta from the velocities, in 60 digits, so that no C compiler is required."""
     from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.mechanics.forms import forms_of
-    from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+    from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
     from scvi_codegen.tables.precision import mp
 
-    system = lagrangian_twin(model.system)
+    system = equivalent_lagrangian(model.system)
     if system is None:
         raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
     rate = _rate(system, model.q, ()) if system.clock else 1.0

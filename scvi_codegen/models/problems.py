@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from scvi_codegen.display.cards import Html, card, listed, plain
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.given.kinds import TEXT, takes
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.systems import (
     cart_pole,
@@ -27,6 +25,8 @@ from scvi_codegen.models.systems import (
     relativistic_particle,
     spherical_pendulum,
 )
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import TEXT, checks_arguments
 
 __all__ = ["PROBLEMS", "Problem", "problem"]
 
@@ -266,7 +266,7 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = MappingProxyType(
 """Catalogue: functions that build the entries, by command-line name."""
 
 
-@takes(name=TEXT)
+@checks_arguments(name=TEXT)
 def problem(name: str) -> Problem:
     """Return an entry of the catalogue; a chain takes a size, as in ``fput-chain:64``.
 

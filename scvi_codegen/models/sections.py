@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from scvi_codegen.errors import ModelFileError, ScviCodegenError, closest
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import FORMULA
 from scvi_codegen.methods import ARGUMENTS, Method, method_from_specification, sized, specification_of
-from scvi_codegen.models.meant import meant_by
+from scvi_codegen.models.key_hints import key_hint
 from scvi_codegen.models.model import DEFAULT_METHOD, real
+from scvi_codegen.validation.argument_types import FORMULA
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "Document",
@@ -20,7 +20,7 @@ __all__ = [
     "chosen_method",
     "formula_of",
     "in_section",
-    "laid_over",
+    "merged_sections",
     "names_of",
     "read_method",
     "read_run",
@@ -43,21 +43,21 @@ def chosen_method(document: Document, given: Document) -> Section:
     default: Section = DEFAULT_METHOD.specification()
     if document.get("system", {}).get("constraints"):
         default = {"method": "svi", "degree": 6}
-    base = _spelt_out(document.get("method", default))
-    return _changed_method(base, _spelt_out(given.get("method", {})))
+    base = _split_method_name(document.get("method", default))
+    return _changed_method(base, _split_method_name(given.get("method", {})))
 
 
-def laid_over(below: Document, above: Document) -> dict[str, Section]:
+def merged_sections(below: Document, above: Document) -> dict[str, Section]:
     """Return all sections merged; keys in ``above`` replace those in ``below`` and their alternatives."""
     document = dict(below)
     for name, section in above.items():
         replaced = {key for keys in ALTERNATIVES if not keys.isdisjoint(section) for key in keys}
-        kept = {} if name == "method" else below.get(name, {})
-        document[name] = {key: value for key, value in kept.items() if key not in replaced} | dict(section)
+        base_section = {} if name == "method" else below.get(name, {})
+        document[name] = {key: value for key, value in base_section.items() if key not in replaced} | dict(section)
     return document
 
 
-def _spelt_out(section: Section) -> Section:
+def _split_method_name(section: Section) -> Section:
     """Return a method section with a name such as ``svi:6`` split into name and degree."""
     name = section.get("method")
     if not isinstance(name, str) or ":" not in name:
@@ -73,16 +73,16 @@ def _changed_method(base: Section, given: Section) -> Section:
     """Return a method with some arguments changed; another method inherits common arguments."""
     if not given:
         return base
-    kept = dict(base)
-    if kept.get("quadrature") == f"gauss-legendre:{kept.get('degree')}":
-        del kept["quadrature"]  # the default for its degree; another degree has another default
-    name = given.get("method", kept.get("method"))
-    if name != kept.get("method"):
+    base_section = dict(base)
+    if base_section.get("quadrature") == f"gauss-legendre:{base_section.get('degree')}":
+        del base_section["quadrature"]  # the default for its degree; another degree has another default
+    name = given.get("method", base_section.get("method"))
+    if name != base_section.get("method"):
         accepted = ARGUMENTS.get(name, ())
-        kept = {key: value for key, value in kept.items() if key in INHERITED and key in accepted}
+        base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
     if {"abscissae", "space"} & given.keys():
-        kept.pop("nodes", None)  # alternatives to nodes
-    return sized({**kept, **given}) if "method" in given else {**kept, **given}
+        base_section.pop("nodes", None)  # alternatives to nodes
+    return sized({**base_section, **given}) if "method" in given else {**base_section, **given}
 
 
 def read_method(section: Section) -> Method:
@@ -128,7 +128,7 @@ def text_of(section: Section, key: str, where: str) -> str:
 
 def formula_of(section: Section, key: str, where: str) -> str:
     """Return the formula value of a key, which is text or a number."""
-    if not FORMULA.holds(required(section, key, where)):
+    if not FORMULA.accepts(required(section, key, where)):
         raise ModelFileError(f"{where} {key} must be a formula between quotes or a number, not {section[key]!r}")
     return str(section[key])
 
@@ -136,7 +136,7 @@ def formula_of(section: Section, key: str, where: str) -> str:
 def check_keys(section: Section, known: Iterable[str], what: str, where: str = "the file") -> None:
     """Raise an error for unknown keys."""
     names = list(known)
-    hint = meant_by if what in ("key", "section") else closest
+    hint = key_hint if what in ("key", "section") else closest
     for key in section:
         if key not in names:
             raise ModelFileError(f"unknown {what} '{key}' in {where}{hint(key, names)} Known: {', '.join(names)}")

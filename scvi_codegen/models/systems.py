@@ -146,9 +146,9 @@ def fput_chain(n: int = 8, *, alpha: float = 0.0, beta: float = 1.0) -> Lagrangi
     if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MAX_CHAIN:
         raise SystemDefinitionError(f"a chain must have 1 to {MAX_CHAIN} masses, not {n!r}")
     names = [f"q{index}" for index in range(1, n + 1)]
-    stretches = [f"({right} - {left})" for left, right in pairwise(["0", *names, "0"])]
+    elongations = [f"({right} - {left})" for left, right in pairwise(["0", *names, "0"])]
     kinetic = " + ".join(f"{name}_dot**2/2" for name in names)
-    springs = "".join(f" - {d}**2/2 - alpha*{d}**3/3 - beta*{d}**4/4" for d in stretches)
+    springs = "".join(f" - {d}**2/2 - alpha*{d}**3/3 - beta*{d}**4/4" for d in elongations)
     return LagrangianSystem.from_text(
         name=f"FPUT chain of {n}",
         coordinates=names,

@@ -28,15 +28,15 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
         if unit is not None and str(unit) not in ("", "dimensionless"):
             raise StateError(f"{name} has the unit {unit}: give plain numbers in the units of the parameters")
     try:
-        given = np.asanyarray(value)
+        converted = np.asanyarray(value)
         rows = value if isinstance(value, list | tuple) else ()
-        if np.ma.is_masked(given) or any(map(np.ma.is_masked, rows)):
+        if np.ma.is_masked(converted) or any(map(np.ma.is_masked, rows)):
             raise StateError(f"{name} has masked entries: fill or remove them")
-        if given.dtype.kind == "O" and any(entry is None for entry in given.flat):
+        if converted.dtype.kind == "O" and any(entry is None for entry in converted.flat):
             raise StateError(f"{name} must be real numbers, not None")
-        if given.dtype.kind not in REAL_KINDS and given.size:
-            raise StateError(f"{name} must be real numbers, not {_shown(value, given.dtype)}")
-        return np.array(given, dtype=np.float64, order="C", subok=False)
+        if converted.dtype.kind not in REAL_KINDS and converted.size:
+            raise StateError(f"{name} must be real numbers, not {_shown(value, converted.dtype)}")
+        return np.array(converted, dtype=np.float64, order="C", subok=False)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, StateError):
             raise
@@ -45,11 +45,11 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
 
 def _shown(value: Any, kind: np.dtype[Any] | None = None) -> str:
     """Return a value, or its beginning, with the kind of its entries; for text with the advice to remove the quotes."""
-    said = repr(value)
-    said = said if len(said) <= LONGEST_SHOWN else f"{said[:LONGEST_SHOWN]} .."
+    shown_value = repr(value)
+    shown_value = shown_value if len(shown_value) <= LONGEST_SHOWN else f"{shown_value[:LONGEST_SHOWN]} .."
     if kind is None:
-        return said
-    return f"text: {said}, write it without quotes" if kind.kind in "US" else f"{kind.name}: {said}"
+        return shown_value
+    return f"text: {shown_value}, write it without quotes" if kind.kind in "US" else f"{kind.name}: {shown_value}"
 
 
 def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:

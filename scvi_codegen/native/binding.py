@@ -43,9 +43,9 @@ class Binding:
         self._origin = origin
         self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
         self.null = library.ffi.NULL
-        self._fallback = fallback if self._has("borrow_fallback") else None
-        self._lacks_fallback = self._fallback is not None
-        self._lender: Self | None = None
+        self._fallback = fallback if self._has("set_fallback") else None
+        self._fallback_missing = self._fallback is not None
+        self._fallback_binding: Self | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self._origin is None:
@@ -56,7 +56,7 @@ class Binding:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
         own = () if memory is None else (memory,)
-        return self._borrowing(function, *own) if self._lacks_fallback else partial(function, *own)
+        return self._with_fallback(function, *own) if self._fallback_missing else partial(function, *own)
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
@@ -67,28 +67,28 @@ class Binding:
                 f"the function {name} requires Newton's method, which this integrator does not include: compile it "
                 "with solver='auto' or solver='newton'"
             )
-        if self._lender is None:
+        if self._fallback_binding is None:
             lender = type(self)(self._fallback(), self._prefix)
-            lender._workspace = lender.constant("LENT_WORKSPACE")
-            self._lender = lender
-        return self._lender
+            lender._workspace = lender.constant("FALLBACK_WORKSPACE")
+            self._fallback_binding = lender
+        return self._fallback_binding
 
     def with_workspace(self, size: int) -> Self:
         """Return this binding with the given number of doubles of workspace."""
         self._workspace = size
         return self
 
-    def borrow_fallback(self) -> None:
+    def set_fallback(self) -> None:
         """Compile the library with Newton's method if it is used and was not required yet."""
-        if self._lacks_fallback:
-            lender = self.with_function("lent_fallback")
-            getattr(self._lib, f"{self._prefix}_borrow_fallback")(lender.function("lent_fallback")())
-            self._lacks_fallback = False
+        if self._fallback_missing:
+            lender = self.with_function("provided_fallback")
+            getattr(self._lib, f"{self._prefix}_set_fallback")(lender.function("provided_fallback")())
+            self._fallback_missing = False
 
     def _has(self, name: str) -> bool:
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
-    def _borrowing(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
+    def _with_fallback(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
         """Return the function; a call that requests the fallback is repeated with it, on the initial memory."""
         memory = self._ffi.buffer(*own) if own else bytearray()
 
@@ -97,7 +97,7 @@ class Binding:
             status = function(*own, *arguments)
             if status != NEEDED:
                 return status
-            self.borrow_fallback()
+            self.set_fallback()
             memory[:] = before
             return function(*own, *arguments)
 

@@ -39,10 +39,10 @@ from scvi_codegen.files.cache import (
     touch,
     trusted_folder,
 )
+from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.compilers import another_compiler, find_compiler, from_wheel, words_of
 from scvi_codegen.native.fingerprint import FLAGS_VARIABLE, fingerprint
 from scvi_codegen.native.processes import running
-from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.source import Source
 
 __all__ = [
@@ -67,23 +67,23 @@ PORTABLE_FLAGS = ("-O2", "-ffp-contract=off")
 DECLARATIONS, DIRECTIVE = "declarations.h", re.compile("^#", re.MULTILINE)
 """File of the declarations for cffi, and a pattern of the directives in it that depend on the processor."""
 
-CUT_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
+DIVIDED_FLAGS = ("-fno-gcse", "-fno-tree-pre", "-fno-rerun-cse-after-loop", "-fno-dse", "-fno-schedule-insns2")
 """Flags in addition to -O3 for kernels divided into functions.
 
 These passes take a tenth of gcc's time and search for common subexpressions, which are already shared; steps take as
 long without them.
 """
 
-ROLLED_FLAGS = ("--param=max-completely-peel-times=4",)
+NO_UNROLL_FLAGS = ("--param=max-completely-peel-times=4",)
 """Flags in addition to -O3 for one trajectory: without unrolling, gcc vectorises loops over coordinates.
 
 Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The lanes of ensembles must be unrolled.
 """
 
-WRITTEN_OUT = frozenset({"support/newton_solver.h", "support/shooting_sweep.h"})
+UNROLLED_HEADERS = frozenset({"support/newton_solver.h", "support/shooting_iteration.h"})
 """Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
 
-SHARED_BY_THREADS, THREADS = "support/indexed_threads.h", ("-DSCVI_THREADS", "-pthread")
+THREADS_HEADER, THREADS = "support/indexed_threads.h", ("-DSCVI_THREADS", "-pthread")
 """Header of sources whose steps threads may share, and the flags for them."""
 
 COMPILE_SECONDS = 600
@@ -200,7 +200,7 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
     with tempfile.TemporaryDirectory(prefix=".building-", dir=entry.parent, ignore_cleanup_errors=True) as folder:
         built = Path(folder) / entry.name
         built.mkdir(mode=0o755)
-        with waiting_for(_work(source, compiler, flags)):
+        with announced(_work(source, compiler, flags)):
             _compile(source, compiler, flags, built)
         (built / "manifest.json").write_text(json.dumps({"sha256": _checksum(built), "prefix": source.prefix}))
         for file in built.rglob("*"):
@@ -225,9 +225,9 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
     """Compile the parts concurrently, one process each; then link them, and write the binding."""
     source.write(folder)
-    is_cut = any("support/parts.h" in each.files for each in source.sources)
-    cut = CUT_FLAGS if is_cut and _takes_flags(compiler, CUT_FLAGS) else ()
-    threads = THREADS if any(SHARED_BY_THREADS in each.files for each in source.sources) else ()
+    is_divided = any("support/parts.h" in each.files for each in source.sources)
+    cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
+    threads = THREADS if any(THREADS_HEADER in each.files for each in source.sources) else ()
     wanted = [*threads, *words_of(FLAGS_VARIABLE)]
     parts = {each.prefix: _passes(each, flags, cut) for each in source.sources}
     objects = ["-shared", *wanted, *(f"{name}.o" for name in parts)]
@@ -257,11 +257,11 @@ def _declarations(source: Source, command: list[str], folder: Path) -> str:
     text = "".join(each.declarations for each in source.sources)
     if not DIRECTIVE.search(text):
         return text
-    given, found = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
-    given.write_text(text, encoding="utf-8")
-    run_compiler([*command, "-E", "-P", given.name, "-o", found.name], folder)
+    declarations_file, found = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
+    declarations_file.write_text(text, encoding="utf-8")
+    run_compiler([*command, "-E", "-P", declarations_file.name, "-o", found.name], folder)
     text = found.read_text(encoding="utf-8")
-    given.unlink()
+    declarations_file.unlink()
     found.unlink()
     return text
 
@@ -293,7 +293,7 @@ def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple
     """Return further flags of gcc for a source, with -O3."""
     if "-O3" not in flags:
         return ()
-    rolled = ROLLED_FLAGS if "support/run.h" in part.files and WRITTEN_OUT.isdisjoint(part.files) else ()
+    rolled = NO_UNROLL_FLAGS if "support/run.h" in part.files and UNROLLED_HEADERS.isdisjoint(part.files) else ()
     return (*cut, *rolled)
 
 

@@ -73,7 +73,7 @@ def compiler_title() -> str:
 
 @cache
 def _title_of(command: tuple[str, ...]) -> str:
-    return (_said_by(command).splitlines() or [" ".join(command)])[0]
+    return (_version_output(command).splitlines() or [" ".join(command)])[0]
 
 
 @cache
@@ -84,10 +84,10 @@ def compiler_version(compiler: tuple[str, ...]) -> str:
         with suppress(OSError):
             status = file.stat()
             return f"{file} {status.st_size} {status.st_mtime_ns}"
-    return _said_by(compiler)
+    return _version_output(compiler)
 
 
-def _said_by(compiler: tuple[str, ...]) -> str:
+def _version_output(compiler: tuple[str, ...]) -> str:
     """Return the version that the compiler prints."""
     settings: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace", "timeout": 60}
     try:

@@ -8,8 +8,8 @@ import tempfile
 from pathlib import Path
 
 from scvi_codegen.errors import BuildError
+from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import run_compiler
-from scvi_codegen.native.waiting import waiting_for
 from scvi_codegen.rendering.source import Source
 
 __all__ = ["TARGETS", "library_for"]
@@ -40,6 +40,6 @@ def library_for(platform: str, source: Source, *, flags: tuple[str, ...]) -> byt
         source.write(folder)
         texts = [f"{each.prefix}.c" for each in source.sources]
         command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], "-shared", "-fPIC", "-s"]
-        with waiting_for(f"compiling for {platform}, slowest the first time"):
+        with announced(f"compiling for {platform}, slowest the first time"):
             run_compiler([*command, "-std=c99", "-I.", *flags, *texts, "-lm", "-o", made], folder)
         return (folder / made).read_bytes()

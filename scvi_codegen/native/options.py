@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.rendering.stopping import MAX_ITERATIONS, TOLERANCE
+from scvi_codegen.rendering.convergence import MAX_ITERATIONS, TOLERANCE
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["FAILURES", "NOT_CONVERGED", "REASONS", "STATUS", "SolverOptions", "checked_options", "step_failure"]
 

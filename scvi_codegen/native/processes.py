@@ -44,16 +44,16 @@ def _started(command: Sequence[str], folder: Path, stdin: int, *, session: bool)
 
 @contextmanager
 def _guarded(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
-    held, pipe = os.pipe()
+    read_end, pipe = os.pipe()
     try:
-        with _started(["/bin/sh", "-c", GUARDED, "sh", *command], folder, held, session=True) as process:
+        with _started(["/bin/sh", "-c", GUARDED, "sh", *command], folder, read_end, session=True) as process:
             try:
                 yield process
             finally:
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
     finally:
-        os.close(held)
+        os.close(read_end)
         os.close(pipe)
 
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, takes
 from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
 from scvi_codegen.pictures.motion import MOTION, Array, DrawnMotion
 from scvi_codegen.pictures.shapes import MovingPoints, shape_of
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.animation import FuncAnimation
@@ -35,7 +35,7 @@ SIZE = 4.8
 """Width and height of the figure in inches."""
 
 
-@takes(trajectory=MOTION, path=PATH, seconds=REAL, positions=FUNCTION)
+@checks_arguments(trajectory=MOTION, path=PATH, seconds=REAL, positions=FUNCTION)
 def animate(
     trajectory: DrawnMotion,
     path: str | os.PathLike[str] | None = None,
@@ -134,13 +134,13 @@ class _Scene:
 
     def __init__(self, figure: Any, motion: DrawnMotion, shape: MovingPoints) -> None:
         self.motion, self.shape = motion, shape
-        self.places = shape.points(motion.q, motion.p)
-        dimension = self.places.shape[2]
+        self.drawn_points = shape.points(motion.q, motion.p)
+        dimension = self.drawn_points.shape[2]
         self.axes: Axes = figure.add_subplot(projection="3d" if dimension == 3 else None)
         self._set_limits(dimension)
         nothing: list[list[float]] = [[]] * dimension
         self.trails = [self.axes.plot(*nothing, color=color(k), linewidth=1.0, alpha=0.5)[0] for k in shape.trails]
-        marks: list[Any] = [slice(None)] if shape.joined else list(range(self.places.shape[1]))
+        marks: list[Any] = [slice(None)] if shape.joined else list(range(self.drawn_points.shape[1]))
         names = shape.names or ("",) * len(marks)
         line = "o-" if shape.joined else "o"
         self.marks = [
@@ -151,7 +151,7 @@ class _Scene:
             self.axes.legend(loc="upper right", fontsize=8)
 
     def _set_limits(self, dimension: int) -> None:
-        flat = self.places.reshape(-1, dimension)
+        flat = self.drawn_points.reshape(-1, dimension)
         flat = flat[np.isfinite(flat).all(axis=1)]
         low, high = flat.min(axis=0), flat.max(axis=0)
         half = (high - low) / 2
@@ -165,12 +165,12 @@ class _Scene:
 
     def show(self, frame: int) -> list[Any]:
         """Show the state of a frame, and its trails."""
-        first = max(0, frame - round(TRAIL * len(self.places)))
+        first = max(0, frame - round(TRAIL * len(self.drawn_points)))
         rows = np.arange(first, frame + 1)[:: max(1, (frame - first) // TRAIL_POINTS)]
         for k, trail in zip(self.shape.trails, self.trails, strict=True):
-            _set(trail, np.concatenate([self.places[rows, k], self.places[frame : frame + 1, k]]))
+            _set(trail, np.concatenate([self.drawn_points[rows, k], self.drawn_points[frame : frame + 1, k]]))
         for which, mark in self.marks:
-            _set(mark, np.atleast_2d(self.places[frame, which]))
+            _set(mark, np.atleast_2d(self.drawn_points[frame, which]))
         interface = self.motion.stepper.interface
         self.axes.set_title(plain(f"{interface.system}, t = {self.motion.t[frame]:.6g}"))
         return [*self.trails, *(mark for _, mark in self.marks)]

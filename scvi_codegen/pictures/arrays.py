@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.given.kinds import CANVAS, PATH, TEXT, Kind, takes
 from scvi_codegen.pictures.canvas import color, panel, plain
+from scvi_codegen.validation.argument_types import CANVAS, PATH, TEXT, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,8 +35,8 @@ class ArrayMotion(Protocol):
     def observed(self) -> NDArray[np.float64] | None: ...
 
 
-@takes(
-    trajectory=Kind("a trajectory of arrays", lambda given: hasattr(given, "energies")),
+@checks_arguments(
+    trajectory=ArgumentType("a trajectory of arrays", lambda arguments: hasattr(arguments, "energies")),
     array=TEXT,
     path=PATH,
     ax=CANVAS,
@@ -76,7 +76,7 @@ def plot_arrays(
     with panel(path, ax) as drawn:
         drawn.grid(visible=False)
         if values.ndim == 3 and values.shape[2] in IN_SPACE:
-            _draw_places(drawn, values, name)
+            _draw_positions(drawn, values, name)
         elif values.ndim == 3:
             _draw_picture(drawn, values[-1].T, name, None)
             drawn.set(xlabel="first index", ylabel="second index", title=f"t = {trajectory.t[-1]:g}")
@@ -96,7 +96,7 @@ def _draw_picture(drawn: Axes, values: NDArray[np.float64], name: str, extent: A
     drawn.figure.colorbar(image, ax=drawn, label=plain(name))
 
 
-def _draw_places(drawn: Axes, values: NDArray[np.float64], name: str) -> None:
+def _draw_positions(drawn: Axes, values: NDArray[np.float64], name: str) -> None:
     for number, (state, label) in enumerate(((values[0], "start"), (values[-1], "end"))):
         drawn.plot(state[:, 0], state[:, 1], ".", color=color(number), markersize=3, label=label)
     drawn.set_aspect("equal", adjustable="datalim")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.kinds import CANVAS, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel
 from scvi_codegen.pictures.motion import HISTORIES, MOTION, Array, DrawnMotion, EnergyHistory, several
+from scvi_codegen.validation.argument_types import CANVAS, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ __all__ = ["draw_energy_error", "largest_in_bins", "plot_energy", "plot_momentum
 BINS = 600
 
 
-@takes(trajectories=HISTORIES, path=PATH, ax=CANVAS)
+@checks_arguments(trajectories=HISTORIES, path=PATH, ax=CANVAS)
 def plot_energy(
     trajectories: EnergyHistory | Sequence[EnergyHistory],
     path: str | os.PathLike[str] | None = None,
@@ -44,7 +44,7 @@ def plot_energy(
     return drawn
 
 
-@takes(trajectory=MOTION, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=MOTION, path=PATH, ax=CANVAS)
 def plot_momentum_maps(
     trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None
 ) -> Axes:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.kinds import Kind
+from scvi_codegen.validation.argument_types import ArgumentType
 
 if TYPE_CHECKING:
     from scvi_codegen.rendering.source import Interface
@@ -79,18 +79,18 @@ class DrawnMotion(Protocol):
 Motions: TypeAlias = DrawnMotion | Sequence[DrawnMotion]
 """One trajectory, or several of the same system."""
 
-MOTION = Kind("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
+MOTION = ArgumentType("a trajectory", lambda value: hasattr(value, "stepper") and hasattr(value, "q"))
 
 
-def _one_or_several(kind: Kind) -> Kind:
-    return Kind(
+def _one_or_several(kind: ArgumentType) -> ArgumentType:
+    return ArgumentType(
         f"{kind.words} or a list of them",
-        lambda value: kind.holds(value) or (isinstance(value, Sequence) and all(map(kind.holds, value))),
+        lambda value: kind.accepts(value) or (isinstance(value, Sequence) and all(map(kind.accepts, value))),
     )
 
 
 MOTIONS = _one_or_several(MOTION)
-HISTORIES = _one_or_several(Kind(MOTION.words, lambda value: hasattr(value, "t") and hasattr(value, "energy")))
+HISTORIES = _one_or_several(ArgumentType(MOTION.words, lambda value: hasattr(value, "t") and hasattr(value, "energy")))
 
 
 def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
@@ -99,10 +99,10 @@ def several(motions: Drawn | Sequence[Drawn]) -> Sequence[Drawn]:
     Raises:
         StateError: if there is none.
     """
-    found = motions if isinstance(motions, Sequence) else [motions]
-    if not found:
+    result = motions if isinstance(motions, Sequence) else [motions]
+    if not result:
         raise StateError("there is no trajectory to draw")
-    return found
+    return result
 
 
 def column(interface: Interface, states: Any, name: str) -> Array:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from scvi_codegen.given.kinds import PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import bodies
 from scvi_codegen.pictures.canvas import COLORS, check_plot_path, new_figure, plain, save, style
 from scvi_codegen.pictures.conserved import draw_energy_error
 from scvi_codegen.pictures.motion import MOTION, DrawnMotion
 from scvi_codegen.pictures.paths import draw_paths, path_panels
+from scvi_codegen.validation.argument_types import PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_trajectory"]
 
 
-@takes(trajectory=MOTION, path=PATH)
+@checks_arguments(trajectory=MOTION, path=PATH)
 def plot_trajectory(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None) -> tuple[Axes, ...]:
     """Draw the path of a trajectory on the left, its relative energy error over time on the right.
 

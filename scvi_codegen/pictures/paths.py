@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scvi_codegen.given.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
+from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["draw_paths", "path_panels", "plot_motion", "plot_phase"]
 
-MOST_POINTS = 20_000
-MOST_CURVES = 6
+MAX_POINTS = 20_000
+MAX_CURVES = 6
 
 
-@takes(trajectory=MOTION, path=PATH, ax=CANVAS)
+@checks_arguments(trajectory=MOTION, path=PATH, ax=CANVAS)
 def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = None, *, ax: Axes | None = None) -> Axes:
     """Draw the path of a trajectory: orbits, a plane of coordinates, a phase plane, or all coordinates over time.
 
@@ -44,7 +44,7 @@ def plot_motion(trajectory: DrawnMotion, path: str | os.PathLike[str] | None = N
     return drawn
 
 
-@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
 def plot_phase(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,
@@ -62,10 +62,10 @@ def plot_phase(
     Raises:
         StateError, PlotError: as :func:`plot_motion`; StateError also for an unknown name.
     """
-    found = several(trajectories)
-    interface = found[0].stepper.interface
+    result = several(trajectories)
+    interface = result[0].stepper.interface
     names = axes or (interface.coordinates[0], interface.momenta[0])
-    curves = [[column(interface, motion, name) for name in names] for motion in found]
+    curves = [[column(interface, motion, name) for name in names] for motion in result]
     with panel(path, ax) as drawn:
         for number, (x, y) in enumerate(curves):
             _draw_curve(drawn, x, y, color(number))
@@ -76,9 +76,9 @@ def plot_phase(
 def path_panels(motion: DrawnMotion) -> int:
     """Return the number of panels of a path: two for motion in space and for three to six coordinates."""
     coordinates = motion.stepper.interface.coordinates
-    found = bodies(coordinates)
-    spatial = found and len(found[0].columns) == 3
-    return 2 if spatial or (not found and 3 <= len(coordinates) <= MOST_CURVES) else 1
+    result = bodies(coordinates)
+    spatial = result and len(result[0].columns) == 3
+    return 2 if spatial or (not result and 3 <= len(coordinates) <= MAX_CURVES) else 1
 
 
 def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
@@ -88,13 +88,13 @@ def draw_paths(panels: Sequence[Axes], motion: DrawnMotion) -> None:
     coordinates as one image over time.
     """
     coordinates = motion.stepper.interface.coordinates
-    found, m = bodies(coordinates), len(coordinates)
+    result, m = bodies(coordinates), len(coordinates)
     if m == 1:
         _draw_phase_plane(panels[0], motion)
-    elif found:
+    elif result:
         for drawn, plane in zip(panels, combinations(range(3), 2), strict=False):
-            _draw_orbits(drawn, motion, found, plane)
-    elif m <= MOST_CURVES:
+            _draw_orbits(drawn, motion, result, plane)
+    elif m <= MAX_CURVES:
         for drawn, plane in zip(panels, combinations(range(m), 2), strict=False):
             _draw_plane(drawn, motion, plane)
     else:
@@ -116,17 +116,17 @@ def _draw_plane(axes: Axes, motion: DrawnMotion, plane: tuple[int, int]) -> None
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_orbits(axes: Axes, motion: DrawnMotion, found: Sequence[Body], plane: tuple[int, int]) -> None:
-    for number, body in enumerate(found):
+def _draw_orbits(axes: Axes, motion: DrawnMotion, result: Sequence[Body], plane: tuple[int, int]) -> None:
+    for number, body in enumerate(result):
         x, y = (motion.q[:, body.columns[index]] for index in plane)
         _draw_curve(axes, x, y, color(number), body.name or None)
-    axes.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(found) > 1 else "orbit")
+    axes.set(xlabel=AXES[plane[0]], ylabel=AXES[plane[1]], title="orbits" if len(result) > 1 else "orbit")
     axes.set_aspect("equal", adjustable="datalim")
 
 
 def _draw_curve(axes: Axes, x: Array, y: Array, color: str, label: str | None = None) -> None:
     """Draw a curve with a ring at the first and a dot at the last state; points if steps are large."""
-    every = max(1, len(x) // MOST_POINTS)
+    every = max(1, len(x) // MAX_POINTS)
     x_drawn, y_drawn = x[::every], y[::every]
     if _is_coarse(x_drawn, y_drawn):
         axes.plot(x_drawn, y_drawn, ".", color=color, markersize=2.0, alpha=0.7)

@@ -6,9 +6,9 @@ import os
 from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.kinds import CANVAS, NAMES, PATH, takes
 from scvi_codegen.pictures.canvas import color, panel, plain
 from scvi_codegen.pictures.motion import MOTIONS, Array, DrawnMotion, Motions, column, several
+from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 __all__ = ["plot_section"]
 
 FEW_POINTS = 2000
-WAY = {1: ", rising", 0: "", -1: ", falling"}
+DIRECTION_TEXT = {1: ", rising", 0: "", -1: ", falling"}
 
 
-@takes(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
+@checks_arguments(trajectories=MOTIONS, path=PATH, ax=CANVAS, axes=NAMES)
 def plot_section(
     trajectories: Motions,
     path: str | os.PathLike[str] | None = None,
@@ -41,16 +41,16 @@ def plot_section(
         StateError: for an unknown name, or without such an event.
         PlotError: without matplotlib.
     """
-    found = several(trajectories)
-    points = [[_at_crossings(motion, name, event) for name in axes] for motion in found]
+    result = several(trajectories)
+    points = [[_at_crossings(motion, name, event) for name in axes] for motion in result]
     size = 2.0 if sum(len(x) for x, _ in points) > FEW_POINTS else 4.0
-    stepper = found[0].stepper
+    stepper = result[0].stepper
     cut = stepper.events[event]
     with panel(path, ax, (5.6, 5.2)) as drawn:
         for number, (x, y) in enumerate(points):
             drawn.plot(x, y, ".", color=color(number), markersize=size, markeredgewidth=0.0)
         drawn.set(xlabel=axes[0], ylabel=axes[1])
-        drawn.set_title(plain(f"{stepper.interface.system}: {cut.function} = 0{WAY[cut.direction]}"))
+        drawn.set_title(plain(f"{stepper.interface.system}: {cut.function} = 0{DIRECTION_TEXT[cut.direction]}"))
     return drawn
 
 

@@ -18,7 +18,7 @@ __all__ = ["MovingPoints", "shape_of"]
 NUMBERED = re.compile(r"(.*?)_?(\d+)")
 LENGTHS = ("l", "L", "length")
 """Names of parameters that are rod lengths, alone or followed by a number."""
-MOST_RODS = 6
+MAX_RODS = 6
 GENERIC = 0.3, 0.17
 """First angle, and difference between angles, of a state without accidental symmetry."""
 
@@ -57,12 +57,12 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
     coordinates, m = motion.stepper.interface.coordinates, motion.q.shape[1]
     if positions is not None:
         return _given(motion, positions)
-    if found := bodies(coordinates):
-        columns = np.array([body.columns for body in found])
-        names = tuple(body.name for body in found if body.name)
+    if result := bodies(coordinates):
+        columns = np.array([body.columns for body in result])
+        names = tuple(body.name for body in result if body.name)
         labels = tuple("xyz"[: columns.shape[1]])
         return MovingPoints(
-            points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(found))), names=names
+            points=lambda q, p: q[:, columns], labels=labels, trails=tuple(range(len(result))), names=names
         )
     if (sign := _hanging(motion)) is not None:
         return _pendulum(_lengths(motion), sign)
@@ -71,9 +71,9 @@ def shape_of(motion: DrawnMotion, positions: Callable[[Array], Array] | None = N
         return MovingPoints(points=lambda q, p: np.stack([q, p], axis=2), labels=labels, trails=(0,), equal=False)
     if m == 2:
         return MovingPoints(points=lambda q, p: q[:, np.newaxis], labels=tuple(coordinates), trails=(0,))
-    places = np.arange(1.0, m + 1)
+    positions_of_indices = np.arange(1.0, m + 1)
     return MovingPoints(
-        points=lambda q, p: np.stack([np.broadcast_to(places, q.shape), q], axis=2),
+        points=lambda q, p: np.stack([np.broadcast_to(positions_of_indices, q.shape), q], axis=2),
         labels=("number of the coordinate", "q"),
         joined=True,
         equal=False,
@@ -109,7 +109,7 @@ def _hanging(motion: DrawnMotion) -> float | None:
     coupled: the kinetic energy of two momenta must not be the sum of that of each.
     """
     numbers, m = _numbers(motion.stepper.interface.coordinates), motion.q.shape[1]
-    if m > MOST_RODS or (m > 1 and numbers is None):
+    if m > MAX_RODS or (m > 1 and numbers is None):
         return None
     generic = GENERIC[0] + GENERIC[1] * np.arange(m)
     q = np.concatenate([np.zeros((1, m)), math.pi * np.eye(m), [generic]])
@@ -134,10 +134,10 @@ def _energies(motion: DrawnMotion, q: Array, p: Array) -> Array:
 
 def _numbers(names: Sequence[str]) -> tuple[int, ...] | None:
     """Return the numbers of theta_1, theta_2, .. or theta1, theta2, ..; ``None`` for other names."""
-    found = [NUMBERED.fullmatch(name) for name in names]
-    if not all(found) or len({match[1] for match in found if match}) > 1:
+    result = [NUMBERED.fullmatch(name) for name in names]
+    if not all(result) or len({match[1] for match in result if match}) > 1:
         return None
-    return tuple(int(match[2]) for match in found if match)
+    return tuple(int(match[2]) for match in result if match)
 
 
 def _lengths(motion: DrawnMotion) -> Array:

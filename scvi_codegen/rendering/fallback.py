@@ -13,13 +13,13 @@ from typing import Literal, TypeAlias
 
 __all__ = ["HEADERS", "Fallback"]
 
-Fallback: TypeAlias = Literal["own", "borrowed", "lent", "none"]
+Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: ``own``; that of another library (``borrowed``); its own, also for others (``lent``); none."""
 
 HEADERS: dict[Fallback, tuple[str, ...]] = {
     "own": ("newton_fallback",),
-    "borrowed": ("fallback", "borrowed_fallback"),
-    "lent": ("fallback", "newton_fallback"),
+    "external": ("fallback", "external_fallback"),
+    "provided": ("fallback", "newton_fallback"),
     "none": ("no_fallback",),
 }
 """Support headers before the solver by fixed-point iteration, in order."""

@@ -39,7 +39,7 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
 
     Args:
         derivatives: a source with derivatives of steps.
-        second: whether to add second derivatives, ``<prefix>_bend_rows``, which the source must have.
+        second: whether to add second derivatives, ``<prefix>_hessian_rows``, which the source must have.
     """
     prefix = derivatives.prefix
     shape, rest = (
@@ -48,9 +48,8 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
     )
     declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
     if second:
-        declared += (
-            f"int {prefix}_bend_rows({shape}, const double *x, const double *slopes, const double *changes, {rest});\n"
-        )
+        declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
+        declared += f"const double *slopes, const double *changes, {rest});\n"
     headers = ("flow", "rows_flow", *(("flow_second", "rows_second") if second else ()))
     return _behind(derivatives, "\n", headers, declared)
 

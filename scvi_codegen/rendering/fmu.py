@@ -6,15 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.program_source import ExampleRun
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE
-from scvi_codegen.rendering.text import ExampleRun
 
 __all__ = ["with_fmu"]
 
 
 def with_fmu(
-    source: Source, interface: Interface, start: ExampleRun, *, by_velocity: bool, places: Sequence[int], token: str
+    source: Source,
+    interface: Interface,
+    start: ExampleRun,
+    *,
+    by_velocity: bool,
+    input_indices: Sequence[int],
+    token: str,
 ) -> Source:
     """Return the source of an integrator with the functions of FMI.
 
@@ -30,7 +36,7 @@ def with_fmu(
         "prefix": interface.prefix,
         "start": start,
         "by_velocity": by_velocity,
-        "places": places,
+        "places": input_indices,
         "token": token,
         "target": DOUBLE,
     }

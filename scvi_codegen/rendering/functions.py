@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, IndexedSum, Kernel, Load
-from scvi_codegen.ir.parts import Part, parts
-from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir.kernel_parts import Part, parts
 from scvi_codegen.rendering.lanes import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
@@ -17,7 +17,7 @@ from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]
 
-LAID_OUT = "  /* clang-format off */\n{}\n  /* clang-format on */"
+UNFORMATTED = "  /* clang-format off */\n{}\n  /* clang-format on */"
 """Wrapper for statements of several lines, whose layout differs from that of clang-format."""
 
 PART = "static SCVI_NOINLINE"
@@ -36,7 +36,7 @@ def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
     return "\n\n".join([*texts, _whole("static", kernel, arguments, statements)])
 
 
-def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
+def lane_kernel_text(kernel: Kernel, sweep: FixedPointIteration, lanes: Lanes) -> str:
     """Return a function of vectors."""
     declared = {name: f"lanes *{name}" for name in ARRAYS}
     declared |= {"u": "const lanes *u", "t": f"{lanes.type_of('t')} t", "kept": "lanes *restrict kept"}
@@ -53,7 +53,7 @@ def lane_kernel_text(kernel: Kernel, sweep: Sweep, lanes: Lanes) -> str:
     return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
 
 
-def lane_mass_text(kernel: Kernel, sweep: Sweep, lanes: Lanes, target: Target) -> str:
+def lane_mass_text(kernel: Kernel, sweep: FixedPointIteration, lanes: Lanes, target: Target) -> str:
     """Return the function of constant masses: of numbers for one trajectory, or of vectors for many."""
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
 
@@ -83,11 +83,11 @@ def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
     lines = []
     for each in kernel.sums:
         slots, values = len(each.table[0]), each.term.values
-        aims = _table_name(each, "targets" if each.targets else "places")
+        targets_table = _table_name(each, "targets" if each.targets else "places")
         given = [_constant(each, k, real, sources) for k in range(len(each.given))]
         lines += [
             f"for (int e = 0; e < {len(each.table)}; e++) {{",
-            f"  const int *at = {_table_name(each, 'places')}[e], *to = {aims}[e];",
+            f"  const int *at = {_table_name(each, 'places')}[e], *to = {targets_table}[e];",
             f"  {real} slot[{each.term.arguments}], term[{values}];",
             *(f"  slot[{a}] = u[at[{a}]];" for a in range(slots)),
             *(f"  slot[{slots + k}] = {text};" for k, text in enumerate(given)),
@@ -135,6 +135,6 @@ def _whole(storage: str, kernel: Kernel, arguments: Sequence[str], statements: S
 def _function(storage: str, code: Kernel | Part, arguments: Sequence[str], statements: Sequence[str]) -> str:
     lines = [wrapped(statement) for statement in statements]
     body = "\n".join(lines)
-    laid_out = LAID_OUT.format(body) if any("\n" in line for line in lines) else body
+    laid_out = UNFORMATTED.format(body) if any("\n" in line for line in lines) else body
     head = wrapped_prototype(f"{storage} void {code.name}({', '.join(arguments)})")
     return f"{head}\n{{\n{laid_out}\n}}"

@@ -7,24 +7,24 @@ from typing import Any
 
 from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.parts import is_cut
-from scvi_codegen.rendering.control import ladder_text
+from scvi_codegen.ir.kernel_parts import is_divided
+from scvi_codegen.rendering.control import predictor_text
+from scvi_codegen.rendering.convergence import MAX_ITERATIONS
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.indexed_constraints import held_context
-from scvi_codegen.rendering.lanes import LIBRARY, POINTS, SweepText, sweep_text
-from scvi_codegen.rendering.nests import DIRECTION, Nest
+from scvi_codegen.rendering.indexed_constraints import constraint_context
+from scvi_codegen.rendering.lanes import LIBRARY, POINTS, IterationSource, iteration_source
+from scvi_codegen.rendering.lattices import lattice_context, roots_per_coordinate
+from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
 from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
-from scvi_codegen.rendering.sharing import MOST_THREADS, Sharing, sharing_of, sharing_text
 from scvi_codegen.rendering.sizes import product_text, sizes_text
 from scvi_codegen.rendering.source import Source, included
-from scvi_codegen.rendering.stopping import MAX_ITERATIONS
 from scvi_codegen.rendering.target import DOUBLE
-from scvi_codegen.rendering.waves import roots_of, waves_context
+from scvi_codegen.rendering.thread_sharing import MOST_THREADS, Sharing, sharing_of, sharing_text
 
 __all__ = ["render_indexed", "render_indexed_example"]
 
-EXPLICIT_VECTORS, HELD_VECTORS, SWEEP_VECTORS = 4, 7, 4
+EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.
 
 Positions, forces, increments; with constraints also constraint forces and trial increments; for iterations positions
@@ -32,8 +32,8 @@ at the points, forces in this step and in two former ones.
 """
 NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/gmres.h)."""
-WAVE_VECTORS = 2
-"""Further vectors: scratch of Fourier transforms (templates/support/indexed_waves.h)."""
+FOURIER_VECTORS = 2
+"""Further vectors: scratch of Fourier transforms (templates/support/fourier_preconditioner.h)."""
 HALVES_VECTORS = 7
 """Further vectors: the state at the start of a step and three increments (templates/support/indexed_halves.h)."""
 
@@ -56,7 +56,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
         "most_threads": 1 if program.held else MOST_THREADS,
-        "cut": is_cut((*scalars, *(each.kernel for each in applied))),
+        "cut": is_divided((*scalars, *(each.kernel for each in applied))),
         "forces": [_force_text(program, each) for each in applied],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
         "masses": [_mass_text(program, each) for each in program.masses],
@@ -69,15 +69,19 @@ def render_indexed(program: IndexedProgram) -> Source:
         "coordinates": " + ".join(map(product_text, program.coordinates)),
         "sweep": _sweep_text(program),
         "work": _work(program),
-        "sweep_vectors": SWEEP_VECTORS,
+        "iteration_vectors": ITERATION_VECTORS,
         "halves_vectors": HALVES_VECTORS,
         "hot": "static",
-        "waves": waves_context(program) if program.reach else None,
-        **held_context(program),
+        "waves": lattice_context(program) if program.reach else None,
+        **constraint_context(program),
     }
     code = environment.get_template("indexed.c.jinja").render(context)
     control = program.control
-    own = {f"support/{program.prefix}_ladder.h": ladder_text(control.ladder)} if control and control.ladder else {}
+    own = (
+        {f"support/{program.prefix}_predictor.h": predictor_text(control.predictor)}
+        if control and control.predictor
+        else {}
+    )
     return Source(
         prefix=program.prefix,
         header=environment.get_template("indexed.h.jinja").render(context),
@@ -103,17 +107,17 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
 def _work(program: IndexedProgram) -> int:
     """Return the number of doubles of ``work`` per coordinate."""
     if program.sweep is None:
-        return HELD_VECTORS if program.held else EXPLICIT_VECTORS
-    own = 2 * SWEEP_VECTORS if program.momenta else SWEEP_VECTORS + bool(program.velocities)
+        return CONSTRAINED_VECTORS if program.held else EXPLICIT_VECTORS
+    own = 2 * ITERATION_VECTORS if program.momenta else ITERATION_VECTORS + bool(program.velocities)
     linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
-    waves = WAVE_VECTORS * program.sweep.lanes + roots_of(program) if program.reach else 0
+    waves = FOURIER_VECTORS * program.sweep.lanes + roots_per_coordinate(program) if program.reach else 0
     return (own + linear) * program.sweep.lanes + waves + HALVES_VECTORS
 
 
-def _sweep_text(program: IndexedProgram) -> SweepText | None:
+def _sweep_text(program: IndexedProgram) -> IterationSource | None:
     applied = (*program.forces, *program.products, *program.diagonals)
     sweep, kernels = program.sweep, [each.kernel for each in applied]
-    return sweep_text(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
+    return iteration_source(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
 
 
 def _vector_functions(program: IndexedProgram) -> list[str]:

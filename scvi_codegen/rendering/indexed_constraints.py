@@ -7,17 +7,17 @@ from dataclasses import replace
 from itertools import accumulate
 from typing import Any
 
-from scvi_codegen.ir.indexed import HeldSteps, IndexedProgram, LoopedKernel
-from scvi_codegen.rendering.nests import DIRECTION, Nest
+from scvi_codegen.ir.indexed import ConstrainedSteps, IndexedProgram, LoopedKernel
+from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
 from scvi_codegen.rendering.sizes import count_text, sizes_text
 
-__all__ = ["held_context"]
+__all__ = ["constraint_context"]
 
 X = "const double *restrict X"
 CURSOR = "condition *now"
 
 
-def held_context(program: IndexedProgram) -> dict[str, Any]:
+def constraint_context(program: IndexedProgram) -> dict[str, Any]:
     """Return the template's context for constraints."""
     held = program.held
     if held is None:
@@ -35,7 +35,7 @@ def held_context(program: IndexedProgram) -> dict[str, Any]:
     return {"held": found, "part_ends": list(accumulate(held.parts))}
 
 
-def _texts(program: IndexedProgram, held: HeldSteps) -> tuple[list[str], list[str], list[str]]:
+def _texts(program: IndexedProgram, held: ConstrainedSteps) -> tuple[list[str], list[str], list[str]]:
     """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
     return (
         [_condition(program, each) for each in held.conditions],

@@ -10,15 +10,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from scvi_codegen.ir.iteration import FixedPointIteration, IterationTable, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.sweep import Kept, Sweep, SweepTable
 from scvi_codegen.rendering.fallback import HEADERS, Fallback
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["LIBRARY", "POINTS", "TRAJECTORIES", "Lanes", "SweepText", "sweep_text"]
+__all__ = ["LIBRARY", "POINTS", "TRAJECTORIES", "IterationSource", "Lanes", "iteration_source"]
 
 LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
@@ -54,11 +54,11 @@ class Lanes:
 
 
 POINTS = Lanes(("u", "t"), "points", (), "one_trajectory")
-TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("crowd_step",), "many_trajectories")
+TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("batched_step",), "many_trajectories")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SweepText:
+class IterationSource:
     """Template data of a fixed-point iteration.
 
     Attributes:
@@ -100,14 +100,14 @@ class SweepText:
         return any("LIBRARY" in line for line in self.functions)
 
 
-def sweep_text(
-    sweep: Sweep,
+def iteration_source(
+    sweep: FixedPointIteration,
     meaning: Lanes,
     *,
     fallback: Fallback,
     kernels: Sequence[Kernel] | None = None,
     changes: bool = False,
-) -> SweepText:
+) -> IterationSource:
     """Return the template data of a fixed-point iteration.
 
     Args:
@@ -123,12 +123,12 @@ def sweep_text(
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
     solver = _solver(sweep, fallback) if meaning.are_points else ()
-    return SweepText(
+    return IterationSource(
         lanes=sweep.lanes,
         whole=meaning.are_points and not sweep.in_groups,
         meaning=meaning,
         defines={
-            "SWEEPS_AFTER": str(sweep.sweeps_after),
+            "FINAL_ITERATIONS": str(sweep.final_iterations),
             **{name: str(value) for name, value in sweep.facts.items()},
         },
         functions=tuple(map(_function, sorted(functions))),
@@ -136,20 +136,20 @@ def sweep_text(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "contraction", "inverse_sizes", meaning.memory, *sweep.parts, *solver),
+        support=(*meaning.before, "convergence", "inverse_sizes", meaning.memory, *sweep.parts, *solver),
         error_defines=_kept(sweep),
         highest=_groups("HIGHEST", sweep.guess.highest),
         next=_groups("NEXT", sweep.guess.next),
     )
 
 
-def _kept(sweep: Sweep) -> dict[str, str]:
+def _kept(sweep: FixedPointIteration) -> dict[str, str]:
     """Return the macros of the error estimate.
 
     Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations.
     """
-    velocities, degree = sweep.kept is Kept.VELOCITIES, sweep.guess.degree
-    forces = sweep.kept is Kept.FORCES
+    velocities, degree = sweep.kept is StoredValues.VELOCITIES, sweep.guess.degree
+    forces = sweep.kept is StoredValues.FORCES
     return {
         "KEPT": str(len(sweep.guess.abscissae)),
         "KEPT_VELOCITIES": str(int(velocities)),
@@ -168,25 +168,25 @@ def _function(name: str) -> str:
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 
-def _solver(sweep: Sweep, fallback: Fallback) -> tuple[str, ...]:
+def _solver(sweep: FixedPointIteration, fallback: Fallback) -> tuple[str, ...]:
     """Return the headers of the solver around an iteration whose lanes are points, in order."""
-    solver = (*HEADERS[fallback], "sweep_solver")
+    solver = (*HEADERS[fallback], "iteration_solver")
     if not sweep.integral_part:
         return solver
     return (*solver, sweep.integral_part, f"integrals_after_{'sweep' if fallback == 'none' else 'fallback'}")
 
 
-def _tables(sweep: Sweep, meaning: Lanes, *, changes: bool) -> Iterator[str]:
+def _tables(sweep: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
     points = len(sweep.guess.abscissae)
     vector, matrix = _printers(meaning, points) if sweep.in_groups else (_vector, _columns)
-    for each in (*sweep.tables, *(sweep.changes_tables if changes else ())):
+    for each in (*sweep.tables, *(sweep.derivatives_tables if changes else ())):
         print_table: Callable[[str, Any], str] = matrix if each.is_matrix else vector
         yield print_table(each.name, each.numbers)
         if each.in_two_parts:
             yield print_table(f"{each.name}_LOW", _rests(each))
 
 
-def _rests(each: SweepTable) -> Values | NumberTable:
+def _rests(each: IterationTable) -> Values | NumberTable:
     """Return the low words of a table: the rounding errors of its numbers."""
     if each.is_matrix:
         return tuple(tuple(map(DOUBLE.rest, row)) for row in each.numbers)

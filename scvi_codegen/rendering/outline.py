@@ -97,12 +97,12 @@ def outline(functions: Mapping[str, Function], start: str) -> str:
     return "\n".join(_lines(functions, start, 0, set()))
 
 
-def _lines(functions: Mapping[str, Function], name: str, depth: int, shown: set[str]) -> Iterator[str]:
+def _lines(functions: Mapping[str, Function], name: str, depth: int, printed: set[str]) -> Iterator[str]:
     function = functions[name]
     visible = bool(function.comment) or depth == 0
-    if name in shown:
+    if name in printed:
         return
-    shown.add(name)
+    printed.add(name)
     if visible:
         indent = "  " * depth
         yield from textwrap.wrap(
@@ -111,7 +111,7 @@ def _lines(functions: Mapping[str, Function], name: str, depth: int, shown: set[
         comment = _first_sentence(function.comment)
         yield from textwrap.wrap(comment, WIDTH, initial_indent=f"{indent}  | ", subsequent_indent=f"{indent}  | ")
     for called in function.calls:
-        yield from _lines(functions, called, depth + visible, shown)
+        yield from _lines(functions, called, depth + visible, printed)
 
 
 def _first_sentence(comment: str) -> str:

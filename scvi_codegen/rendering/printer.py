@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
+from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
+from scvi_codegen.ir.kernel_parts import Part, kept_length, parts
 from scvi_codegen.ir.numbers import Number
-from scvi_codegen.ir.parts import Part, kept_numbers, parts
-from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = [
@@ -114,7 +114,7 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     """Return the statements of a kernel of numbers, or of one of its parts."""
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
-        return [f"{target.scalar} kept[{kept_numbers(cut)}];", *map(_call, cut)]
+        return [f"{target.scalar} kept[{kept_length(cut)}];", *map(_call, cut)]
     return [
         f"const {target.scalar} w{k} = {print_expression(expression, target)};"
         if kind == "w"
@@ -123,14 +123,14 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     ]
 
 
-def print_lane_statements(code: Kernel | Part, sweep: Sweep, sources: Sources) -> list[str]:
+def print_lane_statements(code: Kernel | Part, sweep: FixedPointIteration, sources: Sources) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
     Variables that are the same in every lane remain numbers; derivatives are stored at their indices in the mass.
     """
     cut = parts(code) if isinstance(code, Kernel) else (code,)
     if len(cut) > 1:
-        return [f"lanes kept[{kept_numbers(cut)}];", *map(_call, cut)]
+        return [f"lanes kept[{kept_length(cut)}];", *map(_call, cut)]
     vectors = _Vectors(cut[0], sources)
     statements = []
     for kind, k, expression in cut[0].statements:
@@ -138,7 +138,7 @@ def print_lane_statements(code: Kernel | Part, sweep: Sweep, sources: Sources) -
         if kind == "w":
             statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
         else:
-            target = _place_in_mass(sweep, k) if kind == "slope" else f"{kind}[{k}]"
+            target = _mass_element(sweep, k) if kind == "slope" else f"{kind}[{k}]"
             statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
     return statements
 
@@ -148,7 +148,7 @@ def _call(part: Part) -> str:
     return f"{part.name}({', '.join(array for array in ARRAYS if part.uses(array))});"
 
 
-def _place_in_mass(sweep: Sweep, k: int) -> str:
+def _mass_element(sweep: FixedPointIteration, k: int) -> str:
     i, j = sweep.mass_entries[k]
     return f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.numbers import Number
-from scvi_codegen.rendering.stopping import TOLERANCE
+from scvi_codegen.rendering.convergence import TOLERANCE
 from scvi_codegen.tables.precision import mp, settled
 
 __all__ = ["DOUBLE", "SINGLE", "Target"]
@@ -22,11 +22,11 @@ class Target:
     """A scalar type of C.
 
     Attributes:
-        name: as in :data:`~scvi_codegen.rendering.text.EMBEDDED`.
+        name: as in :data:`~scvi_codegen.rendering.program_source.EMBEDDED`.
         scalar: the type, and the name of its support header.
         suffix: of the functions of libm and of literals.
         digits: of a literal that reads back as the same number; 0: the shortest that does.
-        tolerance: see :data:`scvi_codegen.rendering.stopping.TOLERANCE`.
+        tolerance: see :data:`scvi_codegen.rendering.convergence.TOLERANCE`.
         halvings: from 1 to the round-off unit.
         smallest, largest: numbers with full precision.
     """

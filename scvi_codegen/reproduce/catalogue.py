@@ -35,11 +35,11 @@ MODULES = (
 
 
 def _catalogue() -> dict[str, Experiment]:
-    found = {experiment.name: experiment for experiment in chain.from_iterable(m.EXPERIMENTS for m in MODULES)}
+    result = {experiment.name: experiment for experiment in chain.from_iterable(m.EXPERIMENTS for m in MODULES)}
     names = ORDER.split()
-    if set(names) != set(found):
-        raise AssertionError(f"the order of the catalogue is wrong about {set(names) ^ set(found)}")
-    return {name: found[name] for name in names}
+    if set(names) != set(result):
+        raise AssertionError(f"the order of the catalogue is wrong about {set(names) ^ set(result)}")
+    return {name: result[name] for name in names}
 
 
 EXPERIMENTS = _catalogue()

@@ -104,7 +104,7 @@ EVIDENCE: tuple[str, ...] = (
 
 def claims(results: Mapping[str, Result]) -> Result:
     """Return a row for each claim, with the checks that decide it."""
-    found = {key: tuple(_evidence(key, results)) for key in CLAIMS}
+    result = {key: tuple(_evidence(key, results)) for key in CLAIMS}
     return Result(
         name="claims",
         title="The claims of the paper, one verdict each",
@@ -115,9 +115,9 @@ def claims(results: Mapping[str, Result]) -> Result:
             f"Collected from {len(results)} of {len(EVIDENCE)} experiments"
             + (f"; without {_listed(results)}." if len(results) < len(EVIDENCE) else "."),
         ),
-        checks=tuple(_check(claim, found[key]) for key, claim in CLAIMS.items()),
-        tables=(_summary(found), _details(found)),
-        body=tuple(block for key in CLAIMS for block in _blocks(CLAIMS[key], found[key])),
+        checks=tuple(_check(claim, result[key]) for key, claim in CLAIMS.items()),
+        tables=(_summary(result), _details(result)),
+        body=tuple(block for key in CLAIMS for block in _blocks(CLAIMS[key], result[key])),
     )
 
 
@@ -151,7 +151,7 @@ def _unique(names: list[str]) -> str:
     return ", ".join(dict.fromkeys(names))
 
 
-def _summary(found: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
+def _summary(result: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
     return TableBlock(
         columns=("claim", "place", "checks", *(verdict.value for verdict in Verdict), "verdict"),
         rows=tuple(
@@ -162,19 +162,19 @@ def _summary(found: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBl
                 *(sum(check.verdict is verdict for _, check in evidence) for verdict in Verdict),
                 common_verdict(check for _, check in evidence).value,
             )
-            for key, evidence in found.items()
+            for key, evidence in result.items()
         ),
         formats=dict.fromkeys(("checks", *(verdict.value for verdict in Verdict)), "d"),
     )
 
 
-def _details(found: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
+def _details(result: Mapping[str, tuple[tuple[str, Comparison], ...]]) -> TableBlock:
     return TableBlock(
         name="checks",
         columns=("claim", "experiment", "paper", "measured", "verdict"),
         rows=tuple(
             (key, name, check.claim, check.measured, check.verdict.value)
-            for key, evidence in found.items()
+            for key, evidence in result.items()
             for name, check in evidence
         ),
         shown=False,

@@ -21,7 +21,7 @@ from typing import TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
 
@@ -114,7 +114,7 @@ class _Plan:
     def needs(self, experiment: Experiment) -> dict[str, Result]:
         return {need: self.results[need] for need in experiment.needs}
 
-    def note(self, outcome: Outcome) -> Iterator[Outcome]:
+    def record_outcome(self, outcome: Outcome) -> Iterator[Outcome]:
         """Yield the outcome, and the failures of the experiments that depend on it."""
         yield outcome
         if isinstance(outcome, Result):
@@ -122,7 +122,9 @@ class _Plan:
             return
         for experiment in [e for e in self.pending.values() if outcome.name in e.needs]:
             if self.pending.pop(experiment.name, None):
-                yield from self.note(Failure(name=experiment.name, message=f"its dependency '{outcome.name}' failed"))
+                yield from self.record_outcome(
+                    Failure(name=experiment.name, message=f"its dependency '{outcome.name}' failed")
+                )
 
 
 def _module_of(experiment: Experiment) -> str:
@@ -130,7 +132,7 @@ def _module_of(experiment: Experiment) -> str:
     return getattr(run, "__module__", "")
 
 
-@unwarned()
+@without_accuracy_warnings()
 def _outcome(experiment: Experiment, needs: Mapping[str, Result]) -> Outcome:
     """Run one experiment; convert any error into a failure."""
     try:
@@ -151,7 +153,7 @@ def _described(error: BaseException) -> str:
 def _in_this_process(plan: _Plan, watch: Watch) -> Generator[Outcome, None, None]:
     while (experiment := plan.next()) is not None:
         watch([experiment.name])
-        yield from plan.note(_outcome(experiment, plan.needs(experiment)))
+        yield from plan.record_outcome(_outcome(experiment, plan.needs(experiment)))
 
 
 @dataclass(kw_only=True)
@@ -218,7 +220,7 @@ def _in_processes(plan: _Plan, count: int, module: str, watch: Watch) -> Generat
                 outcome = worker.take()
                 if not worker.process.is_alive():
                     crew[crew.index(worker)] = _Worker.start(module)
-                yield from plan.note(outcome)
+                yield from plan.record_outcome(outcome)
 
 
 def _assign(plan: _Plan, crew: Sequence[_Worker], watch: Watch) -> None:

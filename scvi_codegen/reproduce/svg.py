@@ -72,11 +72,11 @@ def _adapted(color: str, kind: str, *, dark: bool) -> str:
     """Return a colour of equal contrast in dark and in light mode; letters get sufficient contrast in both."""
     if not dark and kind == "line":
         return color
-    as_given = contrast(color, LIGHT_PAPER)
+    original_contrast = contrast(color, LIGHT_PAPER)
     grey = max(_channels(color)) - min(_channels(color)) < GREY
-    if kind == "line" and (grey or as_given < PALE):
+    if kind == "line" and (grey or original_contrast < PALE):
         mixtures = _mixtures("#ffffff" if grey else color, DARK_PAPER)
-        return min(mixtures, key=lambda mixed: abs(contrast(mixed, DARK_PAPER) - as_given))
+        return min(mixtures, key=lambda mixed: abs(contrast(mixed, DARK_PAPER) - original_contrast))
     paper, end = (DARK_PAPER, "#ffffff") if dark else (LIGHT_PAPER, "#000000")
     wanted = TEXT_CONTRAST if kind == "text" else LINE_CONTRAST
     return next(mixed for mixed in _mixtures(color, end) if contrast(mixed, paper) >= wanted)

@@ -13,53 +13,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, warn
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.step_plan import StepPlan
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.integrator import Integrator
 
 __all__ = [
+    "FIXED_STEP_REMEDY",
     "GROSS_ERROR",
-    "MET",
     "TOLERABLE_ERROR",
-    "unwarned",
     "warn_of_energies",
-    "warn_of_long_steps",
-    "warn_of_lost_energies",
-    "warn_of_lost_energy",
+    "warn_of_energy_error",
+    "warn_of_energy_errors",
+    "warn_of_large_steps",
     "warnings_wanted",
+    "without_accuracy_warnings",
 ]
 
 TOLERABLE_ERROR: Final = 1e-3
 """Largest relative error of a step, and largest relative change of the energy of a run, without a warning."""
 
-CONTROLLED: Final = ", or use adaptive steps (t_end= without h)"
+ADAPTIVE_REMEDY: Final = ", or use adaptive steps (t_end= without h)"
 
 GROSS_ERROR: Final = 0.5
 """Relative energy change that triggers a warning in fixed-step runs without an error estimate."""
 
-MOST_ASKED: Final = 1000
+MOST_CHECKED: Final = 1000
 """Largest number of trajectories of an ensemble whose energy is checked."""
 
-MAGNIFIED: Final = (
+ERROR_AMPLIFIED: Final = (
     "although every step met the tolerance: the motion amplifies errors, as close encounters do. Reduce the tolerance, "
     "or use regularised coordinates"
 )
-MET: Final = (
+FIXED_STEP_REMEDY: Final = (
     "although the system conserves it: h is too large, perhaps for a close encounter. Reduce h, or use an SVI with "
     "adaptive steps (t_end=)"
 )
 
 Array = NDArray[np.float64]
 
-_heard: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
+_warnings_enabled: ContextVar[bool] = ContextVar("accuracy warnings are wanted", default=True)
 
 
-class Steps(Protocol):
+class StepData(Protocol):
     """Step data of a trajectory."""
 
     @property
-    def goal(self) -> Goal | None: ...
+    def plan(self) -> StepPlan | None: ...
     @property
     def h(self) -> float: ...
     @property
@@ -68,11 +68,11 @@ class Steps(Protocol):
     def worst_step_time(self) -> float: ...
 
 
-class EnergyAtEnds(Protocol):
+class EnergyData(Protocol):
     """States of a trajectory, including the first and the last."""
 
     @property
-    def goal(self) -> Goal | None: ...
+    def plan(self) -> StepPlan | None: ...
     @property
     def stepper(self) -> Integrator: ...
     @property
@@ -85,11 +85,11 @@ class EnergyAtEnds(Protocol):
     def parameters(self) -> Array: ...
 
 
-class StatesOfMany(Protocol):
+class EnsembleEnergyData(Protocol):
     """States of an ensemble; ``each`` yields times, positions, momenta, status and step count of each trajectory."""
 
     @property
-    def goals(self) -> tuple[Goal, ...]: ...
+    def plans(self) -> tuple[StepPlan, ...]: ...
     @property
     def stepper(self) -> Integrator: ...
     @property
@@ -98,25 +98,25 @@ class StatesOfMany(Protocol):
 
 
 @contextmanager
-def unwarned() -> Iterator[None]:
+def without_accuracy_warnings() -> Iterator[None]:
     """Suppress accuracy warnings within a ``with`` block or a decorated function that takes large steps on purpose."""
-    token = _heard.set(False)
+    token = _warnings_enabled.set(False)
     try:
         yield
     finally:
-        _heard.reset(token)
+        _warnings_enabled.reset(token)
 
 
 def warnings_wanted() -> bool:
-    """Return whether accuracy warnings are wanted: not inside :func:`unwarned`."""
-    return _heard.get()
+    """Return whether accuracy warnings are wanted: not inside :func:`without_accuracy_warnings`."""
+    return _warnings_enabled.get()
 
 
-def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = CONTROLLED) -> None:
+def warn_of_large_steps(trajectory: StepData, *, before: float = 0.0, remedy: str = ADAPTIVE_REMEDY) -> None:
     """Issue an :class:`AccuracyWarning` for the worst fixed step, unless an error ``before`` already caused one."""
     error = trajectory.step_error
-    controlled = trajectory.goal is not None and not trajectory.goal.tau
-    if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _heard.get():
+    controlled = trajectory.plan is not None and not trajectory.plan.tau
+    if controlled or not error > TOLERABLE_ERROR or before > TOLERABLE_ERROR or not _warnings_enabled.get():
         return
     warn(
         f"the step size h = {trajectory.h:g} is too large: the relative error of the step from "
@@ -125,31 +125,37 @@ def warn_of_long_steps(trajectory: Steps, *, before: float = 0.0, remedy: str = 
     )
 
 
-def warn_of_lost_energy(trajectory: EnergyAtEnds) -> None:
+def warn_of_energy_error(trajectory: EnergyData) -> None:
     """Issue an :class:`AccuracyWarning` if an adaptive run does not conserve an energy that the system conserves."""
-    goal, stepper = trajectory.goal, trajectory.stepper
-    if goal is None or goal.tau or not stepper.interface.conserves_energy or not _heard.get():
+    plan, stepper = trajectory.plan, trajectory.stepper
+    if plan is None or plan.tau or not stepper.interface.conserves_energy or not _warnings_enabled.get():
         return
-    if energies := _lost_energies(stepper, trajectory.t, trajectory.q, trajectory.p, trajectory.parameters):
+    if energies := _changed_energies(stepper, trajectory.t, trajectory.q, trajectory.p, trajectory.parameters):
         warn_of_energies(*energies)
 
 
-def warn_of_lost_energies(ensemble: StatesOfMany) -> None:
-    """Issue the warning of :func:`warn_of_lost_energy` for the worst of ``MOST_ASKED`` trajectories of an ensemble."""
-    goals, stepper = ensemble.goals, ensemble.stepper
-    if not goals or not stepper.interface.conserves_energy or not _heard.get():
+def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
+    """Issue the warning of :func:`warn_of_energy_error` for the worst of ``MOST_CHECKED`` trajectories."""
+    plans, stepper = ensemble.plans, ensemble.stepper
+    if not plans or not stepper.interface.conserves_energy or not _warnings_enabled.get():
         return
     found = {}
-    for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(goals) // MOST_ASKED)):
-        if len(t) and (energies := _lost_energies(stepper, t, q, p, ensemble.parameters[j])):
+    for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(plans) // MOST_CHECKED)):
+        if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
             found[j] = energies
-    worst = max(found, key=lambda j: lost_part(*found[j]), default=None)
+    worst = max(found, key=lambda j: relative_energy_change(*found[j]), default=None)
     if worst is not None:
         warn_of_energies(*found[worst], where=f" of trajectory {worst}")
 
 
 def warn_of_energies(
-    first: float, last: float, size: float, *, tolerable: float = TOLERABLE_ERROR, where: str = "", why: str = MAGNIFIED
+    first: float,
+    last: float,
+    size: float,
+    *,
+    tolerable: float = TOLERABLE_ERROR,
+    where: str = "",
+    why: str = ERROR_AMPLIFIED,
 ) -> None:
     """Issue an :class:`AccuracyWarning` if a conserved energy differs between the first and the last state.
 
@@ -160,17 +166,17 @@ def warn_of_energies(
         where: description of the trajectory, appended to "the energy".
         why: probable cause and remedy.
     """
-    if lost_part(first, last, size) > tolerable and _heard.get():
+    if relative_energy_change(first, last, size) > tolerable and _warnings_enabled.get():
         warn(f"the energy{where} changed from {first:.3g} to {last:.3g} {why}", AccuracyWarning)
 
 
-def lost_part(first: float, last: float, size: float) -> float:
+def relative_energy_change(first: float, last: float, size: float) -> float:
     """Return the relative change of an energy; 0 if it is NaN."""
     part = abs(last - first) / max(abs(first), abs(last), size, sys.float_info.min)
     return part if part == part else 0.0
 
 
-def _lost_energies(
+def _changed_energies(
     stepper: Integrator, t: Array, q: Array, p: Array, parameters: Array
 ) -> tuple[float, float, float] | None:
     """Return the first and the last energy and the largest |p.v| if the energy changed; ``None`` otherwise.
@@ -182,7 +188,7 @@ def _lost_energies(
     try:
         energies = stepper._energies_of(t, q, p, parameters)
         first, last = float(energies[0]), float(energies[-1])
-        if not lost_part(first, last, 0.0) > TOLERABLE_ERROR:
+        if not relative_energy_change(first, last, 0.0) > TOLERABLE_ERROR:
             return None
         sizes = np.sum(p * stepper.velocity(q, p, t, parameters), axis=1)
     except StateError:

@@ -8,24 +8,24 @@ from typing import Self
 import numpy as np
 
 from scvi_codegen.display.cards import card, listed, plain
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native import building
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.events import Event, EventLike, as_events
 from scvi_codegen.runtime.inputs import (
     Array,
 )
 
-__all__ = ["CompiledMethod", "no_text"]
+__all__ = ["CompiledMethod", "no_source"]
 
 
-MOST_WATCHING = 16
+MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
 
 
-def no_text(*_: int) -> None:
+def no_source(*_: int) -> None:
     """Return ``None``: the default for source variants that a method does not have."""
 
 
@@ -48,12 +48,12 @@ class CompiledMethod:
         source: Source,
         interface: Interface,
         *,
-        ensemble: Callable[[], Source | None] = no_text,
-        controlled: Callable[[], Source | None] = no_text,
-        fallback: Callable[[], Source | None] = no_text,
-        tangent: Callable[[], Source | None] = no_text,
-        curvature: Callable[[], Source | None] = no_text,
-        changes: Callable[[int], Source | None] = no_text,
+        ensemble: Callable[[], Source | None] = no_source,
+        controlled: Callable[[], Source | None] = no_source,
+        fallback: Callable[[], Source | None] = no_source,
+        tangent: Callable[[], Source | None] = no_source,
+        curvature: Callable[[], Source | None] = no_source,
+        changes: Callable[[int], Source | None] = no_source,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
@@ -65,9 +65,9 @@ class CompiledMethod:
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
-        self._watching: dict[tuple[Event, ...], Self] = {}
+        self._event_variants: dict[tuple[Event, ...], Self] = {}
         self._plain = source
-        self.source = _watching(source, interface, events) if events else source
+        self.source = _event_variant(source, interface, events) if events else source
         library = building.load(self.source, flags=flags)
         self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
 
@@ -138,9 +138,9 @@ class CompiledMethod:
             events: the formulas that later calls pass as ``events=``, all those of one call together.
         """
         for each in (self,) if events is None else (self, self.with_events(events)):
-            each.binding.borrow_fallback()
+            each.binding.set_fallback()
             if adaptive and each._controlled() is not None:
-                each._adaptive().binding.borrow_fallback()
+                each._adaptive().binding.set_fallback()
         wanted = ((tangent, self._tangent), (second, self._curvature), (ensemble, self._ensemble))
         for source in [text() for is_wanted, text in wanted if is_wanted]:
             if source is not None:
@@ -230,13 +230,13 @@ class CompiledMethod:
         wanted = as_events(events)
         if wanted == self.events:
             return self
-        if wanted not in self._watching:
-            while len(self._watching) >= MOST_WATCHING:
-                self._watching.pop(next(iter(self._watching)), None)
-            self._watching[wanted] = self._made_watching(wanted)
-        return self._watching[wanted]
+        if wanted not in self._event_variants:
+            while len(self._event_variants) >= MOST_EVENT_SETS:
+                self._event_variants.pop(next(iter(self._event_variants)), None)
+            self._event_variants[wanted] = self._made_with_events(wanted)
+        return self._event_variants[wanted]
 
-    def _made_watching(self, wanted: tuple[Event, ...]) -> Self:
+    def _made_with_events(self, wanted: tuple[Event, ...]) -> Self:
         return type(self)(
             self._plain,
             self.interface,
@@ -280,7 +280,7 @@ class CompiledMethod:
         )
 
 
-def _watching(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
     from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
 
     return with_events(source, interface, tuple(event.function for event in events))

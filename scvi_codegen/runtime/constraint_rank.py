@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["Linearised", "dependence", "refusal"]
+__all__ = ["Jacobian", "dependence", "rank_deficiency"]
 
 DEPENDENT = 1e-9
 """Smallest singular value of G, with rows of length 1, below which rows count as linearly dependent."""
-TAKES_PART = 1e-6
+NAMED_SHARE = 1e-6
 """Entries of a null vector above this fraction of 1 mark the constraints that are dependent."""
 CONTRADICTED = 1e-7
 """Residual at the nearest state, relative to the size of q, above which constraints count as contradictory."""
 ITERATIONS = 30
 
-Linearised: TypeAlias = Callable[[Array], tuple[Array, Array]]
+Jacobian: TypeAlias = Callable[[Array], tuple[Array, Array]]
 """Values g and Jacobian G of the constraints at positions."""
 
 
@@ -35,10 +35,10 @@ def dependence(jacobian: Array) -> tuple[int, NDArray[np.intp]]:
     left, values, _ = np.linalg.svd(jacobian / np.where(sizes > 0.0, sizes, 1.0))
     null = left[:, np.append(values, np.zeros(len(left) - len(values))) <= DEPENDENT]
     shares = np.abs(null).max(axis=1, initial=0.0)
-    return len(left) - null.shape[1], np.flatnonzero(shares > TAKES_PART)
+    return len(left) - null.shape[1], np.flatnonzero(shares > NAMED_SHARE)
 
 
-def refusal(names: Sequence[str], q: Array, at: Linearised, *, nearest: bool = False) -> str:
+def rank_deficiency(names: Sequence[str], q: Array, at: Jacobian, *, nearest: bool = False) -> str:
     """Return what is wrong with constraints of deficient rank, and what to do; "" if they are independent.
 
     Args:

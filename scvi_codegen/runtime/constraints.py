@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import REASONS, STATUS
-from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
-from scvi_codegen.runtime.constraint_rank import Linearised, refusal
+from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.runtime.constraint_rank import Jacobian, rank_deficiency
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -64,7 +64,7 @@ def projected(
         checked_number(t, "the time t"), *map(binding.pointer, (q0, p0, values, q1, p1)), binding.workspace()
     )
     if status:
-        if wrong := refusal(stepper.constraints, q0, _linearised(stepper, t, parameters), nearest=True):
+        if wrong := rank_deficiency(stepper.constraints, q0, _linearised(stepper, t, parameters), nearest=True):
             raise StateError(f"projection onto the constraints failed near q = {_shown(q0)}: {wrong}")
         _refuse(stepper, status, q0)
     apart = np.empty(2)
@@ -88,18 +88,18 @@ def consistent(
             raise missing_input(name)
     q0, p0 = checked_vector(stepper.interface, q, "q"), checked_vector(stepper.interface, p, "p")
     q1, p1, apart = projected(stepper, q0, p0, t, parameters)
-    if check_rank and (wrong := refusal(stepper.constraints, q1, _linearised(stepper, t, parameters))):
+    if check_rank and (wrong := rank_deficiency(stepper.constraints, q1, _linearised(stepper, t, parameters))):
         raise StateError(f"{wrong} (q = {_shown(q1)})")
     moved = float(apart.max())
-    if moved <= ROUNDED * np.finfo(float).eps:
+    if moved <= ROUNDING_UNITS * np.finfo(float).eps:
         return q0, p0
-    if moved <= TYPED:
+    if moved <= INPUT_PRECISION:
         return q1, p1
     worst = _worst(stepper, q0, p0, t, parameters)
-    said = f"the initial state violates the constraints by {moved:.1e} (relative): {worst}"
-    if moved > NEAR:
-        raise StateError(f"{said}. Use stepper.project(q, p) for the nearest consistent state")
-    warn(f"{said}. It was projected onto the constraints", AccuracyWarning)
+    message = f"the initial state violates the constraints by {moved:.1e} (relative): {worst}"
+    if moved > LARGEST_VIOLATION:
+        raise StateError(f"{message}. Use stepper.project(q, p) for the nearest consistent state")
+    warn(f"{message}. It was projected onto the constraints", AccuracyWarning)
     return q1, p1
 
 
@@ -111,12 +111,12 @@ def _worst(stepper: Integrator, q: Array, p: Array, t: float, parameters: Parame
     names = [stepper.constraints[k] for k in worst]
     if not any(f"{q}_dot" in names[1] for q in stepper.coordinates):  # a velocity constraint is a rate itself
         names[1] = f"the rate of {names[1]}"
-    told = [
+    descriptions = [
         f"{name} is {value:.3g}"
         for name, value in zip(names, largest, strict=True)
-        if abs(value) > ROUNDED * np.finfo(float).eps * np.abs(largest).max()
+        if abs(value) > ROUNDING_UNITS * np.finfo(float).eps * np.abs(largest).max()
     ]
-    return f"{' and '.join(told)}, not 0"
+    return f"{' and '.join(descriptions)}, not 0"
 
 
 def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameters: Array) -> None:
@@ -125,7 +125,7 @@ def check_reachable(stepper: Integrator, q: Array, p: Array, t: float, parameter
     Rates may jump: an impulse along the constraint gradients then changes the momenta. Positions cannot jump.
     """
     moved = projected(stepper, q, p, t, parameters)[2][0]
-    if moved > TYPED:
+    if moved > INPUT_PRECISION:
         g = constraint_values(stepper, q, p, t, parameters)[0, 0]
         k = int(np.abs(g).argmax())
         raise StateError(
@@ -152,7 +152,7 @@ def _call(
         _refuse(stepper, status, q)
 
 
-def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Linearised:
+def _linearised(stepper: Integrator, t: float, parameters: Parameters) -> Jacobian:
     """Return a function that evaluates g and G by unit velocities; NaN where velocities have no momenta."""
     unit = np.concatenate([np.zeros((1, stepper.dimension)), np.eye(stepper.dimension)])
 

@@ -22,18 +22,18 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import step_failure
-from scvi_codegen.runtime.clock import states_by_clock
-from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.saved_states import SavedStates
+from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.runtime.time_transformation import states_in_transformed_time
 
 __all__ = [
-    "ON_GRID",
+    "STEP_END_TOLERANCE",
     "checked_times",
     "grid_tolerance",
-    "lengths_at",
     "states_and_steps_at",
     "states_at",
+    "step_sizes_at",
     "times_of_run",
     "whole_steps",
     "within",
@@ -41,10 +41,10 @@ __all__ = [
 
 Array = NDArray[np.float64]
 ROUNDINGS = 4.0
-ON_GRID = 1e-6
+STEP_END_TOLERANCE = 1e-6
 
 
-def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
+def states_at(states: SavedStates, times: Array) -> tuple[Array, Array]:
     """Return (n, m) positions and momenta at (n,) times within the range of the saved states, in any order.
 
     Raises:
@@ -55,25 +55,27 @@ def states_at(states: KeptStates, times: Array) -> tuple[Array, Array]:
     return q, p
 
 
-def states_and_steps_at(states: KeptStates, times: Array) -> tuple[Array, Array, Array]:
+def states_and_steps_at(states: SavedStates, times: Array) -> tuple[Array, Array, Array]:
     """Return the states of :func:`states_at` and (n,) values of the independent variable of the steps, tau or t."""
     times = within(times, states.t[0], states.t[-1])
     if states.tau is not None:
         _check_on_grid(states)
-        return states_by_clock(states, times)
+        return states_in_transformed_time(states, times)
     left = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
-    if states.goal is not None and np.isnan(states.step_sizes[:-1]).any():
-        return *_run_to_each(states, left, times, states.goal), times
+    if states.plan is not None and np.isnan(states.step_sizes[:-1]).any():
+        return *_integrate_to_each(states, left, times, states.plan), times
     _check_on_grid(states)
     t, q, p = states.t[left], states.q[left], states.p[left]
     whole = whole_steps(times - t, np.nan_to_num(states.step_sizes[left], nan=np.inf))
     between = np.flatnonzero(whole)
-    _takewhole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
-    _take_parts(states, t, times - t, q, p)
+    _take_whole_steps(states, left, whole, between[np.lexsort((whole[between], left[between]))], t, q, p)
+    _take_partial_steps(states, t, times - t, q, p)
     return q, p, times
 
 
-def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal: Goal) -> tuple[Array, Array]:
+def _integrate_to_each(
+    states: SavedStates, left: NDArray[np.intp], times: Array, plan: StepPlan
+) -> tuple[Array, Array]:
     """Integrate with adaptive steps from the saved state before each time to that time."""
     q, p = states.q[left], states.p[left]
     for k in np.flatnonzero(times != states.t[left]):
@@ -81,7 +83,7 @@ def _run_to_each(states: KeptStates, left: NDArray[np.intp], times: Array, goal:
             states.stepper,
             q[k],
             p[k],
-            h=replace(goal, t_end=float(times[k])),
+            h=replace(plan, t_end=float(times[k])),
             t=states.t[left[k]],
             parameters=states.parameters,
             options=states.options,
@@ -99,8 +101,8 @@ def whole_steps(spans: Array, h: Array, slack: float = 0.0) -> NDArray[np.int64]
     return np.where(fits, nearest, np.floor(ratio)).astype(np.int64)
 
 
-def _takewhole_steps(
-    states: KeptStates,
+def _take_whole_steps(
+    states: SavedStates,
     left: NDArray[np.intp],
     whole: NDArray[np.int64],
     order: NDArray[np.intp],
@@ -109,15 +111,15 @@ def _takewhole_steps(
     p: Array,
 ) -> None:
     """Advance in place by whole steps: one run from each saved state, stopped at every requested step number."""
-    kept, run = -1, None
+    saved, run = -1, None
     for k in order:
-        if run is None or left[k] != kept:
-            kept = left[k]
+        if run is None or left[k] != saved:
+            saved = left[k]
             run = Memory.started(
                 states.stepper,
                 q[k],
                 p[k],
-                h=states.step_sizes[kept],
+                h=states.step_sizes[saved],
                 t=t[k],
                 parameters=states.parameters,
                 options=states.options,
@@ -126,7 +128,7 @@ def _takewhole_steps(
         t[k], q[k], p[k] = run.t, run.q, run.p
 
 
-def _take_parts(states: KeptStates, t: Array, h: Array, q: Array, p: Array) -> None:
+def _take_partial_steps(states: SavedStates, t: Array, h: Array, q: Array, p: Array) -> None:
     """Take one step of size h[k] from each state k, in place."""
     binding, m = states.stepper.binding, states.stepper.dimension
     step, report, workspace = binding.function("step"), binding.new("report *"), binding.workspace()
@@ -172,14 +174,14 @@ def within(times: Array, first: float, last: float) -> Array:
     return np.clip(times, low, high)
 
 
-def grid_tolerance(states: KeptStates) -> Array:
+def grid_tolerance(states: SavedStates) -> Array:
     """Return (n,) distances within which a time counts as the end of a step: times are rounded."""
     rounding = ROUNDINGS * np.finfo(float).eps * np.abs(states.stepped).max()
-    tolerance: Array = np.fmax(ON_GRID * np.abs(states.step_sizes), rounding)
+    tolerance: Array = np.fmax(STEP_END_TOLERANCE * np.abs(states.step_sizes), rounding)
     return tolerance
 
 
-def lengths_at(states: KeptStates, times: Array) -> Array:
+def step_sizes_at(states: SavedStates, times: Array) -> Array:
     """Return (n,) sizes of the steps that begin at the given times; NaN at times between two steps."""
     before = np.searchsorted(states.forward * states.t, states.forward * times, side="right") - 1
     after = np.minimum(before + 1, len(states) - 1)
@@ -188,7 +190,7 @@ def lengths_at(states: KeptStates, times: Array) -> Array:
     return np.where(off, np.nan, states.step_sizes[nearest])
 
 
-def _check_on_grid(states: KeptStates) -> None:
+def _check_on_grid(states: SavedStates) -> None:
     """Raise ``StateError`` unless all states but the last (an event may end it) are at whole steps from the first."""
     if np.isnan(states.step_sizes[:-1]).any():
         raise StateError(

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.given.counts import checked_count
+from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
 from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble_selection import ensemble_work
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters
-from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import ensemble_work
+from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -84,8 +84,8 @@ def integrate_ensemble(
         "options": options,
         "save_every": save_every,
     }
-    way: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
-    work = ensemble_work(stepper, q, p, inputs=inputs, t_eval=t_eval, **way, **start)
+    step_arguments: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
+    work = ensemble_work(stepper, q, p, inputs=inputs, t_eval=t_eval, **step_arguments, **start)
     wanted = None if blocks is None else checked_count(blocks, "blocks", least=1)
     with _client(address) as client:
         count = wanted or BLOCKS_A_THREAD * sum(client.ncores().values())
@@ -122,7 +122,7 @@ def _slices(count: int, blocks: int) -> Iterator[slice]:
 
 
 def _gather(
-    client: Any, work: Ensemble | EnsembleToEnds, parts: list[slice], progress: Callable[[int], None] | None
+    client: Any, work: Ensemble | AdaptiveEnsemble, parts: list[slice], progress: Callable[[int], None] | None
 ) -> None:
     """Submit the slices and store their results."""
     from distributed import as_completed

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native import building
 from scvi_codegen.native.arguments import checked_number, checked_step, empty_array
 from scvi_codegen.native.binding import Binding
@@ -28,21 +27,22 @@ from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTr
 from scvi_codegen.runtime.inputs import Array, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.portions import record_states
+from scvi_codegen.runtime.run_loop import record_states
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.workers import MOST_PIECES, PROGRESS_SECONDS, workers_of
+from scvi_codegen.runtime.workers import MOST_JOBS, PROGRESS_SECONDS, workers_of
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "Change",
     "Ensemble",
     "LaneBlock",
-    "Portion",
+    "StepChunk",
 ]
 
-FIRST_PORTION = 64
+FIRST_CHUNK_STEPS = 64
 """Steps of the first chunk of a block, before its speed is known."""
-PORTION_SECONDS = 0.02
+CHUNK_SECONDS = 0.02
 """Target duration of a chunk in seconds; bounds the delay of an interruption."""
 
 
@@ -53,7 +53,7 @@ class Change(NamedTuple):
     parameters: Callable[[slice], Array]
 
 
-class Portion(NamedTuple):
+class StepChunk(NamedTuple):
     """Chunk of steps for one call into C.
 
     Attributes:
@@ -92,13 +92,13 @@ class Ensemble:
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
                 self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
-        kept = self.row(self.steps)
-        self.q, self.p = (empty_array((kept, self.count, stepper.dimension)) for _ in "qp")
+        saved_count = self.row(self.steps)
+        self.q, self.p = (empty_array((saved_count, self.count, stepper.dimension)) for _ in "qp")
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = start_q, start_p
         self.times = None
         if stepper.interface.energy_parameter:
-            self.times = np.full((kept, self.count), np.nan)
+            self.times = np.full((saved_count, self.count), np.nan)
             self.times[0] = self.t0
         self.status = np.full(self.count, OK, dtype="<U16")
         self.done = np.zeros(self.count, dtype=np.int64)
@@ -115,16 +115,16 @@ class Ensemble:
         """Return the index of the first saved state after ``step`` steps."""
         return step // self.save_every + 1
 
-    def portions(self, begin: int, size: int) -> Iterator[Portion]:
+    def step_chunks(self, begin: int, size: int) -> Iterator[StepChunk]:
         """Yield the chunks that advance from step ``begin`` by ``size`` steps."""
-        yield Portion(size, self.save_every)
+        yield StepChunk(size, self.save_every)
 
-    def placed(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
+    def step_data(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
         """Return h, the time and the parameters of trajectory j after ``step`` steps."""
         high, low = times_after(self.t0, self.h, step)
         return self.h, (float(high), float(low)), self.parameters[j]
 
-    def kept_times(self) -> Array:
+    def saved_times(self) -> Array:
         """Return the (n,) times of the saved states."""
         number = self.save_every * np.arange(len(self.q), dtype=np.float64)
         return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
@@ -165,21 +165,21 @@ class Ensemble:
 
         def drive(number: int) -> None:
             block = make(firsts[number])
-            portion = min(FIRST_PORTION, self.steps)
+            chunk_size = min(FIRST_CHUNK_STEPS, self.steps)
             while reached[number] < self.steps and not stop.is_set():
                 began = time.perf_counter()
-                block.advance(portion)
-                reached[number] += portion
-                faster = PORTION_SECONDS / max(time.perf_counter() - began, 1e-6)
-                portion = min(max(1, int(portion * min(8.0, faster))), self.steps - int(reached[number]))
+                block.advance(chunk_size)
+                reached[number] += chunk_size
+                faster = CHUNK_SECONDS / max(time.perf_counter() - began, 1e-6)
+                chunk_size = min(max(1, int(chunk_size * min(8.0, faster))), self.steps - int(reached[number]))
 
         def take(piece: int) -> None:
-            for number in range(piece, len(firsts), MOST_PIECES):
+            for number in range(piece, len(firsts), MOST_JOBS):
                 drive(number)
 
         with ThreadPoolExecutor(workers) as pool:
             try:
-                pending = {pool.submit(take, piece) for piece in range(min(len(firsts), MOST_PIECES))}
+                pending = {pool.submit(take, piece) for piece in range(min(len(firsts), MOST_JOBS))}
                 while pending:
                     finished, pending = wait(pending, PROGRESS_SECONDS, FIRST_EXCEPTION)
                     for future in finished:
@@ -203,7 +203,7 @@ class Ensemble:
         """Return the trajectories; those neither completed nor failed have the status ``"interrupted"``."""
         unfinished = (self.status == OK) & (self.done < self.steps)
         return EnsembleTrajectory(
-            t=self.kept_times(),
+            t=self.saved_times(),
             times=self.times,
             q=self.q,
             p=self.p,
@@ -226,7 +226,7 @@ class LaneBlock:
         lanes = np.frombuffer(binding.buffer(self.memory.parameters), dtype=np.float64).reshape(-1, len(self.active))
         self.parameters = lanes[: work.parameters.shape[1]]
         self.count, self.step = min(len(self.active), work.count - first), 0
-        self.left: dict[int, _Alone] = {}
+        self.left: dict[int, _SingleRun] = {}
         self._fill()
 
     def _fill(self) -> None:
@@ -260,10 +260,12 @@ class LaneBlock:
 
     def advance(self, size: int) -> None:
         """Advance by ``size`` steps."""
-        for portion in self.work.portions(self.step, size):
-            if portion.change is not None:
-                self._change(portion.change.h, portion.change.parameters(slice(self.first, self.first + self.count)))
-            self._advance(portion.steps, portion.save_every)
+        for chunk_size in self.work.step_chunks(self.step, size):
+            if chunk_size.change is not None:
+                self._change(
+                    chunk_size.change.h, chunk_size.change.parameters(slice(self.first, self.first + self.count))
+                )
+            self._advance(chunk_size.steps, chunk_size.save_every)
 
     def _change(self, h: float, own: Array) -> None:
         """Set step size and parameters; a new step size invalidates the predictor."""
@@ -275,9 +277,9 @@ class LaneBlock:
             return
         self.memory.h, self.memory.guess = h, 0
         if self.binding.constant("NEEDS_VELOCITIES"):
-            self._take_velocities(own)
+            self._reset_predictor(own)
 
-    def _take_velocities(self, parameters: Array) -> None:
+    def _reset_predictor(self, parameters: Array) -> None:
         """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
         at_points = np.frombuffer(self.binding.buffer(self.memory.memory), dtype=np.float64)
         at_points = at_points.reshape(-1, self.work.stepper.dimension, len(self.active))
@@ -307,15 +309,15 @@ class LaneBlock:
         running = self.active[: self.count] > 0.0
         work.done[self.first : self.first + self.count][running] = self.step
         for lane in np.flatnonzero(~running):
-            self._leave(int(lane), begin, save_every)
+            self._continue_singly(int(lane), begin, save_every)
 
-    def _leave(self, lane: int, begin: int, save_every: int) -> None:
+    def _continue_singly(self, lane: int, begin: int, save_every: int) -> None:
         """Replace the states that a call from step ``begin`` stored for an inactive lane by those of a single run."""
         work, j = self.work, self.first + lane
         if lane not in self.left:
             step = int(self.memory.last_step[lane])
             q, p, *carries = (self.lanes(name)[:, lane].copy() for name in ("q", "p", "carry_q", "carry_p"))
-            self.left[lane] = _Alone(work, j, q, p, step, (carries[0], carries[1]))
+            self.left[lane] = _SingleRun(work, j, q, p, step, (carries[0], carries[1]))
             begin = step
         rows = slice(work.row(begin), work.row(self.step))
         work.q[rows, j] = work.p[rows, j] = np.nan
@@ -326,18 +328,18 @@ class _SingleBlock:
     """Block of one trajectory, for methods without SIMD lanes."""
 
     def __init__(self, work: Ensemble, first: int) -> None:
-        self.step, self.run = 0, _Alone(work, first, work.q[0, first], work.p[0, first])
+        self.step, self.run = 0, _SingleRun(work, first, work.q[0, first], work.p[0, first])
 
     def advance(self, size: int) -> None:
         """Advance by ``size`` steps."""
-        for portion in self.run.work.portions(self.step, size):
-            self.step += portion.steps
-            if portion.change is not None:
-                self.run.update(portion.change.h, portion.change.parameters(slice(self.run.j, self.run.j + 1))[0])
-            self.run.advance_to(self.step, portion.save_every)
+        for chunk_size in self.run.work.step_chunks(self.step, size):
+            self.step += chunk_size.steps
+            if chunk_size.change is not None:
+                self.run.update(chunk_size.change.h, chunk_size.change.parameters(slice(self.run.j, self.run.j + 1))[0])
+            self.run.advance_to(self.step, chunk_size.save_every)
 
 
-class _Alone:
+class _SingleRun:
     """Trajectory j computed by the single integrator from its state after ``step`` steps."""
 
     def __init__(
@@ -346,7 +348,7 @@ class _Alone:
         self.work, self.j = work, j
         self.run: Memory | None = None
         work.done[j] = step
-        h, time, parameters = work.placed(step, j)
+        h, time, parameters = work.step_data(step, j)
         try:
             run = Memory.started(work.stepper, q, p, h=h, t=work.t0, parameters=parameters, options=work.options)
         except StateError:  # a sum of finite terms has overflowed

@@ -36,10 +36,14 @@ def momenta_of_each(
     parameters: EnsembleParameters,
 ) -> ArrayLike:
     """Return the momenta of states specified by p or by velocity, each with its own parameters."""
-    name, given = stepper.momentum_or_velocity(p, velocity)
+    name, argument = stepper.momentum_or_velocity(p, velocity)
     if name == "p":
-        return given
-    at, positions, velocities = checked_number(t, "the time t"), _states(stepper, q, "q"), _states(stepper, given, name)
+        return argument
+    at, positions, velocities = (
+        checked_number(t, "the time t"),
+        _states(stepper, q, "q"),
+        _states(stepper, argument, name),
+    )
     if positions.shape != velocities.shape:
         raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
     values = parameters_of_each(stepper, parameters, len(positions))
@@ -73,20 +77,20 @@ def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
     return array
 
 
-def parameters_of_each(stepper: Integrator, given: EnsembleParameters, count: int) -> Array:
+def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int) -> Array:
     """Return (k, number of parameters) values: defaults overridden by name (one or k numbers each) or by an array."""
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
-    if isinstance(given, Mapping):
-        for name, value in given.items():
+    if isinstance(argument, Mapping):
+        for name, value in argument.items():
             column = real_array(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
                 raise StateError(
                     f"the parameter {name} must be one number or {count} numbers, not of shape {column.shape}"
                 )
             values[:, parameter_index(stepper.interface, name)] = column
-    elif given is not None:
-        array = real_array(given, "parameters")
+    elif argument is not None:
+        array = real_array(argument, "parameters")
         if array.shape not in ((len(names),), (count, len(names))):
             raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
         values[:] = array

@@ -11,18 +11,18 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.display.summary import one_line
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
-from scvi_codegen.given.kinds import MAPPING, PATH, takes
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.representation import one_line
+from scvi_codegen.runtime.descriptions import short_title
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.quantities import quantities
-from scvi_codegen.runtime.standing import short_title
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory import relative_changes
+from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     import xarray
@@ -62,7 +62,7 @@ class EnsembleTrajectory:
     parameters: Array
     stepper: Integrator = field(repr=False)
     times: Array | None = None
-    goals: tuple[Goal, ...] = ()
+    plans: tuple[StepPlan, ...] = ()
     spans: tuple[Span, ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
@@ -135,7 +135,7 @@ class EnsembleTrajectory:
                 if good.size:
                     yield j, good, own
 
-    @takes(path=PATH, units=MAPPING)
+    @checks_arguments(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv`` (one state a line: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
 

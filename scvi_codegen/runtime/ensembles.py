@@ -8,15 +8,15 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import warn_of_lost_energies
+from scvi_codegen.runtime.accuracy import warn_of_energy_errors
+from scvi_codegen.runtime.chaos_indicators import ChaosIndicators
+from scvi_codegen.runtime.chaos_indicators_ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
-from scvi_codegen.runtime.deviations import ChaosIndicators
-from scvi_codegen.runtime.deviations_ensemble import DeviationsEnsemble
+from scvi_codegen.runtime.ensemble_selection import ensemble_work
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.ensemble_work import ensemble_work
+from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
 
 __all__ = ["Ensembles"]
 
@@ -24,7 +24,7 @@ __all__ = ["Ensembles"]
 class Ensembles(ConstrainedStates):
     """Integration of many initial states on all cores."""
 
-    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
+    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
     def integrate_ensemble(
         self,
         q: ArrayLike,
@@ -85,10 +85,10 @@ class Ensembles(ConstrainedStates):
         )
         work.run(progress=progress, threads=threads)
         found = work.result()
-        warn_of_lost_energies(found)
+        warn_of_energy_errors(found)
         return found
 
-    @takes(StateError, progress=FUNCTION)
+    @checks_arguments(StateError, progress=FUNCTION)
     def chaos_indicators_ensemble(
         self,
         q: ArrayLike,
@@ -129,7 +129,7 @@ class Ensembles(ConstrainedStates):
             StateError: if a shape, name or number is invalid.
         """
         p = momenta_of_each(self, q, p, velocity, t, parameters)
-        work = DeviationsEnsemble(
+        work = ChaosIndicatorsEnsemble(
             self,
             q,
             p,

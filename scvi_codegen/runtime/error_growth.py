@@ -19,9 +19,9 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.runtime import indexed_constraints
 from scvi_codegen.runtime.accuracy import warnings_wanted
 from scvi_codegen.runtime.constraints import projected
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.step_plan import StepPlan
 
 __all__ = ["MOST_STEPS", "GrowthCheck"]
 
@@ -47,7 +47,7 @@ SLOW = 0.9
 """Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
 
 
-class StatesRepeated(Protocol):
+class ComparedStates(Protocol):
     """States of a run for comparison."""
 
     @property
@@ -72,46 +72,46 @@ class GrowthCheck:
     """
 
     def __init__(
-        self, run: Memory | IndexedRun, asked: bool | None, lead: Callable[[float], None] | None = None
+        self, run: Memory | IndexedRun, requested: bool | None, advance_until: Callable[[float], None] | None = None
     ) -> None:
-        adaptive = run.goal is not None and not run.goal.tau
-        if asked and not adaptive:
+        adaptive = run.plan is not None and not run.plan.tau
+        if requested and not adaptive:
             raise StateError(
                 "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
                 "check_growth"
             )
-        self.run, self.asked, self.lead = run, asked, lead or self._to
-        self.wanted = adaptive and asked is not False and warnings_wanted()
+        self.run, self.requested, self.advance_until = run, requested, advance_until or self._to
+        self.wanted = adaptive and requested is not False and warnings_wanted()
         if self.wanted:
             self.start: Any = run.checkpoint() if isinstance(run, Memory) else run.mark
             self.parameters = (
                 run.parameters.copy() if isinstance(run, Memory) else None
             )  # inputs change them during the run
 
-    def warn(self, states: StatesRepeated) -> None:
+    def warn(self, states: ComparedStates) -> None:
         """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
         if not self.wanted or len(states.t) < 2:
             return
-        assert self.run.goal is not None  # by construction
-        steps, tolerance = self.run.steps, self.run.goal.tolerance
+        assert self.run.plan is not None  # by construction
+        steps, tolerance = self.run.steps, self.run.plan.tolerance
         nudge = max(NUDGE, tolerance)
         tolerable = min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
         last, decades = self._last(states, steps), math.log10(tolerable / nudge)
         few = steps * math.log10(FASTEST) < decades
-        if last == 0 or (not self.asked and (few or self._slow(states, last, max(nudge, COARSE), decades))):
+        if last == 0 or (not self.requested and (few or self._grows_slowly(states, last, max(nudge, COARSE), decades))):
             return
         try:
             self._begin(nudge, tolerance)
             for k in sorted({last // 2, last} - {0}):
-                self.lead(float(states.t[k]))
-                apart = self._apart(states, k)
+                self.advance_until(float(states.t[k]))
+                apart = self._relative_difference(states, k)
                 if not apart <= tolerable:
                     self._report(nudge, f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
                     return
         except StepFailedError as failure:
             self._report(nudge, f"fails at t = {failure.t:g}")
 
-    def _slow(self, states: StatesRepeated, last: int, tolerance: float, decades: float) -> bool:
+    def _grows_slowly(self, states: ComparedStates, last: int, tolerance: float, decades: float) -> bool:
         """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
 
         The growth A(k) until step k of n is extrapolated exponentially from the start, A(k)^(n/k), and from the
@@ -123,9 +123,9 @@ class GrowthCheck:
         try:
             self._begin(tolerance, tolerance)
             for k in sorted((first | {int(last * part) for part in DECISIVE}) - {0}):
-                self.lead(float(states.t[k]))
+                self.advance_until(float(states.t[k]))
                 little = 0.0 if k in first else SLOW * decades * k / last
-                grown = math.log10(max(self._apart(states, k, tolerance * 10.0**little) / tolerance, 1.0))
+                grown = math.log10(max(self._relative_difference(states, k, tolerance * 10.0**little) / tolerance, 1.0))
                 rate = max(grown - grown_before, 0.0) / (k - before)
                 if k not in first and (grown < little or grown + rate * (last - k) < SLOW * decades):
                     return True
@@ -134,15 +134,15 @@ class GrowthCheck:
             pass
         return False
 
-    def _last(self, states: StatesRepeated, steps: int) -> int:
+    def _last(self, states: ComparedStates, steps: int) -> int:
         """Return the index of the last state to compare; 0 unless all states of the run are saved."""
         count = len(states.t) - 1
         if len(self._rows(states.q, 0, len(states.t))) != len(states.t):
             return 0
-        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self._halves()[0])))
-        return count if self.asked or steps <= most else int(count * most / steps)
+        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self._positions_and_momenta()[0])))
+        return count if self.requested or steps <= most else int(count * most / steps)
 
-    def _halves(self) -> tuple[Array, Array]:
+    def _positions_and_momenta(self) -> tuple[Array, Array]:
         """Return views of the positions and momenta of the run."""
         if isinstance(self.run, Memory):
             return self.run._q, self.run._p
@@ -155,9 +155,9 @@ class GrowthCheck:
         run.rollback(self.start)
         if isinstance(run, Memory):
             run._parameters[:] = self.parameters
-        assert run.goal is not None  # by construction
-        run.goal = Goal(t_end=run.goal.t_end, tolerance=tolerance)
-        q, p = self._halves()
+        assert run.plan is not None  # by construction
+        run.plan = StepPlan(t_end=run.plan.t_end, tolerance=tolerance)
+        q, p = self._positions_and_momenta()
         factors = _factors(len(q), nudge)
         q *= factors[0]
         p *= factors[1]
@@ -169,18 +169,18 @@ class GrowthCheck:
 
     def _to(self, t: float) -> None:
         run = self.run
-        assert run.goal is not None  # by construction
-        run.goal = Goal(t_end=t, tolerance=run.goal.tolerance)
+        assert run.plan is not None  # by construction
+        run.plan = StepPlan(t_end=t, tolerance=run.plan.tolerance)
         while not run.arrived:
             run.advance(MOST_STEPS)
 
-    def _apart(self, states: StatesRepeated, k: int, small: float = 0.0) -> float:
+    def _relative_difference(self, states: ComparedStates, k: int, small: float = 0.0) -> float:
         """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
 
         If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
         """
         ratios = []
-        for mine, each in zip(self._halves(), (states.q, states.p), strict=True):
+        for mine, each in zip(self._positions_and_momenta(), (states.q, states.p), strict=True):
             row = self._rows(each, k, k + 1)[0]
             difference = mine - row
             largest = float(np.abs(row).max())
@@ -204,9 +204,10 @@ class GrowthCheck:
         return np.asarray(values)[first:end]
 
     @staticmethod
-    def _report(nudge: float, said: str) -> None:
+    def _report(nudge: float, difference_text: str) -> None:
         warn(
-            f"the motion amplifies errors: a run with the initial state perturbed by {nudge:.1e} (relative) {said}, so "
+            f"the motion amplifies errors: a run with the initial state perturbed by {nudge:.1e} (relative) "
+            f"{difference_text}, so "
             "later states are not reproducible. Use error= to find the time until which digits are confirmed, or "
             "check_growth=False to skip this check",
             AccuracyWarning,

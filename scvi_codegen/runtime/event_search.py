@@ -14,11 +14,11 @@ from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.dense_output import grid_tolerance
 from scvi_codegen.runtime.events import ACCUMULATED, Crossings
 from scvi_codegen.runtime.integrator import Integrator
-from scvi_codegen.runtime.kept_states import KeptStates
+from scvi_codegen.runtime.saved_states import SavedStates
 
 __all__ = ["CrossingSearch", "crossings_of"]
 
-ROOM = 256
+INITIAL_CAPACITY = 256
 """Initial number of crossings that one call can return; doubled when exceeded."""
 
 
@@ -45,14 +45,14 @@ class CrossingSearch:
         numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
         fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]
         self._record = np.dtype(fields, align=True)
-        self._room = ROOM
+        self._capacity = INITIAL_CAPACITY
 
     @property
     def ended(self) -> bool:
         """Return whether a terminal event occurred."""
         return bool(self.watch.ended)
 
-    def search(self, part: KeptStates, first: int = 0) -> int:
+    def search(self, part: SavedStates, first: int = 0) -> int:
         """Search between consecutive states of a trajectory; return the number of steps before the search ended.
 
         Args:
@@ -68,7 +68,7 @@ class CrossingSearch:
         workspace, report = self.binding.workspace(), self.binding.new("report *")
         done = 0
         while True:
-            crossings, filled = self.binding.new(f"crossing[{self._room}]"), self.binding.numbers("long long *")
+            crossings, filled = self.binding.new(f"crossing[{self._capacity}]"), self.binding.numbers("long long *")
             status = self.binding.function("crossings")(
                 self.watch,
                 len(t) - done,
@@ -78,7 +78,7 @@ class CrossingSearch:
                 self.binding.pointer(p[done:]),
                 parameters,
                 options,
-                self._room,
+                self._capacity,
                 crossings,
                 filled,
                 report,
@@ -93,7 +93,7 @@ class CrossingSearch:
                 return done - 1
             if done == len(t) - 1:
                 return done
-            self._room *= 2
+            self._capacity *= 2
 
     def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
         if self.watch.undefined:
@@ -114,7 +114,7 @@ class CrossingSearch:
         )
 
 
-def crossings_of(stepper: Integrator, states: KeptStates) -> tuple[Crossings, ...]:
+def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
     """Return the crossings of the stepper's events along a trajectory with all states saved; no event is terminal.
 
     Raises:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import EventError
-from scvi_codegen.given.counts import checked_count
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from sympy import Expr

@@ -14,27 +14,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import AccuracyWarning, FitError, StateError, StepFailedError, closest, warn
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import MAPPING, NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.pictures.residuals import ResidualPlot
-from scvi_codegen.runtime.driven import checked_inputs
+from scvi_codegen.representation import summary
 from scvi_codegen.runtime.inputs import Array, checked_parameters, checked_vector
 from scvi_codegen.runtime.measurements import Measurements, distinct, state_names
+from scvi_codegen.runtime.runs_with_inputs import checked_inputs
 from scvi_codegen.runtime.segments import LOOSE, TIGHT, Chain, Limits, chained, joined
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import MAPPING, NAMES, SWITCH, checks_arguments, of
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Fit", "fit"]
 
 SAME = 1e-10
 """Sensitivity relative to the largest below which an unknown counts as undetermined."""
-NEARER = 4
+REFINEMENT_ITERATIONS = 4
 """Gauss-Newton iterations from the solution with half the step size."""
-NOTICED = 1e-6
+NEGLIGIBLE_CHANGE = 1e-6
 """Relative change of an unknown with half the step size below which no warning is issued."""
-SHARE = 0.1
+NAMED_FRACTION = 0.1
 """Fraction of the largest entry of a null direction from which on an unknown is named."""
 
 
@@ -97,7 +97,7 @@ class Fit:
         return ResidualPlot(self.t, self.residuals, self.deviations, self.observed)
 
 
-@takes(
+@checks_arguments(
     StateError,
     stepper=of("a compiled stepper", Stepper),
     unknown=NAMES,
@@ -163,10 +163,10 @@ def fit(
     model = _Model.checked(measurements, q, p, velocity, parameters, unknown, fit_initial_state=fit_initial_state)
     if measurements.used.sum() < len(model.names):
         raise FitError(f"{int(measurements.used.sum())} measurements do not determine {len(model.names)} unknowns")
-    chain, x = chained(measurements, model.known, model.places, checked_count(segments, "segments", least=1))
-    chain, x, held, evaluations = _solved(model, chain, x, bounds or {})
-    fitted = model.fit(chain, x, held, evaluations, known_noise=deviations is not None)
-    if told := _told_by_steps(chain, fitted, x, ~held):
+    chain, x = chained(measurements, model.known, model.unknown_indices, checked_count(segments, "segments", least=1))
+    chain, x, at_bound, evaluations = _solved(model, chain, x, bounds or {})
+    fitted = model.fit(chain, x, at_bound, evaluations, known_noise=deviations is not None)
+    if told := _step_size_warning(chain, fitted, x, ~at_bound):
         warn(told, AccuracyWarning)
     return fitted
 
@@ -182,15 +182,15 @@ def _solved(
     several = len(chain.parts) > 1
     if several:
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
-    found = least_squares(chain.residuals, x, jac=chain.slopes, bounds=limits, x_scale="jac")
+    found = least_squares(chain.residuals, x, jac=chain.jacobian, bounds=limits, x_scale="jac")
     if not found.success:
         raise FitError(f"least squares did not converge: {found.message} Give a better initial guess")
-    held = found.active_mask != 0
-    _check_told(model.names, found.jac, chain.typical_unknowns(found.x), held)
+    at_bound = found.active_mask != 0
+    _check_determined(model.names, found.jac, chain.typical_unknowns(found.x), at_bound)
     if not several:
-        return chain, found.x, held, found.nfev
-    x, held, more = joined(chain, found.x, limits)
-    return replace(chain, jump=TIGHT), x, held, found.nfev + more
+        return chain, found.x, at_bound, found.nfev
+    x, at_bound, more = joined(chain, found.x, limits)
+    return replace(chain, jump=TIGHT), x, at_bound, found.nfev + more
 
 
 @dataclass(eq=False)
@@ -205,7 +205,7 @@ class _Model:
 
     measurements: Measurements
     names: tuple[str, ...]
-    places: NDArray[np.intp]
+    unknown_indices: NDArray[np.intp]
     known: Array
 
     @classmethod
@@ -243,22 +243,22 @@ class _Model:
             )
         values = checked_parameters(stepper.interface, parameters)
         momenta = stepper._initial_momenta(q, p, velocity, measurements.start, values)
-        places = [2 * m + stepper.parameters.index(name) for name in wanted]
+        unknown_indices = [2 * m + stepper.parameters.index(name) for name in wanted]
         names = (*wanted, *state_names(stepper)) if fit_initial_state else tuple(wanted)
-        places += range(2 * m) if fit_initial_state else ()
-        first = (checked_vector(stepper.interface, given, name) for given, name in ((q, "q"), (momenta, "p")))
+        unknown_indices += range(2 * m) if fit_initial_state else ()
+        first = (checked_vector(stepper.interface, argument, name) for argument, name in ((q, "q"), (momenta, "p")))
         known = np.concatenate([*first, values])
-        return cls(measurements, names, np.array(places, dtype=np.intp), known)
+        return cls(measurements, names, np.array(unknown_indices, dtype=np.intp), known)
 
     @property
     def guess(self) -> Array:
         """(k,) initial guesses."""
-        return self.known[self.places]
+        return self.known[self.unknown_indices]
 
-    def bounded(self, given: Mapping[str, tuple[float, float]]) -> Limits:
+    def bounded(self, argument: Mapping[str, tuple[float, float]]) -> Limits:
         """Return (k,) lower and (k,) upper bounds of all unknowns; infinite for no bound."""
         low, high = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
-        for name, ends in given.items():
+        for name, ends in argument.items():
             if name not in self.names:
                 raise StateError(f"bounds name '{name}', which is not an unknown{closest(name, self.names)}")
             pair, k = real_array(ends, f"the bounds of {name}"), self.names.index(name)
@@ -269,21 +269,21 @@ class _Model:
             low[k], high[k] = pair
         return low, high
 
-    def fit(self, chain: Chain, x: Array, held: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
-        """Return the result; ``held`` is the (unknowns,) mask of those at bounds."""
+    def fit(self, chain: Chain, x: Array, at_bound: NDArray[np.bool_], evaluations: int, *, known_noise: bool) -> Fit:
+        """Return the result; ``at_bound`` is the (unknowns,) mask of those at bounds."""
         measurements, values, count = self.measurements, chain.values(x), len(self.names)
         m = measurements.stepper.dimension
-        scaled, slopes = chain.scaled(x), chain.slopes(x)
-        free = len(scaled) - int((~held[:count]).sum())
+        scaled, jacobian = chain.scaled(x), chain.jacobian(x)
+        free = len(scaled) - int((~at_bound[:count]).sum())
         noise = 1.0 if known_noise else float(np.sqrt(scaled @ scaled / free)) if free else np.nan
-        inverse = np.linalg.pinv(slopes[:, ~held])
+        inverse = np.linalg.pinv(jacobian[:, ~at_bound])
         covariance = np.full((len(x), len(x)), np.nan)
-        covariance[np.ix_(~held, ~held)] = noise**2 * inverse @ inverse.T
+        covariance[np.ix_(~at_bound, ~at_bound)] = noise**2 * inverse @ inverse.T
         return Fit(
             names=self.names,
             values=np.array(x[:count]),
             covariance=covariance[:count, :count],
-            at_bounds=tuple(name for name, at in zip(self.names, held[:count], strict=True) if at),
+            at_bounds=tuple(name for name, at in zip(self.names, at_bound[:count], strict=True) if at),
             parameters=dict(zip(measurements.stepper.parameters, values[2 * m :].tolist(), strict=True)),
             q=values[:m],
             p=values[m : 2 * m],
@@ -298,7 +298,7 @@ class _Model:
         )
 
 
-def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
+def _step_size_warning(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_]) -> str:
     """Return a warning if half the step size changes an unknown by more than its standard error, else "".
 
     Changes below a millionth of the size of an unknown are ignored: noise-free data have no errors.
@@ -306,11 +306,11 @@ def _told_by_steps(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.bool_])
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
     count, found = len(fitted.names), x.copy()
     errors, told = np.sqrt(np.diag(fitted.covariance)), free[:count]
-    noticed = np.maximum(errors, NOTICED * chain.typical_unknowns(x)[:count])
+    noticed = np.maximum(errors, NEGLIGIBLE_CHANGE * chain.typical_unknowns(x)[:count])
     with suppress(StepFailedError):
-        for _ in range(NEARER):
-            scaled, slopes = finer.evaluated(found)
-            found[free] -= np.linalg.pinv(slopes[:, free]) @ scaled
+        for _ in range(REFINEMENT_ITERATIONS):
+            scaled, jacobian = finer.evaluated(found)
+            found[free] -= np.linalg.pinv(jacobian[:, free]) @ scaled
             moved = np.abs(found - x)[:count][told]
             if not (moved > noticed[told]).any():
                 return ""
@@ -327,7 +327,7 @@ def _of_inputs(stepper: Stepper) -> set[str]:
     return {f"{name}_{part}" for name in stepper.interface.inputs for part in "0123t"}
 
 
-def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray[np.bool_]) -> None:
+def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bound: NDArray[np.bool_]) -> None:
     """Raise :class:`FitError` for unknowns that can change without changing the computed measurements.
 
     Columns are scaled by the size of the unknowns, so units do not matter.
@@ -338,20 +338,24 @@ def _check_told(names: Sequence[str], slopes: Array, sizes: Array, held: NDArray
         sizes: (unknowns,) typical sizes, 0 if unknown.
         held: (unknowns,) mask of those at bounds.
     """
-    if held.all():
+    if at_bound.all():
         return
-    own = [*names, *[""] * (len(held) - len(names))]
-    free, slopes, sizes = [name for name, at in zip(own, held, strict=True) if not at], slopes[:, ~held], sizes[~held]
-    lengths = np.linalg.norm(slopes, axis=0)
+    own = [*names, *[""] * (len(at_bound) - len(names))]
+    free, jacobian, sizes = (
+        [name for name, at in zip(own, at_bound, strict=True) if not at],
+        jacobian[:, ~at_bound],
+        sizes[~at_bound],
+    )
+    lengths = np.linalg.norm(jacobian, axis=0)
     changes = lengths * sizes
     if nothing := np.flatnonzero((lengths == 0.0) | ((sizes > 0.0) & (changes <= SAME * changes.max()))).tolist():
         name = free[nothing[0]]
         raise FitError(f"the measurements do not determine {name}: they do not depend on it. {_as_known([name])}")
-    singular, directions = np.linalg.svd(slopes / lengths)[1:]
+    singular, directions = np.linalg.svd(jacobian / lengths)[1:]
     if singular[-1] > SAME * singular[0]:
         return
     shares = np.abs(directions[-1])
-    told = [free[k] for k in np.flatnonzero(shares > SHARE * shares.max()).tolist() if free[k]]
+    told = [free[k] for k in np.flatnonzero(shares > NAMED_FRACTION * shares.max()).tolist() if free[k]]
     if len(told) < 2:
         raise FitError(
             f"the measurements do not determine {' '.join(told) or 'the states of segments'}: changed together with "

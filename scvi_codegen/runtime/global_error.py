@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["Confirmed", "GlobalError", "checked_error", "confirmed_run"]
 
@@ -172,7 +172,7 @@ def confirmed_run(
         return again(_nudged(q, number), nearby, velocity=moving, tolerance=tolerance or None, t_end=end, **common)
 
     tolerance, runs = wanted * FIRST, 0
-    with unwarned():
+    with without_accuracy_warnings():
         while True:
             last, runs = tolerance < LEAST, runs + 1
             found, tolerance, others = _accurate(tight, tolerance, last=last)

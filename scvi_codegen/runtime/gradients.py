@@ -13,37 +13,37 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.native.options import step_failure
+from scvi_codegen.representation import summary
 from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.kept_states import KeptStates
-from scvi_codegen.runtime.levels import time_of
 from scvi_codegen.runtime.linearised import LinearisedMethod, Sensitivity, Starts
 from scvi_codegen.runtime.memory import Memory, fill
-from scvi_codegen.runtime.retaken import refuse_strays, steps_between
+from scvi_codegen.runtime.recomputation import check_recomputed, steps_between
+from scvi_codegen.runtime.saved_states import SavedStates
+from scvi_codegen.runtime.transformed_derivatives import time_of
 
 __all__ = [
     "Gradient",
     "backward",
-    "carried",
-    "carry",
-    "changes_of",
-    "checked_slopes",
+    "checked_cotangents",
     "finite",
     "forward",
     "gradient_of",
     "pieces",
-    "pulled_back",
+    "propagate",
     "seeds_of",
     "sensitivity",
     "starts_of",
+    "tangent_vectors",
+    "tangents_from_directions",
+    "vector_jacobian_product",
 ]
 
 MOST_STEPS = 1024
 """Largest number of steps of a segment processed at once."""
-SAME_LENGTH = 1e-9
+SAME_STEP_SIZE = 1e-9
 """Relative difference of step sizes that rounding of times may cause."""
 
 
@@ -67,7 +67,7 @@ class Gradient:
     __repr__ = summary("q", "p", "parameters")
 
 
-def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
+def tangent_vectors(states: SavedStates, directions: ArrayLike | None) -> Array:
     """Return (n, 2m, k) tangent vectors at the states, from (2m, k) directions of (q, p) or (2m + parameters + 2, k).
 
     Without directions the full state-transition matrices of (q, p) are returned.
@@ -77,11 +77,11 @@ def carried(states: KeptStates, directions: ArrayLike | None) -> Array:
     """
     size = 2 * states.stepper.dimension
     given = np.eye(size) if directions is None else finite(directions, "directions")
-    found, _ = forward(states, changes_of(states.stepper, given))
+    found, _ = forward(states, tangents_from_directions(states.stepper, given))
     return found[:, :size].reshape(len(states), size, *given.shape[1:])
 
 
-def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
+def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Array:
     """Return (k, variables) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
 
     Raises:
@@ -93,65 +93,66 @@ def changes_of(stepper: LinearisedMethod, directions: Array) -> Array:
             f"directions must have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
             f"parameters, t, h), not {directions.shape}"
         )
-    changes = np.zeros((directions[0].size, given))
-    changes[:, : len(directions)] = directions.reshape(len(directions), -1).T
-    return changes
+    tangents = np.zeros((directions[0].size, given))
+    tangents[:, : len(directions)] = directions.reshape(len(directions), -1).T
+    return tangents
 
 
-def sensitivity(states: KeptStates) -> Sensitivity:
+def sensitivity(states: SavedStates) -> Sensitivity:
     """Return the derivatives of all states with respect to all inputs of the run."""
     columns, _ = forward(states, np.eye(states.stepper._input_size))
-    return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_one_length(states))
+    return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_fixed_step_size(states))
 
 
-def pulled_back(states: KeptStates, cotangents: ArrayLike) -> Gradient:
+def vector_jacobian_product(states: SavedStates, cotangents: ArrayLike) -> Gradient:
     """Return the vector-Jacobian product of the run with (n, 2m) or (n, 2m, c) cotangents of the states."""
-    slopes = checked_slopes(states.stepper, len(states), cotangents)
-    seeds = seeds_of(states.stepper, slopes)
+    derivatives = checked_cotangents(states.stepper, len(states), cotangents)
+    seeds = seeds_of(states.stepper, derivatives)
     found = backward(states, seeds, np.zeros_like(seeds[0]))
-    return gradient_of(states, found.T.reshape(states.stepper._input_size, *slopes.shape[2:]))
+    return gradient_of(states, found.T.reshape(states.stepper._input_size, *derivatives.shape[2:]))
 
 
-def seeds_of(stepper: LinearisedMethod, slopes: Array) -> Array:
+def seeds_of(stepper: LinearisedMethod, derivatives: Array) -> Array:
     """Return (n, c, variables) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
-    size = slopes.shape[1]
-    seeds = np.zeros((len(slopes), slopes[0].size // size, stepper._input_size))
-    seeds[:, :, stepper._output_indices[:size]] = slopes.reshape(len(slopes), size, -1).transpose(0, 2, 1)
+    size = derivatives.shape[1]
+    seeds = np.zeros((len(derivatives), derivatives[0].size // size, stepper._input_size))
+    seeds[:, :, stepper._output_indices[:size]] = derivatives.reshape(len(derivatives), size, -1).transpose(0, 2, 1)
     return seeds
 
 
-def backward(states: KeptStates, seeds: Array, now: Array) -> Array:
+def backward(states: SavedStates, seeds: Array, now: Array) -> Array:
     """Return (c, variables) adjoints at the start, from the seeds of each state and those ``now`` after the last."""
     time = time_of(states)
-    states, by_ends = time.states, time.seeded(seeds)
+    states, by_ends = time.states, time.step_cotangents(seeds)
     for first, last in reversed(list(pieces(states))):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
-        kept = np.flatnonzero(numbers[1:] > 0) + 1
-        vectors[kept] = by_ends[numbers[kept]]
+        saved = np.flatnonzero(numbers[1:] > 0) + 1
+        vectors[saved] = by_ends[numbers[saved]]
         vectors[-1] += now
-        carry(states, starts, numbers, vectors, back=True)
+        propagate(states, starts, numbers, vectors, back=True)
         now = vectors[0]
-    return time.pulled(now + by_ends[0], seeds)
+    return time.initial_cotangents(now + by_ends[0], seeds)
 
 
-def checked_slopes(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
+def checked_cotangents(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
     """Return validated (n, 2m) or (n, 2m, c) cotangents; in transformed time they may include one of t.
 
     Raises:
         StateError: if the shape does not match the number of states.
     """
-    size, slopes = 2 * stepper.dimension, finite(cotangents, "cotangents")
+    size, derivatives = 2 * stepper.dimension, finite(cotangents, "cotangents")
     sizes = {size, len(stepper._output_indices)}
-    if slopes.ndim not in (2, 3) or slopes.shape[0] != count or slopes.shape[1] not in sizes:
+    if derivatives.ndim not in (2, 3) or derivatives.shape[0] != count or derivatives.shape[1] not in sizes:
         shape = f"({count}, {size})" + f", or ({count}, {size + 1}) with those by t," * (len(sizes) - 1)
         raise StateError(
-            f"cotangents, derivatives by (q, p) of each state, must have shape {shape} or (.., c), not {slopes.shape}"
+            f"cotangents, derivatives by (q, p) of each state, must have shape {shape} or (.., c), "
+            f"not {derivatives.shape}"
         )
-    return slopes
+    return derivatives
 
 
-def gradient_of(states: KeptStates, found: Array) -> Gradient:
+def gradient_of(states: SavedStates, found: Array) -> Gradient:
     """Construct from (variables, ..) derivatives."""
     m = states.stepper.dimension
     return Gradient(
@@ -159,7 +160,7 @@ def gradient_of(states: KeptStates, found: Array) -> Gradient:
         p=found[m : 2 * m],
         parameters=found[2 * m : -2],
         t=found[-2],
-        h=found[-1] if _has_one_length(states) else None,
+        h=found[-1] if _has_fixed_step_size(states) else None,
     )
 
 
@@ -171,31 +172,31 @@ def finite(given: ArrayLike, name: str) -> Array:
     return array
 
 
-def forward(states: KeptStates, changes: Array) -> tuple[Array, Array]:
+def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
     """Return (n, outputs, count) tangent vectors at the states and (count, variables) at the end of the run."""
     time, told = time_of(states), states.stepper._output_indices
-    states, now = time.states, time.begun(changes)
+    states, now = time.states, time.initial_tangents(tangents)
     found = np.empty((len(states), len(told), len(now)))
     found[0] = now[:, told].T
     for first, last in pieces(states):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
         vectors[0] = now
-        carry(states, starts, numbers, vectors, back=False)
-        kept = np.flatnonzero(numbers[1:] > 0) + 1
-        found[numbers[kept]] = vectors[kept][:, :, told].transpose(0, 2, 1)
+        propagate(states, starts, numbers, vectors, back=False)
+        saved = np.flatnonzero(numbers[1:] > 0) + 1
+        found[numbers[saved]] = vectors[saved][:, :, told].transpose(0, 2, 1)
         now = vectors[-1]
-    return time.ended(found, now, changes)
+    return time.final_tangents(found, now, tangents)
 
 
-def carry(states: KeptStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
+def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
     """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
     ends = states.stepper._propagate(starts, vectors, states.parameters, states.options, transpose=back)
     known = np.concatenate([starts.q, starts.p], axis=1)
-    refuse_strays(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
+    check_recomputed(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
 
 
-def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
+def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:
     """Yield the first and last index of segments whose steps are all saved, or of two consecutive saved states."""
     spans, lengths = np.diff(states.stepped), states.step_sizes[:-1]
     several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
@@ -209,13 +210,13 @@ def pieces(states: KeptStates) -> Iterator[tuple[int, int]]:
         first = last
 
 
-def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
+def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
     """Return the steps of a segment, and (steps + 1,) indices of the saved states at their ends, -1 if not saved."""
     length, span = float(states.step_sizes[first]), float(states.stepped[last] - states.stepped[first])
     count = steps_between(length, span) if last == first + 1 else 1
     if count == 1:
         spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
-        h = np.where(np.abs(spans - lengths) < SAME_LENGTH * np.abs(lengths), lengths, spans)
+        h = np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths), lengths, spans)
         of = slice(first, last + 1)
         starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
         return starts, np.arange(first, last + 1)
@@ -242,10 +243,10 @@ def starts_of(states: KeptStates, first: int, last: int) -> tuple[Starts, NDArra
     return starts, numbers
 
 
-def _has_one_length(states: KeptStates) -> bool:
+def _has_fixed_step_size(states: SavedStates) -> bool:
     """Return whether all steps have size h."""
-    if states.goal is not None:
+    if states.plan is not None:
         return False
     spans = np.diff(states.stepped)
     steps = np.rint(spans / states.h)
-    return bool((np.abs(spans - steps * states.h) <= SAME_LENGTH * abs(states.h) * np.maximum(1.0, steps)).all())
+    return bool((np.abs(spans - steps * states.h) <= SAME_STEP_SIZE * abs(states.h) * np.maximum(1.0, steps)).all())

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from scvi_codegen.runtime.inputs import Array
 
-__all__ = ["SERIES", "Growth", "apart", "triangles"]
+__all__ = ["SERIES", "Growth", "ill_conditioned", "r_factors"]
 
 SERIES = ("lengths", "greatest", "stretches", "rates", "mean_rates")
-"""Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.deviations.ChaosIndicators`."""
+"""Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.chaos_indicators.ChaosIndicators`."""
 
-APART = 1e3
+MOST_GROWTH_RATIO = 1e3
 """Largest ratio of growth between tangent vectors within a segment; bounds the loss of significant digits."""
 
 
@@ -56,19 +56,19 @@ class Growth:
         means[1:] += rates[:-1]
         means[0] += self.rates
         areas = self.areas + np.cumsum(np.diff(times, axis=0) / 2 * means, axis=0)
-        kept = np.flatnonzero(numbers >= 0)
-        self.found[:, numbers[kept]] = [
-            lengths[kept],
-            greatest[kept],
-            self.stretches + stretched[kept],
-            rates[kept],
-            areas[kept] / times[kept + 1],
+        saved = np.flatnonzero(numbers >= 0)
+        self.found[:, numbers[saved]] = [
+            lengths[saved],
+            greatest[saved],
+            self.stretches + stretched[saved],
+            rates[saved],
+            areas[saved] / times[saved + 1],
         ]
         self.lengths, self.greatest, self.stretches = lengths[-1], greatest[-1], self.stretches + stretched[-1]
         self.moments, self.rates, self.areas = moments[-1], rates[-1], areas[-1]
 
 
-def triangles(images: Array) -> Array:
+def r_factors(images: Array) -> Array:
     """Return the (.., k, k) factors R of (.., 2m, k) matrices."""
     if images.shape[-1] == 1:
         found: Array = np.linalg.norm(images, axis=-2)[..., np.newaxis]
@@ -77,9 +77,9 @@ def triangles(images: Array) -> Array:
     return found
 
 
-def apart(images: Array) -> NDArray[np.bool_]:
+def ill_conditioned(images: Array) -> NDArray[np.bool_]:
     """Return (..) flags of the factors R (.., k, k) whose tangent vectors lost too many significant digits."""
     largest = np.abs(images).max(axis=(-2, -1))
     least = np.abs(np.diagonal(images, axis1=-2, axis2=-1)).min(axis=-1)
-    parted: NDArray[np.bool_] = ~(np.maximum(largest, 1.0) <= APART * np.minimum(least, 1.0))
+    parted: NDArray[np.bool_] = ~(np.maximum(largest, 1.0) <= MOST_GROWTH_RATIO * np.minimum(least, 1.0))
     return parted

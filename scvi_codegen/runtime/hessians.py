@@ -8,23 +8,23 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.gradients import (
     Gradient,
-    carry,
-    changes_of,
-    checked_slopes,
+    checked_cotangents,
     finite,
     gradient_of,
     pieces,
+    propagate,
     starts_of,
+    tangents_from_directions,
 )
 from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.kept_states import KeptStates
 from scvi_codegen.runtime.linearised import LinearisedMethod
+from scvi_codegen.runtime.saved_states import SavedStates
 
-__all__ = ["bent_back", "checked_function", "hessian_product"]
+__all__ = ["checked_function", "hessian_product", "second_order_adjoints"]
 
 
 def hessian_product(
-    states: KeptStates, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None
+    states: SavedStates, cotangents: ArrayLike, directions: ArrayLike, curvatures: ArrayLike | None
 ) -> Gradient:
     """Return the Hessian-vector product of a function F of the states along directions.
 
@@ -36,11 +36,11 @@ def hessian_product(
         directions: directions v of (q, p), or of (q, p, parameters, t, h).
         curvatures: (n, 2m, 2m) F'' at each state.
     """
-    slopes, bends = checked_function(states.stepper, len(states), cotangents, curvatures)
+    derivatives, hessian_blocks = checked_function(states.stepper, len(states), cotangents, curvatures)
     given = finite(directions, "directions")
     states.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
-    changes = changes_of(states.stepper, given)
-    found = bent_back(states, slopes, bends, changes, np.zeros((2, *changes.shape)))
+    tangents = tangents_from_directions(states.stepper, given)
+    found = second_order_adjoints(states, derivatives, hessian_blocks, tangents, np.zeros((2, *tangents.shape)))
     return gradient_of(states, found[1].T.reshape(states.stepper._input_size, *given.shape[1:]))
 
 
@@ -48,17 +48,21 @@ def checked_function(
     stepper: LinearisedMethod, count: int, cotangents: ArrayLike, curvatures: ArrayLike | None
 ) -> tuple[Array, Array]:
     """Return validated (n, 2m) first and (n, 2m, 2m) second derivatives of one function of ``count`` states."""
-    size, slopes = 2 * stepper.dimension, checked_slopes(stepper, count, cotangents)
-    if slopes.ndim == 3:
-        raise StateError(f"cotangents of one function must have shape ({count}, {size}), not {slopes.shape}")
+    size, derivatives = 2 * stepper.dimension, checked_cotangents(stepper, count, cotangents)
+    if derivatives.ndim == 3:
+        raise StateError(f"cotangents of one function must have shape ({count}, {size}), not {derivatives.shape}")
     shape = (count, size, size)
-    bends = np.broadcast_to(0.0, shape) if curvatures is None else finite(curvatures, "curvatures")
-    if bends.shape != shape:
-        raise StateError(f"curvatures, Hessians by (q, p) of each state, must have shape {shape}, not {bends.shape}")
-    return slopes, bends
+    hessian_blocks = np.broadcast_to(0.0, shape) if curvatures is None else finite(curvatures, "curvatures")
+    if hessian_blocks.shape != shape:
+        raise StateError(
+            f"curvatures, Hessians by (q, p) of each state, must have shape {shape}, not {hessian_blocks.shape}"
+        )
+    return derivatives, hessian_blocks
 
 
-def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, now: Array) -> Array:
+def second_order_adjoints(
+    states: SavedStates, derivatives: Array, hessian_blocks: Array, tangents: Array, now: Array
+) -> Array:
     """Return (2, k, variables) adjoints at the start and their tangents, from those ``now`` after the last state.
 
     Args:
@@ -67,38 +71,38 @@ def bent_back(states: KeptStates, slopes: Array, bends: Array, changes: Array, n
         now: (2, k, variables) adjoints and their tangents after the last state.
     """
     between = list(pieces(states))
-    at_starts = _changes_at_starts(states, between, changes)
+    at_starts = _tangents_at_starts(states, between, tangents)
     for (first, last), start in zip(reversed(between), reversed(at_starts), strict=True):
         starts, numbers = starts_of(states, first, last)
-        moved = np.zeros((len(numbers), *changes.shape))
+        moved = np.zeros((len(numbers), *tangents.shape))
         moved[0] = start
-        carry(states, starts, numbers, moved, back=False)
-        vectors = np.zeros((len(numbers), 2, *changes.shape))
-        kept = np.flatnonzero(numbers[1:] > 0) + 1
-        vectors[kept] = _seeds(slopes[numbers[kept]], bends[numbers[kept]], moved[kept])
+        propagate(states, starts, numbers, moved, back=False)
+        vectors = np.zeros((len(numbers), 2, *tangents.shape))
+        saved = np.flatnonzero(numbers[1:] > 0) + 1
+        vectors[saved] = _seeds(derivatives[numbers[saved]], hessian_blocks[numbers[saved]], moved[saved])
         vectors[-1] += now
         states.stepper._second_order_adjoint(starts, moved, vectors, states.parameters, states.options)
         now = vectors[0]
-    first_slopes: Array = now + _seeds(slopes[:1], bends[:1], changes[np.newaxis])[0]
+    first_slopes: Array = now + _seeds(derivatives[:1], hessian_blocks[:1], tangents[np.newaxis])[0]
     return first_slopes
 
 
-def _changes_at_starts(states: KeptStates, between: list[tuple[int, int]], changes: Array) -> list[Array]:
+def _tangents_at_starts(states: SavedStates, between: list[tuple[int, int]], tangents: Array) -> list[Array]:
     """Return the tangent vectors at the start of each segment."""
-    found = [changes]
+    found = [tangents]
     for first, last in between[:-1]:
         starts, numbers = starts_of(states, first, last)
-        moved = np.zeros((len(numbers), *changes.shape))
+        moved = np.zeros((len(numbers), *tangents.shape))
         moved[0] = found[-1]
-        carry(states, starts, numbers, moved, back=False)
+        propagate(states, starts, numbers, moved, back=False)
         found.append(moved[-1])
     return found if between else []
 
 
-def _seeds(slopes: Array, bends: Array, moved: Array) -> Array:
+def _seeds(derivatives: Array, hessian_blocks: Array, moved: Array) -> Array:
     """Return (n, 2, k, variables) derivatives of F with respect to n states, and their tangents."""
-    size = slopes.shape[1]
-    seeds = np.zeros((len(slopes), 2, *moved.shape[1:]))
-    seeds[:, 0, :, :size] = slopes[:, np.newaxis]
-    seeds[:, 1, :, :size] = np.einsum("nij,nkj->nki", bends, moved[:, :, :size])
+    size = derivatives.shape[1]
+    seeds = np.zeros((len(derivatives), 2, *moved.shape[1:]))
+    seeds[:, 0, :, :size] = derivatives[:, np.newaxis]
+    seeds[:, 1, :, :size] = np.einsum("nij,nkj->nki", hessian_blocks, moved[:, :, :size])
     return seeds

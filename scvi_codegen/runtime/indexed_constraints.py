@@ -10,8 +10,8 @@ import numpy as np
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.indices import Loop
 from scvi_codegen.native.options import REASONS, STATUS, SolverOptions
-from scvi_codegen.rendering.stopping import NEAR, ROUNDED, TYPED
-from scvi_codegen.runtime.constraint_rank import refusal
+from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.runtime.constraint_rank import rank_deficiency
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 
@@ -22,7 +22,7 @@ MOST_DENSE = 64
 """Largest numbers of coordinates and of constraints for which the rank of the dense Jacobian is checked."""
 
 
-class RunOfArrays(Protocol):
+class ConstrainedRun(Protocol):
     """Interface required of a run.
 
     Attributes:
@@ -50,14 +50,14 @@ class RunOfArrays(Protocol):
         ...
 
 
-def constraint_values(run: RunOfArrays) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
+def constraint_values(run: ConstrainedRun) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
     """Return g and its rate for each constraint, as arrays over its loops."""
     found = np.zeros(_count(run)), np.zeros(_count(run))
     run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
     return _apart(run, found[0]), _apart(run, found[1])
 
 
-def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
+def multipliers(run: ConstrainedRun) -> tuple[Numbers, ...]:
     """Return the multipliers lambda of the forces G^T lambda of each constraint, as arrays over its loops."""
     found = np.zeros(_count(run))
     if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
@@ -65,7 +65,7 @@ def multipliers(run: RunOfArrays) -> tuple[Numbers, ...]:
     return _apart(run, found)
 
 
-def consistent(run: RunOfArrays) -> None:
+def consistent(run: ConstrainedRun) -> None:
     """Project the initial state of a run onto the constraints; warn unless rounding explains the distance.
 
     Raises:
@@ -75,21 +75,21 @@ def consistent(run: RunOfArrays) -> None:
     before, moved = project(run)
     if wrong := _dependent(run):
         raise StateError(wrong)
-    if max(moved) <= ROUNDED * np.finfo(float).eps:
+    if max(moved) <= ROUNDING_UNITS * np.finfo(float).eps:
         run.state[:] = before
-    if max(moved) <= TYPED:
+    if max(moved) <= INPUT_PRECISION:
         return
     largest = [max(float(np.abs(each).max(initial=0.0)) for each in values) for values in (g, rate)]
-    said = (
+    message = (
         f"the initial state violates the constraints by {max(moved):.1e} (relative): they are up to {largest[0]:.3g}, "
         f"their rates up to {largest[1]:.3g}, not 0"
     )
-    if max(moved) > NEAR:
-        raise StateError(f"{said}. Use stepper.project(q, p) for the nearest consistent state")
-    warn(f"{said}. It was projected onto the constraints", AccuracyWarning)
+    if max(moved) > LARGEST_VIOLATION:
+        raise StateError(f"{message}. Use stepper.project(q, p) for the nearest consistent state")
+    warn(f"{message}. It was projected onto the constraints", AccuracyWarning)
 
 
-def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
+def project(run: ConstrainedRun) -> tuple[Numbers, tuple[float, float]]:
     """Project the state onto the constraints; return the previous state and the relative changes of q and of p.
 
     Raises:
@@ -109,10 +109,10 @@ def project(run: RunOfArrays) -> tuple[Numbers, tuple[float, float]]:
     return before, (_relative(before[:half], run.state[:half]), _relative(before[half:], run.state[half:]))
 
 
-def check_reachable(run: RunOfArrays) -> None:
+def check_reachable(run: ConstrainedRun) -> None:
     """Raise :class:`StateError` if changed parameters move position constraints; momenta follow rates that jump."""
     before, (moved, _) = project(run)
-    if moved > TYPED:
+    if moved > INPUT_PRECISION:
         run.state[:] = before
         raise StateError(
             f"at t = {run.t:g} the position constraints jump by {moved:.1e} (relative): parameters in position "
@@ -121,8 +121,8 @@ def check_reachable(run: RunOfArrays) -> None:
     run.state[: len(before) // 2] = before[: len(before) // 2]
 
 
-def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
-    """Return the message of :func:`refusal`; "" if the system is too large for dense linear algebra."""
+def _dependent(run: ConstrainedRun, *, nearest: bool = False) -> str:
+    """Return the message of :func:`rank_deficiency`; "" if the system is too large for dense linear algebra."""
     n, count = len(run.state) // 2, _count(run)
     if max(n, count) > MOST_DENSE:
         return ""
@@ -144,23 +144,23 @@ def _dependent(run: RunOfArrays, *, nearest: bool = False) -> str:
         for place in np.ndindex(*shape)
     ]
     try:
-        return refusal(names, state[:n].copy(), at, nearest=nearest)
+        return rank_deficiency(names, state[:n].copy(), at, nearest=nearest)
     finally:
         run.state[:] = state
 
 
-def _count(run: RunOfArrays) -> int:
+def _count(run: ConstrainedRun) -> int:
     if not run.problem.interface.constraints:
         raise MethodError(f"'{run.problem.interface.system}' has no constraints")
     return sum(int(np.prod(shape)) for shape in _shapes(run))
 
 
-def _shapes(run: RunOfArrays) -> list[list[int]]:
+def _shapes(run: ConstrainedRun) -> list[list[int]]:
     """Return the shape of the loops of each constraint."""
     return [_shape(loops, run.problem.arrays.sizes) for loops in run.problem.interface.constraints]
 
 
-def _apart(run: RunOfArrays, values: Numbers) -> tuple[Numbers, ...]:
+def _apart(run: ConstrainedRun, values: Numbers) -> tuple[Numbers, ...]:
     """Split a vector into one array per constraint."""
     found, start = [], 0
     for shape in _shapes(run):

@@ -20,7 +20,7 @@ from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
 from scvi_codegen.runtime.events import ACCUMULATED, Event
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, check_accesses
-from scvi_codegen.runtime.indexed_memory import IndexedMark
+from scvi_codegen.runtime.indexed_memory import IndexedSnapshot
 from scvi_codegen.runtime.indexed_run import IndexedRun
 
 if TYPE_CHECKING:
@@ -89,8 +89,8 @@ class IndexedSearch:
         run, before, values = self.run, self.run.mark, self.values
         run.advance(1)
         self.values = self._values(run)
-        low = run._run.t_low - before.moments["t_low"]
-        h = (run.t - before.moments["t"]) + low if run.goal else run.h
+        low = run._run.t_low - before.run_fields["t_low"]
+        h = (run.t - before.run_fields["t"]) + low if run.plan else run.h
         zeros: list[tuple[float, int, bool]] = []
         for k, event in enumerate(self.events):
             looked = [(0.0, values[k]), (1.0, self.values[k])]
@@ -100,7 +100,7 @@ class IndexedSearch:
             zeros += [(self._zero(before, k, h, *pair), k, pair[1][1] > pair[0][1]) for pair in pairs]
         self.started = True
         for number, (part, k, _) in enumerate(sorted(zeros)):
-            there = self._part(before, part * h) if part < 1.0 else run.apart(h)
+            there = self._part(before, part * h) if part < 1.0 else run.copy_with_step(h)
             if self._take(k, there):
                 for other, j, rises in sorted(zeros)[number + 1 :]:
                     if other - part <= TIE and self._value(there, j) * (1.0 if rises else -1.0) >= 0.0:
@@ -114,14 +114,14 @@ class IndexedSearch:
         self.remaining[k] -= 1
         return self.remaining[k] == 0
 
-    def _leaves_zero(self, before: IndexedMark, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
+    def _leaves_zero(self, before: IndexedSnapshot, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
         """Return samples within a first step that begins at a zero, as if the run had come from the other side.
 
         Raises:
             EventError: if the run returns to a terminal event within a rounding error.
         """
         (_, old), (_, new) = ends
-        start = self.run.apart(h)
+        start = self.run.copy_with_step(h)
         start.rollback(before)
         noise = self._rounding(start, k, old)
         change, doubt = self._first_change(before, start, k, h, noise)
@@ -151,7 +151,7 @@ class IndexedSearch:
         return found
 
     def _first_change(
-        self, before: IndexedMark, start: IndexedRun, k: int, h: float, noise: float
+        self, before: IndexedSnapshot, start: IndexedRun, k: int, h: float, noise: float
     ) -> tuple[float, float]:
         """Return h dg/dt at the start of a step and its uncertainty; zeros if g is undefined nearby."""
         n, part, next_ = start.problem.count, RATE_PART, self._part(before, RATE_PART * h)
@@ -197,13 +197,13 @@ class IndexedSearch:
             for event, found in zip(self.events, self.found, strict=True)
         )
 
-    def _end(self, before: IndexedMark, there: IndexedRun) -> None:
+    def _end(self, before: IndexedSnapshot, there: IndexedRun) -> None:
         """Leave the run at the state of a terminal event."""
         self.run.rollback(before)
-        self.run.stand_at(there)
+        self.run.move_to(there)
         self.ended = True
 
-    def _zero(self, before: IndexedMark, k: int, h: float, left: Sample, right: Sample) -> float:
+    def _zero(self, before: IndexedSnapshot, k: int, h: float, left: Sample, right: Sample) -> float:
         """Return the fraction of a step, between two samples, at which a function is 0 or first has its new sign."""
         from scipy.optimize import brentq  # here: slow to import
 
@@ -217,11 +217,11 @@ class IndexedSearch:
             part, width = min(right[0], part + width * right[0]), 2.0 * width
         return part
 
-    def _part(self, before: IndexedMark, h: float) -> IndexedRun:
+    def _part(self, before: IndexedSnapshot, h: float) -> IndexedRun:
         """Return the state after a partial step."""
-        run = self.run.apart(h)
-        run.rollback(replace(before, moments={**before.moments, "h": h}))
-        run.goal = None
+        run = self.run.copy_with_step(h)
+        run.rollback(replace(before, run_fields={**before.run_fields, "h": h}))
+        run.plan = None
         run.advance(1)
         return run
 
@@ -254,7 +254,7 @@ class _Function:
         self.needs = {access.array.name for access, _ in accesses}
 
     def value(self, run: IndexedRun) -> float:
-        from scvi_codegen.formulas.summed import Elements  # here, because it imports SymPy
+        from scvi_codegen.formulas.indexed_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
         given = run.problem.arrays

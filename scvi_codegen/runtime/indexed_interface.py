@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 Numbers = NDArray[np.float64]
-Places = NDArray[np.int32]
+IndexTable = NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +85,7 @@ class RunArrays:
     state: dict[str, Numbers]
     numbers: list[float]
     fields: dict[str, Numbers]
-    places: dict[str, Places]
+    places: dict[str, IndexTable]
 
 
 def read_arrays(
@@ -102,19 +102,21 @@ def read_arrays(
     places, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.coordinates]
     shapes += [(table, places[table.name].shape) for table in interface.tables]
-    given = dict(parameters or {})
-    numbers = number_values(interface, given)
+    argument = dict(parameters or {})
+    numbers = number_values(interface, argument)
     shapes += [
-        (field, real_array(given[field.name], field.name).shape) for field in interface.fields if field.name in given
+        (field, real_array(argument[field.name], field.name).shape)
+        for field in interface.fields
+        if field.name in argument
     ]
     sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
-    fields = field_values(interface, given, sizes)
+    fields = field_values(interface, argument, sizes)
     check_accesses(interface, sizes, places)
     return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=places)
 
 
 def read_state(
-    interface: IndexedInterface, given: ArrayLike | Mapping[str, ArrayLike], what: str
+    interface: IndexedInterface, argument: ArrayLike | Mapping[str, ArrayLike], what: str
 ) -> dict[str, Numbers]:
     """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
 
@@ -122,43 +124,45 @@ def read_state(
         StateError: if a name, a number of axes or a value is invalid.
     """
     names = [array.name for array in interface.coordinates]
-    if not isinstance(given, Mapping):
+    if not isinstance(argument, Mapping):
         if len(names) > 1:
             raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
-        given = {names[0]: given}
-    _check_named(given, names, what, whole=True)
-    return {array.name: _of_axes(array, real_array(given[array.name], what), what) for array in interface.coordinates}
+        argument = {names[0]: argument}
+    _check_named(argument, names, what, whole=True)
+    return {
+        array.name: _of_axes(array, real_array(argument[array.name], what), what) for array in interface.coordinates
+    }
 
 
-def number_values(interface: IndexedInterface, given: Mapping[str, ArrayLike]) -> list[float]:
+def number_values(interface: IndexedInterface, argument: Mapping[str, ArrayLike]) -> list[float]:
     """Return the scalar parameters in order."""
     known = dict(zip(interface.parameters, interface.defaults, strict=True))
-    _check_named(given, [*known, *(field.name for field in interface.fields)], "parameters", whole=False)
-    return [checked_number(given.get(name, value), name) for name, value in known.items()]
+    _check_named(argument, [*known, *(field.name for field in interface.fields)], "parameters", whole=False)
+    return [checked_number(argument.get(name, value), name) for name, value in known.items()]
 
 
 def field_values(
-    interface: IndexedInterface, given: Mapping[str, ArrayLike], sizes: Mapping[str, int]
+    interface: IndexedInterface, argument: Mapping[str, ArrayLike], sizes: Mapping[str, int]
 ) -> dict[str, Numbers]:
     """Return the field arrays by name, in full shape; a scalar fills its array."""
     found = {}
     for array, default in zip(interface.fields, interface.field_defaults, strict=True):
-        values = real_array(given.get(array.name, default), array.name)
+        values = real_array(argument.get(array.name, default), array.name)
         _check_finite(values, array.name)
         shape = array.shape(sizes)
         if values.shape not in ((), shape):
             raise StateError(f"'{array.name}' must have the shape {_text(shape)} of {array}, not {values.shape}")
-        found[array.name] = _kept(np.ascontiguousarray(np.broadcast_to(values, shape)))
+        found[array.name] = _read_only(np.ascontiguousarray(np.broadcast_to(values, shape)))
     return found
 
 
-def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | None) -> dict[str, Places]:
+def read_tables(interface: IndexedInterface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
-    _check_named(given or {}, [table.name for table in interface.tables], "tables", whole=True)
+    _check_named(argument or {}, [table.name for table in interface.tables], "tables", whole=True)
     found = {}
     for table in interface.tables:
         try:
-            values = np.asarray((given or {})[table.name])
+            values = np.asarray((argument or {})[table.name])
         except (TypeError, ValueError, OverflowError) as error:
             raise StateError(
                 f"the table '{table.name}' must be an array of whole numbers with {table.axes[1].number} columns: "
@@ -175,11 +179,11 @@ def read_tables(interface: IndexedInterface, given: Mapping[str, ArrayLike] | No
                 f"the indices in the table '{table.name}' must be from 0 to 2**31 - 1, "
                 f"not {values.min()} to {values.max()}"
             )
-        found[table.name] = _kept(np.array(values, dtype=np.int32, order="C"))
+        found[table.name] = _read_only(np.array(values, dtype=np.int32, order="C"))
     return found
 
 
-def _kept(array: NDArray[Any]) -> NDArray[Any]:
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     """Make an array read-only and return it: C code keeps a pointer to it."""
     array.flags.writeable = False
     return array
@@ -205,7 +209,7 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
     return {name: length for name, (length, _) in found.items()}
 
 
-def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, Places]) -> None:
+def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, IndexTable]) -> None:
     """Raise :class:`StateError` if an access leaves its array, or an index its table, for these sizes and tables."""
     rows = {table.name: table for table in interface.tables}
     for access, loops in interface.accesses:
@@ -215,7 +219,7 @@ def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables
         for k, place in enumerate(access.places):
             if place.table:
                 _check_span(f"{place}", _span(spans[place.index], sizes), rows[place.table], 0, sizes)
-            span = _places(place, spans, sizes, tables, access.array.axes[k].at(sizes))
+            span = _index_range(place, spans, sizes, tables, access.array.axes[k].at(sizes))
             _check_span(f"{access}", span, access.array, k, sizes)
 
 
@@ -230,8 +234,8 @@ def table_limits(interface: IndexedInterface, sizes: Mapping[str, int]) -> list[
     return list(found.items())
 
 
-def _places(
-    place: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, Places], length: int
+def _index_range(
+    place: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, IndexTable], length: int
 ) -> tuple[int, int]:
     """Return the smallest and the largest index on an axis of a given length."""
     if place.table:
@@ -273,14 +277,14 @@ def _check_finite(values: Numbers, what: str) -> None:
         raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in place]}")
 
 
-def _check_named(given: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
-    for name in given:
+def _check_named(argument: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:
+    for name in argument:
         if name not in names:
             raise StateError(
                 f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names) or 'none'}"
             )
     for name in names:
-        if whole and name not in given:
+        if whole and name not in argument:
             raise StateError(f"'{name}' is missing in {what}")
 
 

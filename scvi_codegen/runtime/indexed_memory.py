@@ -13,13 +13,23 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.indexed_interface import Numbers
 
-__all__ = ["MOMENTS", "STATE", "IndexedMark", "aligned", "held_memory"]
+__all__ = ["RUN_FIELDS", "STATE", "IndexedSnapshot", "aligned", "constraint_memory"]
 
-CHOICE = ("rung", "change", "change_before", "direction", "rejected", "failed", "avoiding", "error_before", "doubted")
+STEP_CONTROL_FIELDS = (
+    "grid_level",
+    "change",
+    "change_before",
+    "direction",
+    "rejected",
+    "failed",
+    "avoiding",
+    "error_before",
+    "steps_to_compare",
+)
 """Fields of the C struct that control adaptive steps."""
-MOMENTS = (
+RUN_FIELDS = (
     *("t", "t_low", "h", "step", "guess", "turn", "error", "error_t"),
-    *("largest_q", "largest_p", "leaving", "uneven", *CHOICE),
+    *("largest_q", "largest_p", "steps_from_rest", "uneven", *STEP_CONTROL_FIELDS),
 )
 """Scalar fields of the C struct of a run."""
 STATE = ("q", "p", "carry_q", "carry_p")
@@ -29,11 +39,11 @@ ALIGNMENT = 64
 
 
 @dataclass(frozen=True, slots=True)
-class IndexedMark:
+class IndexedSnapshot:
     """Snapshot of a run: arrays, scalar fields and total solver iterations."""
 
     arrays: Mapping[str, Numbers]
-    moments: Mapping[str, Any]
+    run_fields: Mapping[str, Any]
     iterations: int
 
 
@@ -47,7 +57,7 @@ def aligned(count: int) -> Numbers:
     return memory[start : start + count]
 
 
-def held_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, NDArray[Any]]:
+def constraint_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[str, NDArray[Any]]:
     """Allocate the memory of constraints, by the name of its pointer in the C struct.
 
     Args:

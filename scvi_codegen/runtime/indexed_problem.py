@@ -27,9 +27,9 @@ class IndexedProblem:
     """
 
     def __init__(
-        self, interface: IndexedInterface, binding: Binding, arrays: RunArrays, awaited: tuple[str, ...] = ()
+        self, interface: IndexedInterface, binding: Binding, arrays: RunArrays, unset_inputs: tuple[str, ...] = ()
     ) -> None:
-        self.interface, self.binding, self.arrays, self.awaited = interface, binding, arrays, awaited
+        self.interface, self.binding, self.arrays, self.unset_inputs = interface, binding, arrays, unset_inputs
         self.struct = binding.new("problem *")
         for k, name in enumerate(interface.sizes):
             self.struct.size[k] = arrays.sizes[name]
@@ -41,7 +41,7 @@ class IndexedProblem:
             self.struct.parameters[k] = value
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.interface, self.binding, self.arrays, self.awaited)
+        return type(self), (self.interface, self.binding, self.arrays, self.unset_inputs)
 
     @property
     def count(self) -> int:
@@ -57,21 +57,21 @@ class IndexedProblem:
     def _numbers(self) -> dict[str, float]:
         return dict(zip(self.interface.parameters, self.arrays.numbers, strict=True))
 
-    def with_parameters(self, given: Mapping[str, ArrayLike] | Sequence[float] | Numbers) -> Self:
+    def with_parameters(self, argument: Mapping[str, ArrayLike] | Sequence[float] | Numbers) -> Self:
         """Return the problem with other parameters: by name, the others unchanged; or all scalars in order.
 
         Raises:
             StateError: if a name, shape or number is invalid.
         """
-        missing = inputs_not_given(self.interface, given)
-        if not isinstance(given, Mapping):
-            given = dict(zip(self.interface.parameters, given, strict=True))
-        known = self.parameters | dict(given)
+        missing = inputs_not_given(self.interface, argument)
+        if not isinstance(argument, Mapping):
+            argument = dict(zip(self.interface.parameters, argument, strict=True))
+        known = self.parameters | dict(argument)
         fields = field_values(self.interface, known, self.arrays.sizes)
         numbers = number_values(self.interface, known)
         return self._with(replace(self.arrays, numbers=numbers, fields=fields), missing)
 
-    def held(self, inputs: Mapping[str, float]) -> Self:
+    def with_constant_inputs(self, inputs: Mapping[str, float]) -> Self:
         """Return the problem with inputs set to constant values.
 
         Raises:
@@ -84,10 +84,10 @@ class IndexedProblem:
             values |= {f"{name}_0": checked_number(value, f"the input {name}")}
             values |= {f"{name}_{part}": 0.0 for part in "123t"}
         numbers = number_values(self.interface, self._numbers | values)
-        missing = tuple(name for name in self.awaited if name not in inputs)
+        missing = tuple(name for name in self.unset_inputs if name not in inputs)
         return self._with(replace(self.arrays, numbers=numbers), missing)
 
     def _with(self, arrays: RunArrays, missing: tuple[str, ...]) -> Self:
         """Return the problem with other arrays, in which the inputs ``missing`` are still not set."""
-        awaited = tuple(name for name in self.awaited if name in missing)
-        return type(self)(self.interface, self.binding, arrays, awaited)
+        unset_inputs = tuple(name for name in self.unset_inputs if name in missing)
+        return type(self)(self.interface, self.binding, arrays, unset_inputs)

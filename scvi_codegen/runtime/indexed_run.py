@@ -10,21 +10,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED, SolverOptions, step_failure
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.descriptions import describe_run, short_title
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_state
 from scvi_codegen.runtime.indexed_maps import momentum_of
-from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE, IndexedMark, aligned, held_memory
+from scvi_codegen.runtime.indexed_memory import RUN_FIELDS, STATE, IndexedSnapshot, aligned, constraint_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
-from scvi_codegen.runtime.indexed_saving import read_saved, restore_memory, saved_arrays, saved_bytes, telling_of_damage
+from scvi_codegen.runtime.indexed_saving import (
+    damage_as_state_error,
+    read_saved,
+    restore_memory,
+    saved_arrays,
+    saved_bytes,
+)
 from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.one_thread import OneThread, alone
-from scvi_codegen.runtime.portions import SLICE_SECONDS
-from scvi_codegen.runtime.standing import short_title, stands
+from scvi_codegen.runtime.run_loop import CALL_SECONDS
+from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["IndexedRun"]
 
@@ -76,20 +82,20 @@ class IndexedRun(OneThread):
         *,
         h: float,
         t: float,
-        goal: Goal | None = None,
+        plan: StepPlan | None = None,
         options: SolverOptions | None = None,
         threads: int = 1,
     ) -> None:
         super().__init__()
-        self.problem, self.goal, self.iterations, self.threads = problem, goal, 0, threads
+        self.problem, self.plan, self.iterations, self.threads = problem, plan, 0, threads
         self._binding, self.options = problem.binding, options
         self._options = self._binding.options(options)
         self._start(q, moving, h, t)
 
     def __repr__(self) -> str:
         sizes = "".join(f", {name} = {size}" for name, size in self.sizes.items())
-        return stands(
-            f"{short_title(self.interface)}{sizes}", self.interface.solver, self, awaited=self.problem.awaited
+        return describe_run(
+            f"{short_title(self.interface)}{sizes}", self.interface.solver, self, unset_inputs=self.problem.unset_inputs
         )
 
     @property
@@ -123,7 +129,7 @@ class IndexedRun(OneThread):
         self._run = self._binding.new("run *")
         self._run.t, self._run.h, self._run.threads = t, h, self.threads
         if self.interface.constraints:
-            self._numbers |= held_memory(self._binding, self._run, self.problem.struct, n)
+            self._numbers |= constraint_memory(self._binding, self._run, self.problem.struct, n)
         for name in self._numbers:
             setattr(self._run, name, self._pointer(name))
 
@@ -140,7 +146,7 @@ class IndexedRun(OneThread):
         *,
         parameters: Mapping[str, ArrayLike] | Sequence[float] | Numbers | None = None,
         h: float | None = None,
-        goal: Goal | None = None,
+        plan: StepPlan | None = None,
     ) -> None:
         """Set parameters (scalars and arrays), step size or step plan; what is omitted is unchanged.
 
@@ -153,7 +159,7 @@ class IndexedRun(OneThread):
             self._take(self.problem.with_parameters(parameters))
         if h is not None and checked_step(h) != self.h:
             self._run.h, self._run.guess = h, 0
-        self.goal = goal or self.goal
+        self.plan = plan or self.plan
 
     def _take(self, problem: IndexedProblem) -> None:
         """Set another problem of equal sizes; reused forces are discarded, an extrapolated predictor is kept."""
@@ -170,38 +176,38 @@ class IndexedRun(OneThread):
     @alone
     def set_inputs(self, **inputs: float) -> None:
         """Set inputs to constant values for the following steps (zero-order hold)."""
-        self._take(self.problem.held(inputs))
+        self._take(self.problem.with_constant_inputs(inputs))
 
     @alone
-    def apart(self, h: float, goal: Goal | None = None) -> IndexedRun:
+    def copy_with_step(self, h: float, plan: StepPlan | None = None) -> IndexedRun:
         """Return an independent run from the present state, bitwise equal, with another step size or step plan."""
-        beside: dict[str, Any] = {"goal": goal, "options": self.options, "threads": self.threads}
-        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **beside)
+        shared_arguments: dict[str, Any] = {"plan": plan, "options": self.options, "threads": self.threads}
+        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **shared_arguments)
         for name in ("carry_q", "carry_p"):
             other._numbers[name][:] = self._numbers[name]
         other._run.t_low = self._run.t_low
         return other
 
     @property
-    def mark(self) -> IndexedMark:
+    def mark(self) -> IndexedSnapshot:
         """Snapshot of the present state for :meth:`rollback`."""
         kept = {name: self._numbers[name].copy() for name in STATE}
-        moments = {name: getattr(self._run, name) for name in MOMENTS}
-        return IndexedMark(kept, moments, self.iterations)
+        run_fields = {name: getattr(self._run, name) for name in RUN_FIELDS}
+        return IndexedSnapshot(kept, run_fields, self.iterations)
 
     @alone
-    def stand_at(self, other: IndexedRun) -> None:
+    def move_to(self, other: IndexedRun) -> None:
         """Copy state and time of another run of the same problem; keep the step count, reset the predictor."""
         for name in STATE:
             self._numbers[name][:] = other._numbers[name]
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
     @alone
-    def rollback(self, mark: IndexedMark) -> None:
+    def rollback(self, mark: IndexedSnapshot) -> None:
         """Restore a snapshot; the predictor of the next step is reset."""
         for name, values in mark.arrays.items():
             self._numbers[name][:] = values
-        for name, value in mark.moments.items():
+        for name, value in mark.run_fields.items():
             setattr(self._run, name, value)
         self._run.guess, self.iterations = 0, mark.iterations
 
@@ -319,19 +325,19 @@ class IndexedRun(OneThread):
     @property
     def arrived(self) -> bool:
         """Return whether the target time is reached."""
-        return self.goal is not None and self.t == self.goal.t_end and self._run.t_low == 0.0
+        return self.plan is not None and self.t == self.plan.t_end and self._run.t_low == 0.0
 
     @alone
     def checkpoint(self) -> bytes:
         """Return the whole run as bytes in NumPy's format (.npz), for :meth:`IndexedStepper.from_checkpoint`."""
         saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
-        saved |= {"moments": [float(getattr(self._run, name)) for name in MOMENTS], "iterations": self.iterations}
-        saved |= {"awaited": np.array(self.problem.awaited, dtype=str), "to a goal": self.goal is not None}
+        saved |= {"moments": [float(getattr(self._run, name)) for name in RUN_FIELDS], "iterations": self.iterations}
+        saved |= {"unset_inputs": np.array(self.problem.unset_inputs, dtype=str), "to a goal": self.plan is not None}
         return saved_bytes(saved, self.problem.arrays, self.interface)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        given = (self.interface, self._binding, self.checkpoint(), self.options, self.goal, self.threads)
+        given = (self.interface, self._binding, self.checkpoint(), self.options, self.plan, self.threads)
         return type(self).restored, given
 
     @classmethod
@@ -341,7 +347,7 @@ class IndexedRun(OneThread):
         binding: Binding,
         saved: bytes,
         options: SolverOptions | None,
-        goal: Goal | None = None,
+        plan: StepPlan | None = None,
         threads: int = 1,
     ) -> Self:
         """Return the run saved by :meth:`save`.
@@ -349,12 +355,12 @@ class IndexedRun(OneThread):
         Raises:
             StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
         """
-        found = read_saved(saved, interface, to_a_goal=goal is not None)
-        with telling_of_damage():
-            awaited = tuple(name for name in interface.inputs if name in found["awaited"].tolist())
-            problem = IndexedProblem(interface, binding, saved_arrays(found, interface), awaited)
-            beside: dict[str, Any] = {"goal": goal, "options": options, "threads": threads}
-            run = cls(problem, problem.arrays.state, (None, ""), h=0.0, t=0.0, **beside)
+        found = read_saved(saved, interface, to_a_goal=plan is not None)
+        with damage_as_state_error():
+            unset_inputs = tuple(name for name in interface.inputs if name in found["unset_inputs"].tolist())
+            problem = IndexedProblem(interface, binding, saved_arrays(found, interface), unset_inputs)
+            shared_arguments: dict[str, Any] = {"plan": plan, "options": options, "threads": threads}
+            run = cls(problem, problem.arrays.state, (None, ""), h=0.0, t=0.0, **shared_arguments)
             restore_memory(run._run, run._numbers, found)
             run.iterations = checked_count(found["iterations"].item(), "iterations", least=0)
         return run
@@ -377,22 +383,22 @@ class IndexedRun(OneThread):
         Raises:
             StepFailedError: if a step fails; the run is left at the state before it.
         """
-        steps, done, portion = checked_count(steps, "steps", least=0), 0, 1
+        steps, done, chunk_size = checked_count(steps, "steps", least=0), 0, 1
         report = self._binding.new("report *")
-        if steps and self.problem.awaited:
-            raise missing_input(self.problem.awaited[0])
+        if steps and self.problem.unset_inputs:
+            raise missing_input(self.problem.unset_inputs[0])
         while done < steps and not self.arrived and not (stop and stop()):
-            size, began = min(portion, steps - done), time.perf_counter()
+            size, began = min(chunk_size, steps - done), time.perf_counter()
             status = self._steps(size, report)
             done += report.steps
             self.iterations += report.iterations
             if status:
-                h, failures = 0.0 if self.goal else self.h, FAILURES_BY_SOLVER[self.interface.solver]
+                h, failures = 0.0 if self.plan else self.h, FAILURES_BY_SOLVER[self.interface.solver]
                 raise step_failure(status, report, step=self.steps, h=h, failures=failures)
             if progress is not None:
                 progress(self.steps)
             elapsed = max(time.perf_counter() - began, 1e-6)
-            portion = max(1, int(min(2.0 * size, size * SLICE_SECONDS / elapsed)))
+            chunk_size = max(1, int(min(2.0 * size, size * CALL_SECONDS / elapsed)))
 
     def call(self, name: str, *arguments: Any) -> int:
         """Call a C function with the run as its first argument and return its status."""
@@ -400,7 +406,7 @@ class IndexedRun(OneThread):
 
     def _steps(self, size: int, report: Any) -> int:
         """Take steps and return the status of the last one."""
-        problem, goal = self.problem.struct, self.goal
-        if goal is None:
+        problem, plan = self.problem.struct, self.plan
+        if plan is None:
             return self.call("advance", problem, size, self._options, report)
-        return self.call("advance_to", problem, goal.t_end, goal.tolerance, size, self._options, report)
+        return self.call("advance_to", problem, plan.t_end, plan.tolerance, size, self._options, report)

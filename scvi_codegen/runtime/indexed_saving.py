@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, RunArrays, read_arrays
-from scvi_codegen.runtime.indexed_memory import MOMENTS, STATE
+from scvi_codegen.runtime.indexed_memory import RUN_FIELDS, STATE
 
-__all__ = ["read_saved", "restore_memory", "saved_arrays", "saved_bytes", "telling_of_damage"]
+__all__ = ["damage_as_state_error", "read_saved", "restore_memory", "saved_arrays", "saved_bytes"]
 
 RANGES = {
-    **dict.fromkeys(("step", "rejected", "avoiding", "leaving", "doubted"), (0, 2**53)),
+    **dict.fromkeys(("step", "rejected", "avoiding", "steps_from_rest", "steps_to_compare"), (0, 2**53)),
     "guess": (0, 2),
     "turn": (0, 2),
     "direction": (-1, 1),
     "uneven": (0, 1),
-    **dict.fromkeys(("rung", "change", "change_before", "failed"), (-(2**16), 2**16)),
+    **dict.fromkeys(("grid_level", "change", "change_before", "failed"), (-(2**16), 2**16)),
 }
 """Smallest and largest values of whole numbers that C uses as indices or states."""
 FINITE = ("t", "t_low", "h")
@@ -53,7 +53,7 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) ->
     """
     if not isinstance(saved, bytes):
         raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
-    with telling_of_damage():
+    with damage_as_state_error():
         found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
         if str(found["integrator"]) != interface.integrator:
             raise StateError(f"the saved run is one of '{found['integrator']}', not of '{interface.integrator}'")
@@ -78,7 +78,7 @@ def saved_arrays(found: Mapping[str, NDArray[Any]], interface: IndexedInterface)
 
 
 @contextmanager
-def telling_of_damage() -> Iterator[None]:
+def damage_as_state_error() -> Iterator[None]:
     """Convert exceptions caused by damaged bytes to :class:`StateError`."""
     try:
         yield
@@ -94,7 +94,7 @@ def restore_memory(run: Any, arrays: Mapping[str, NDArray[Any]], saved: Mapping[
     Raises:
         StateError: if a value is impossible in a run.
     """
-    moments = dict(zip(MOMENTS, np.asarray(saved["moments"], dtype=float).tolist(), strict=True))
+    moments = dict(zip(RUN_FIELDS, np.asarray(saved["moments"], dtype=float).tolist(), strict=True))
     for name, value in moments.items():
         if name in RANGES and not (value.is_integer() and RANGES[name][0] <= value <= RANGES[name][1]):
             raise _not_saved(f"{name} is {value:g}, not a whole number from {RANGES[name][0]} to {RANGES[name][1]}")

@@ -9,38 +9,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.sharing import MOST_THREADS
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import GROSS_ERROR, MET, warn_of_energies, warn_of_long_steps
-from scvi_codegen.runtime.compiled_method import no_text
-from scvi_codegen.runtime.driven import (
-    advance_to,
-    checked_inputs,
-    end_of,
-    entered,
-    parameters_at,
-    planned,
-    stretches,
-)
+from scvi_codegen.rendering.thread_sharing import MOST_THREADS
+from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.runtime.accuracy import FIXED_STEP_REMEDY, GROSS_ERROR, warn_of_energies, warn_of_large_steps
+from scvi_codegen.runtime.compiled_method import no_source
 from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.global_error import checked_error, confirmed_run
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.indexed_constraints import consistent, project
 from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, read_arrays
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
 from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs, inputs_not_given
+from scvi_codegen.runtime.runs_with_inputs import (
+    advance_to,
+    checked_inputs,
+    final_time,
+    first_inner_time,
+    parameters_at,
+    planned_segments,
+    prepared_segments,
+)
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.times import steps_to
+from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["IndexedStepper"]
 
@@ -62,7 +62,7 @@ class IndexedStepper:
         source: Source,
         interface: IndexedInterface,
         *,
-        controlled: Callable[[], Source | None] = no_text,
+        controlled: Callable[[], Source | None] = no_source,
         flags: tuple[str, ...] = TUNED_FLAGS,
     ) -> None:
         self.source, self.interface, self.flags, self._controlled_text = source, interface, flags, controlled
@@ -100,7 +100,7 @@ class IndexedStepper:
         for source in filter(None, variants):
             load(source, flags=self.flags)
 
-    @takes(StateError, parameters=MAPPING, tables=MAPPING)
+    @checks_arguments(StateError, parameters=MAPPING, tables=MAPPING)
     def start(
         self,
         q: ArrayLike | Mapping[str, ArrayLike],
@@ -122,7 +122,7 @@ class IndexedStepper:
             StateError: if a name, shape or number is invalid, or an index would leave its array.
             MethodError: if the method has no adaptive steps.
         """
-        goal, binding = _goal(h, t_end, tolerance), self._binding if t_end is None else self._controlled
+        plan, binding = _plan(h, t_end, tolerance), self._binding if t_end is None else self._controlled
         arrays, moving = self._given(q, p, velocity, parameters, tables)
         length = 0.0 if h is None else checked_step(h)
         run = IndexedRun(
@@ -131,7 +131,7 @@ class IndexedStepper:
             moving,
             h=length,
             t=checked_number(t, "t"),
-            goal=goal,
+            plan=plan,
             options=options,
             threads=self._threads(threads),
         )
@@ -193,11 +193,13 @@ class IndexedStepper:
         Raises:
             StateError: if the bytes are no saved run or belong to another integrator.
         """
-        goal = None if t_end is None else Goal.checked(t_end, tolerance)
-        binding = self._controlled if goal else self._binding
-        return IndexedRun.restored(self.interface, binding, saved, options, goal, self._threads(threads))
+        plan = None if t_end is None else StepPlan.checked(t_end, tolerance)
+        binding = self._controlled if plan else self._binding
+        return IndexedRun.restored(self.interface, binding, saved, options, plan, self._threads(threads))
 
-    @takes(StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION)
+    @checks_arguments(
+        StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION
+    )
     def integrate(
         self,
         q: ArrayLike | Mapping[str, ArrayLike],
@@ -263,39 +265,39 @@ class IndexedStepper:
             count = _step_count(h, steps, t, t_end)
         else:
             check_left_to_inputs(self.interface, parameters)
-            end = end_of(t, h, steps, t_end)
-        beside: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
-        beside |= {"options": options, "threads": threads}
+            end = final_time(t, h, steps, t_end)
+        shared_arguments: dict[str, Any] = {"t": t, "parameters": parameters, "tables": tables}
+        shared_arguments |= {"options": options, "threads": threads}
         if error is not None:
             return confirmed_run(
                 checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance, "observe": observe}),
                 partial(self.integrate, events=events),
                 self.integrate,
                 (q, p, velocity),
-                beside | {"inputs": inputs},
+                shared_arguments | {"inputs": inputs},
                 {"t_end": t_end, "save_every": save_every, "progress": progress},
             )
         to = t_end if h is None else None
-        run = self.start(q, p, velocity=velocity, h=h, t_end=to, tolerance=tolerance, **beside)
+        run = self.start(q, p, velocity=velocity, h=h, t_end=to, tolerance=tolerance, **shared_arguments)
         record = IndexedRecord(run, observe, as_events(events))
         if data is None:
             check = GrowthCheck(run, check_growth)
             if h is None or t_end is None:
                 record.follow(count, save_every, progress=progress)
-                return _said(record, check)
+                return _with_warnings(record, check)
             segments: Iterable[int | None] = _planned_segments(run, t_end, h)
         else:
             values = partial(parameters_at, self.interface.parameters, np.array(run.problem.arrays.numbers), data)
-            run.update(parameters=values(entered(t, end)))
+            run.update(parameters=values(first_inner_time(t, end)))
             check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
-            segments = stretches(run, data, end, values)
+            segments = prepared_segments(run, data, end, values)
         record.take(keep=True)
         for steps in segments:
             until = np.inf if steps is None else run.steps + steps
-            record.go_on(until, save_every, progress=progress, to_end=True)
+            record.continue_recording(until, save_every, progress=progress, to_end=True)
             if record.search and record.search.ended:
                 break
-        return _said(record, check)
+        return _with_warnings(record, check)
 
 
 def _step_count(h: float | None, steps: int | None, t: float, t_end: float | None) -> float:
@@ -317,44 +319,44 @@ def _step_count(h: float | None, steps: int | None, t: float, t_end: float | Non
 
 def _planned_segments(run: IndexedRun, t_end: float, h: float) -> Iterator[int]:
     """Set the step size of the run for each segment of equal steps to t_end, and yield its number of steps."""
-    for part in planned(run.t, t_end, h, {}):
+    for part in planned_segments(run.t, t_end, h, {}):
         run.update(h=part.h)
         yield part.steps
 
 
-def _goal(h: float | None, t_end: float | None, tolerance: float | None) -> Goal | None:
+def _plan(h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan | None:
     """Return the step plan of adaptive steps, ``None`` for fixed steps."""
     if (h is None) == (t_end is None):
         raise StateError(
             f"give either h (fixed step size) or t_end (adaptive step size); got {'neither' if h is None else 'both'}"
         )
     if t_end is not None:
-        return Goal.checked(t_end, tolerance)
+        return StepPlan.checked(t_end, tolerance)
     if tolerance is not None:
         raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
     return None
 
 
-def _said(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
+def _with_warnings(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
     """Return the trajectory, after warnings about its step size, its energy and its error growth."""
     found = record.trajectory()
     check.warn(found)
-    warn_of_long_steps(found, remedy="")
+    warn_of_large_steps(found, remedy="")
     if record.run.interface.conserves_energy:
-        _say_lost_energy(found)
+        _warn_of_energy_error(found)
     return found
 
 
-def _say_lost_energy(found: IndexedTrajectory) -> None:
+def _warn_of_energy_error(found: IndexedTrajectory) -> None:
     """Warn of an energy error of adaptive runs, and of fixed-step runs without an error estimate.
 
     For a Hamiltonian the kinetic part, which sets the scale, is 0.
     """
     (first, last), size = found.energies[[0, -1], 2], 2.0 * found.energies[[0, -1], 0].max()
-    if found.goal is not None:
+    if found.plan is not None:
         warn_of_energies(first, last, size)
     elif np.isnan(found.step_error):
-        warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=MET)
+        warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 
 def _rebuild(

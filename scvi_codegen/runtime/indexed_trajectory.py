@@ -11,19 +11,19 @@ from typing import Self, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
+from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.dense_output import checked_times
 from scvi_codegen.runtime.events import Event
 from scvi_codegen.runtime.global_error import Confirmed, GlobalError
-from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.indexed_between import Departure, states_between
+from scvi_codegen.runtime.indexed_dense_output import Continuation, states_between
 from scvi_codegen.runtime.indexed_events import IndexedCrossings, IndexedSearch
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_run import IndexedRun
-from scvi_codegen.runtime.kept_states import checked_row, checked_rows
+from scvi_codegen.runtime.saved_states import checked_row, checked_rows
+from scvi_codegen.runtime.step_plan import StepPlan
 
 __all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
 
@@ -62,15 +62,15 @@ class IndexedTrajectory(Confirmed):
     iterations: int
     step_error: float
     worst_step_time: float
-    goal: Goal | None = None
+    plan: StepPlan | None = None
     rejected_steps: int = 0
     events: tuple[IndexedCrossings, ...] = ()
-    departures: tuple[Departure, ...] = field(default=(), repr=False)
+    continuations: tuple[Continuation, ...] = field(default=(), repr=False)
     confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
-        lengths = "" if self.goal else f" of {self.h:g}"
+        lengths = "" if self.plan else f" of {self.h:g}"
         return clipped(f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>", LONGEST)
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class IndexedTrajectory(Confirmed):
             IndexError: if an index is out of range, or a slice is empty or descending.
             StateError: if states were not saved.
         """
-        if len(self.departures) < len(self.t):
+        if len(self.continuations) < len(self.t):
             raise StateError("a run with observe saves no states: omit observe, or index t and observed")
         if not isinstance(rows, slice):
             k = checked_row(rows, len(self))
@@ -99,7 +99,7 @@ class IndexedTrajectory(Confirmed):
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return replace(
             self,
-            **{name: getattr(self, name)[rows] for name in ("t", "energies", "maps", "departures")},
+            **{name: getattr(self, name)[rows] for name in ("t", "energies", "maps", "continuations")},
             q={name: each[rows] for name, each in self.q.items()},
             p={name: each[rows] for name, each in self.p.items()},
             events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
@@ -114,9 +114,9 @@ class IndexedTrajectory(Confirmed):
             StateError: if a time is outside the run, or states were not saved.
             StepFailedError: if such a step fails.
         """
-        if len(self.departures) < len(self.t):
+        if len(self.continuations) < len(self.t):
             raise StateError("dense output requires all saved states in full: omit observe")
-        return states_between(self.departures, self.t, self.q, self.p, checked_times(t, "t"))
+        return states_between(self.continuations, self.t, self.q, self.p, checked_times(t, "t"))
 
     @property
     def velocity(self) -> dict[str, Numbers]:
@@ -172,7 +172,7 @@ class IndexedRecord:
     ) -> None:
         self.run, self.observe = run, observe
         self.search = IndexedSearch(run, events) if events else None
-        self.departures: list[Departure] = []
+        self.continuations: list[Continuation] = []
         self.t: list[float] = []
         self.energies: list[tuple[float, float, float]] = []
         self.maps: list[Numbers] = []
@@ -193,9 +193,9 @@ class IndexedRecord:
             StepFailedError: if a step fails; its ``trajectory`` contains the states before.
         """
         self.take(keep=True)
-        self.go_on(steps, save_every, progress=progress, stop=stop)
+        self.continue_recording(steps, save_every, progress=progress, stop=stop)
 
-    def go_on(
+    def continue_recording(
         self,
         steps: float,
         save_every: int,
@@ -206,7 +206,7 @@ class IndexedRecord:
     ) -> None:
         """Continue recording as :meth:`follow`; with ``to_end`` the last state is saved as well."""
         run, last = self.run, self.run.steps
-        self.departures[-1] = Departure.of(run)
+        self.continuations[-1] = Continuation.of(run)
         while run.steps < steps and not self.ended and not (stop and stop()):
             try:
                 self._advance(int(min(save_every - run.steps % save_every, steps - run.steps)), progress, stop)
@@ -245,7 +245,7 @@ class IndexedRecord:
             self.observed.append(self._observed(self.observe(self.run)))
         if keep or self.observe is None:
             self.states.append((self.run.q, self.run.p))
-            self.departures.append(Departure.of(self.run))
+            self.continuations.append(Continuation.of(self.run))
 
     def _observed(self, given: ArrayLike) -> Numbers:
         found, when = real_array(given, "the result of observe"), f"at t = {self.run.t:g}"
@@ -272,10 +272,10 @@ class IndexedRecord:
             iterations=run.iterations,
             step_error=run.step_error,
             worst_step_time=run.worst_step_time,
-            goal=run.goal,
+            plan=run.plan,
             rejected_steps=run.rejected_steps,
             events=self.search.crossings() if self.search else (),
-            departures=tuple(self.departures),
+            continuations=tuple(self.continuations),
         )
 
 

@@ -282,7 +282,7 @@ class Integrator(LinearisedMethod):
         """Return F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
         return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
 
-    def exchanged(
+    def work_and_impulses(
         self,
         q: ArrayLike,
         p: ArrayLike,
@@ -310,7 +310,8 @@ class Integrator(LinearisedMethod):
         check_inputs_given(self.interface, parameters)
         state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
         q1, p1, given = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
-        self._solve(self.binding.with_function("exchanges"), "exchanges", t, h, state, options, (q1, p1, given))
+        name = "work_and_impulses"
+        self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, given))
         return q1, p1, given
 
     def step_positions(

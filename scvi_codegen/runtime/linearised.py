@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
+from scvi_codegen.representation import summary
 from scvi_codegen.runtime.compiled_method import CompiledMethod
 from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_vector
 
@@ -98,7 +98,7 @@ class LinearisedMethod(CompiledMethod):
     @property
     def _input_size(self) -> int:
         """Number of variables of a step: (q, p), parameters, t and h."""
-        return self.tangent.constant("GIVEN")
+        return self.tangent.constant("STEP_INPUTS")
 
     @property
     def _output_indices(self) -> NDArray[np.intp]:
@@ -145,7 +145,7 @@ class LinearisedMethod(CompiledMethod):
         others = dict(zip(self.parameters, parameters.tolist(), strict=True))
         del others[name]
         binding, values = self.tangent, self._parameters_at(q, p, others)
-        status = binding.function("level")(*map(binding.pointer, (q, p, values, found)), binding.workspace())
+        status = binding.function("energy_gradient")(*map(binding.pointer, (q, p, values, found)), binding.workspace())
         if status:
             raise StateError(f"the energy gradient at q = {q}, p = {p} cannot be computed: {REASONS[status]}")
         return found
@@ -338,7 +338,7 @@ class LinearisedMethod(CompiledMethod):
         """
         binding = self._second_derivatives
         report = binding.new("report *")
-        status = binding.function("bend")(
+        status = binding.function("second_order")(
             len(starts.h),
             *map(binding.pointer, (starts.t, starts.h, starts.q, starts.p, parameters)),
             binding.options(options),

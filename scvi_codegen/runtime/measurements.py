@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import MethodError, StateError, closest
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.runtime.dense_output import checked_times
-from scvi_codegen.runtime.driven import Input, parameters_of
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.runtime.runs_with_inputs import Input, parameters_of
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.times import steps_within
 
@@ -45,7 +45,7 @@ class Measurements:
     deviations: Array
     inputs: Mapping[str, Input]
     pieces: tuple[tuple[Array, Array], ...]
-    places: NDArray[np.intp]
+    step_numbers: NDArray[np.intp]
 
     @classmethod
     def checked(
@@ -79,15 +79,15 @@ class Measurements:
         first = float(times[0]) if start is None else checked_number(start, "the time start")
         if first > times[0]:
             raise StateError(f"start = {first:g} must not be after the first measurement, at t = {times[0]:g}")
-        pieces, places = _steps(first, times, checked_step(h), inputs)
+        pieces, step_numbers = _steps(first, times, checked_step(h), inputs)
         columns = np.array([_column(stepper, name) for name in names])
         sizes = np.broadcast_to(sizes, (len(names),)).copy()
-        return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, places)
+        return cls(stepper, times, first, values, names, columns, sizes, inputs, pieces, step_numbers)
 
     def halved(self) -> Measurements:
         """Return the measurements with half the step size."""
         pieces = tuple((np.stack([t, t + h / 2], axis=1).ravel(), np.repeat(h / 2, 2)) for t, h in self.pieces)
-        return replace(self, pieces=pieces, places=2 * self.places)
+        return replace(self, pieces=pieces, step_numbers=2 * self.step_numbers)
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
@@ -97,7 +97,7 @@ class Measurements:
     def cut(self, count: int) -> tuple[Measurements, ...]:
         """Divide into at most n - 1 segments of about equally many measurements, each from the end of the previous."""
         firsts = np.unique(np.linspace(0, len(self.t), count, endpoint=False).astype(int))
-        nodes = [0, *self.places[firsts[1:]].tolist(), int(self.places[-1])]
+        nodes = [0, *self.step_numbers[firsts[1:]].tolist(), int(self.step_numbers[-1])]
         return tuple(self._part(begin, end, last=end == nodes[-1]) for begin, end in pairwise(dict.fromkeys(nodes)))
 
     def _part(self, begin: int, end: int, *, last: bool) -> Measurements:
@@ -107,13 +107,13 @@ class Measurements:
             of = slice(max(begin - done, 0), max(end - done, 0))
             pieces.append((t[of], h[of]))
             done += len(h)
-        rows = (self.places >= begin) & ((self.places < end) | last)
+        rows = (self.step_numbers >= begin) & ((self.step_numbers < end) | last)
         steps = tuple(piece for piece in pieces if len(piece[1]))
         start = float(steps[0][0][0])
-        own = replace(self, t=self.t[rows], measured=self.measured[rows], places=self.places[rows] - begin)
+        own = replace(self, t=self.t[rows], measured=self.measured[rows], step_numbers=self.step_numbers[rows] - begin)
         return replace(own, pieces=steps, start=start)
 
-    def motion(self, state: Array, changes: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+    def motion(self, state: Array, tangents: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
         """Integrate and return the computed measurements and the final state, with derivatives.
 
         Returns:
@@ -122,20 +122,20 @@ class Measurements:
         """
         m, done = self.stepper.dimension, 0
         values = np.tile(state[self.columns], (len(self.t), 1))  # at the start, also where no step follows
-        slopes = np.tile(changes[:, self.columns].T, (len(self.t), 1, 1))
+        derivatives = np.tile(tangents[:, self.columns].T, (len(self.t), 1, 1))
         for t, h in self.pieces:
             at = parameters_of(self.stepper, parameters, self.inputs)(float(t[0]) + 0.5 * float(h[0]))
             starts = Starts.chain(state[:m], state[m:], t, h)
-            vectors = np.zeros((len(h) + 1, *changes.shape))
-            vectors[0] = changes
+            vectors = np.zeros((len(h) + 1, *tangents.shape))
+            vectors[0] = tangents
             self.stepper._propagate(starts, vectors, at, None)
             states = np.concatenate([starts.q, starts.p], axis=1)
-            here = np.flatnonzero((self.places >= done) & (self.places <= done + len(h)))
-            rows = self.places[here] - done
+            here = np.flatnonzero((self.step_numbers >= done) & (self.step_numbers <= done + len(h)))
+            rows = self.step_numbers[here] - done
             values[here] = states[rows][:, self.columns]
-            slopes[here] = vectors[rows][:, :, self.columns].transpose(0, 2, 1)
-            state, changes, done = states[-1], vectors[-1], done + len(h)
-        return values, slopes, state, changes
+            derivatives[here] = vectors[rows][:, :, self.columns].transpose(0, 2, 1)
+            state, tangents, done = states[-1], vectors[-1], done + len(h)
+        return values, derivatives, state, tangents
 
 
 def _steps(

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.counts import LARGEST_COUNT, checked_count
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
 from scvi_codegen.runtime.constraints import check_reachable
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -26,15 +24,17 @@ from scvi_codegen.runtime.inputs import (
 )
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.one_thread import OneThread, alone, in_use
+from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
 
 __all__ = ["Memory", "fill"]
 
 
-UNHEARD_STEPS = 10**5
+STEPS_PER_CALL = 10**5
 """Largest number of steps per call into C, between checks for Ctrl-C."""
-RUNGS, MOST_RUNGS = ("rung", "change", "change_before", "direction", "failed", "avoiding"), 2**16
+GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16
 """Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
-NEVER = LARGEST_COUNT
+NO_OUTPUT = LARGEST_COUNT
 """Output stride that saves no state."""
 
 
@@ -55,19 +55,19 @@ class Memory(OneThread):
         memory: Any,
         parameters: Array,
         options: SolverOptions | None,
-        goal: Goal | None = None,
-        awaited: tuple[str, ...] = (),
+        plan: StepPlan | None = None,
+        unset_inputs: tuple[str, ...] = (),
     ) -> None:
         super().__init__()
         self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
         binding = stepper.binding
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
         self._given = binding.pointer(parameters), binding.options(options)
-        self._dropped = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
+        self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
-        self.goal, self._awaited, self.longest = goal, awaited, 0.0
+        self.plan, self._unset_inputs, self.longest = plan, unset_inputs, 0.0
         self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 
     @classmethod
@@ -77,7 +77,7 @@ class Memory(OneThread):
         q: ArrayLike,
         p: ArrayLike,
         *,
-        h: float | Goal,
+        h: float | StepPlan,
         t: float = 0.0,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
@@ -89,13 +89,13 @@ class Memory(OneThread):
         binding.function("start")(
             memory,
             checked_number(t, "the time t"),
-            0.0 if isinstance(h, Goal) else checked_step(h),
+            0.0 if isinstance(h, StepPlan) else checked_step(h),
             binding.pointer(q0),
             binding.pointer(p0),
         )
-        goal = h if isinstance(h, Goal) else None
-        values, awaited = stepper._parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
-        return cls(stepper, memory, values, checked_options(options), goal, awaited)
+        plan = h if isinstance(h, StepPlan) else None
+        values, unset_inputs = stepper._parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
+        return cls(stepper, memory, values, checked_options(options), plan, unset_inputs)
 
     @classmethod
     def restored(
@@ -105,7 +105,7 @@ class Memory(OneThread):
         *,
         parameters: Parameters = None,
         options: SolverOptions | None = None,
-        goal: Goal | None = None,
+        plan: StepPlan | None = None,
     ) -> Self:
         """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
         memory = stepper.binding.new("run *")
@@ -116,29 +116,29 @@ class Memory(OneThread):
             raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
         buffer[:] = saved
         _check_memory(memory)
-        if (memory.h == 0.0) != (goal is not None):
+        if (memory.h == 0.0) != (plan is not None):
             raise StateError(
                 "the saved run has adaptive steps: give t_end"
-                if goal is None
+                if plan is None
                 else "the saved run has fixed steps: omit t_end"
             )
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        values, awaited = (
+        values, unset_inputs = (
             checked_parameters(stepper.interface, parameters),
             inputs_not_given(stepper.interface, parameters),
         )
-        return cls(stepper, memory, values, checked_options(options), goal, awaited)
+        return cls(stepper, memory, values, checked_options(options), plan, unset_inputs)
 
     @property
-    def goal(self) -> Goal | None:
+    def plan(self) -> StepPlan | None:
         """Step plan of adaptive steps, ``None`` for fixed steps."""
-        return self._goal
+        return self._plan
 
-    @goal.setter
-    def goal(self, goal: Goal | None) -> None:
-        self._goal, self._way = goal, (goal.t_end, goal.tau or goal.tolerance) if goal else ()
-        self._go = self.stepper.binding.function("advance_to" if goal else "advance", self._memory)
+    @plan.setter
+    def plan(self, plan: StepPlan | None) -> None:
+        self._plan, self._plan_arguments = plan, (plan.t_end, plan.tau or plan.tolerance) if plan else ()
+        self._advance_function = self.stepper.binding.function("advance_to" if plan else "advance", self._memory)
 
     @property
     def h(self) -> float:
@@ -165,7 +165,7 @@ class Memory(OneThread):
         return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
 
     @alone
-    def update(self, *, parameters: Parameters = None, h: float | None = None, goal: Goal | None = None) -> None:
+    def update(self, *, parameters: Parameters = None, h: float | None = None, plan: StepPlan | None = None) -> None:
         """Set parameters, step size or step plan; what is omitted is unchanged.
 
         Args:
@@ -180,12 +180,12 @@ class Memory(OneThread):
             known = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
             parameters = {**known, **parameters}
         if parameters is not None:
-            self._go_on_with(checked_parameters(interface, parameters))
-            self._awaited = tuple(name for name in self._awaited if name in missing)
+            self._set_parameters(checked_parameters(interface, parameters))
+            self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
         if h is not None and checked_step(h) != self._memory.h:
             self._memory.h, self._memory.guess = h, 0
-        if goal is not None:
-            self.goal = goal
+        if plan is not None:
+            self.plan = plan
 
     def set_inputs(self, **inputs: float) -> None:
         """Set inputs to constant values for the following steps (zero-order hold).
@@ -200,13 +200,13 @@ class Memory(OneThread):
         if not self._lock.acquire(False):
             raise in_use()
         try:
-            self._go_on_with(values)
+            self._set_parameters(values)
         finally:
             self._lock.release()
-        if self._awaited:
-            self._awaited = tuple(name for name in self._awaited if name not in inputs)
+        if self._unset_inputs:
+            self._unset_inputs = tuple(name for name in self._unset_inputs if name not in inputs)
 
-    def _go_on_with(self, values: Array) -> None:
+    def _set_parameters(self, values: Array) -> None:
         """Set parameter values; raise ``StateError`` if position constraints jump."""
         if self.stepper.interface.constraints:
             check_reachable(self.stepper, self.q, self.p, self.t, values)
@@ -247,8 +247,8 @@ class Memory(OneThread):
 
     def check_inputs(self) -> None:
         """Raise :class:`StateError` if an input is not set."""
-        if self._awaited:
-            raise missing_input(self._awaited[0])
+        if self._unset_inputs:
+            raise missing_input(self._unset_inputs[0])
 
     @alone
     def rollback(self, saved: bytes) -> None:
@@ -266,22 +266,24 @@ class Memory(OneThread):
             raise in_use()
         try:
             while left > 0 and not self.arrived:
-                if status := self._advance(min(left, UNHEARD_STEPS), NEVER, self._dropped):
+                if status := self._advance(min(left, STEPS_PER_CALL), NO_OUTPUT, self._discarded):
                     raise step_failure(status, self._report, step=self.steps, h=self.h)
-                left -= UNHEARD_STEPS
+                left -= STEPS_PER_CALL
         finally:
             self._lock.release()
 
     def _run_to_target(self) -> None:
         """Advance to the target time without saving intermediate states."""
         while not self.arrived:
-            self.advance(UNHEARD_STEPS)
+            self.advance(STEPS_PER_CALL)
 
-    def _advance(self, steps: int, save_every: int, places: tuple[Any, ...]) -> int:
-        """Take steps in one C call that stores every ``save_every``-th state at ``places``; return the status."""
-        if self._awaited and steps:
+    def _advance(self, steps: int, save_every: int, output_arrays: tuple[Any, ...]) -> int:
+        """Take steps in one C call; every ``save_every``-th state goes to ``output_arrays``. Return the status."""
+        if self._unset_inputs and steps:
             self.check_inputs()
-        status: int = self._go(*self._way, steps, save_every, *self._given, *places, self._report, self._workspace)
+        status: int = self._advance_function(
+            *self._plan_arguments, steps, save_every, *self._given, *output_arrays, self._report, self._workspace
+        )
         return status
 
     @property
@@ -296,7 +298,7 @@ class Memory(OneThread):
     @property
     def arrived(self) -> bool:
         """Return whether the run has reached its target time."""
-        return self.goal is not None and self.left_to(self.goal.t_end) == 0.0
+        return self.plan is not None and self.left_to(self.plan.t_end) == 0.0
 
     @property
     def rejected_steps(self) -> int:
@@ -314,7 +316,7 @@ class Memory(OneThread):
     @property
     def _leaving(self) -> bool:
         """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
-        return bool(getattr(self._memory, "leaving", 0))
+        return bool(getattr(self._memory, "steps_from_rest", 0))
 
 
 def fill(
@@ -342,7 +344,7 @@ def _check_memory(memory: Any) -> None:
     """Raise :class:`StateError` if the bytes cannot belong to a run."""
     numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
     counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
-    rungs = {name: getattr(memory, name) for name in RUNGS if hasattr(memory, name)}
+    grid_levels = {name: getattr(memory, name) for name in GRID_FIELDS if hasattr(memory, name)}
     sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
-    if not sound or memory.guess > 2 or any(abs(rung) > MOST_RUNGS for rung in rungs.values()):
-        raise StateError(f"invalid saved run: h = {memory.h:g}, {counts | rungs}")
+    if not sound or memory.guess > 2 or any(abs(grid_level) > MOST_GRID_LEVEL for grid_level in grid_levels.values()):
+        raise StateError(f"invalid saved run: h = {memory.h:g}, {counts | grid_levels}")

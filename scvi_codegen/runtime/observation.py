@@ -13,21 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.runtime.clock import part_of_step
-from scvi_codegen.runtime.dense_output import lengths_at, states_and_steps_at, times_of_run
+from scvi_codegen.runtime.dense_output import states_and_steps_at, step_sizes_at, times_of_run
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.portions import SLICE_SECONDS, record, trajectory_of
-from scvi_codegen.runtime.stalling import Watch
+from scvi_codegen.runtime.run_loop import CALL_SECONDS, record, trajectory_of
+from scvi_codegen.runtime.singular_time import ProgressMonitor
+from scvi_codegen.runtime.time_transformation import part_of_step
 from scvi_codegen.runtime.times import WHOLE
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Observation", "observed_until"]
 
 Array = NDArray[np.float64]
-NUMBERS = 2**18
+CHUNK_NUMBERS = 2**18
 """Largest number of positions in a chunk."""
 FIRST_STEPS = 64
 
@@ -70,19 +70,19 @@ class Observation:
             StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
             EventError: if an event function is not finite.
         """
-        goal = self.run.goal
-        on = steps is None and (goal or self.end is not None)
+        plan = self.run.plan
+        on = steps is None and (plan or self.end is not None)
         most_steps = np.inf if on else checked_count(steps, "steps", least=0)
         self._keep(record(self.run, 0), first=True)
-        most = max(1, NUMBERS // self.run.stepper.dimension)
-        portion, done = min(FIRST_STEPS, most), 0
-        watch = Watch(self.run.stepper, self.end if goal is None else goal.t_end if goal.tau else None)
+        most = max(1, CHUNK_NUMBERS // self.run.stepper.dimension)
+        chunk_size, done = min(FIRST_STEPS, most), 0
+        watch = ProgressMonitor(self.run.stepper, self.end if plan is None else plan.t_end if plan.tau else None)
         while done < most_steps and not self.run.arrived and not stop():
-            size, began = int(min(portion, most_steps - done)), time.perf_counter()
+            size, began = int(min(chunk_size, most_steps - done)), time.perf_counter()
             before = self.run.t, self.run.steps
             try:
-                self._portion(size)
-                if failure := watch.halt(before[0], self.run.t, self.run.steps - before[1], self.run.steps):
+                self._advance_chunk(size)
+                if failure := watch.check_progress(before[0], self.run.t, self.run.steps - before[1], self.run.steps):
                     raise failure
             except StepFailedError as failure:
                 failure.trajectory = self.trajectory()
@@ -93,13 +93,13 @@ class Observation:
             if progress is not None:
                 progress(done)
             elapsed = max(time.perf_counter() - began, 1e-6)
-            portion = max(1, min(most, 2 * size, int(size * SLICE_SECONDS / elapsed)))
+            chunk_size = max(1, min(most, 2 * size, int(size * CALL_SECONDS / elapsed)))
         found = self.trajectory()
         if self.times is None and not self.ended:
             self.run.iterations = self.iterations - int(found.iterations.sum())
         return found
 
-    def _portion(self, size: int) -> None:
+    def _advance_chunk(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
         before, failure = self.run.checkpoint(), None
         try:
@@ -122,8 +122,8 @@ class Observation:
         """Return the chunk with the state of the terminal event appended."""
         assert self.search is not None
         last = self.search.found[-1][-1]
-        _, _, tau = self._inside(part, float(last["t"]))
-        return self._closed(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
+        _, _, tau = self._state_within_step(part, float(last["t"]))
+        return self._with_state(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
 
     def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
         """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
@@ -135,16 +135,16 @@ class Observation:
             self.run.rollback(before)
             whole -= 1
             part = record(self.run, whole)
-        q, p, tau = self._inside(part, self.end)
+        q, p, tau = self._state_within_step(part, self.end)
         lengths = part.step_sizes.copy()
         lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
         self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
         if tau is None:
             run = self.run
             q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
-        return self._closed(part, lengths, self.end, q, p, tau)
+        return self._with_state(part, lengths, self.end, q, p, tau)
 
-    def _inside(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
+    def _state_within_step(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
         """Return the state and tau at a time in the step after a chunk; without time transformation the last state.
 
         Systems in transformed time are autonomous, so t is counted from the last state.
@@ -155,7 +155,9 @@ class Observation:
         q, p, x = part_of_step(run.stepper, 0.0, run.h, left, part.q[-1], part.p[-1], run.parameters, run.options)
         return q, p, float(part.tau[-1]) + x * run.h
 
-    def _closed(self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None) -> Trajectory:
+    def _with_state(
+        self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None
+    ) -> Trajectory:
         """Return a chunk with one more state within a step appended."""
         return self._made(
             np.append(part.t, t),
@@ -188,7 +190,7 @@ class Observation:
         times = self.times[after & (forward * self.times <= right)]
         q, p, stepped = states_and_steps_at(part, times)
         behind = np.searchsorted(forward * part.t, forward * times, side="right") - 1
-        self.states.append((times, q, p, lengths_at(part, times), stepped, total[behind]))
+        self.states.append((times, q, p, step_sizes_at(part, times), stepped, total[behind]))
 
     def trajectory(self) -> Trajectory:
         """Return all states saved so far."""

@@ -48,7 +48,7 @@ def alone(method: Called) -> Called:
     """Decorate a method to lock its run; the method raises as :meth:`OneThread.alone`."""
 
     @functools.wraps(method)
-    def held(self: Any, *given: Any, **named: Any) -> Any:
+    def locked(self: Any, *given: Any, **named: Any) -> Any:
         lock = self._lock
         if not lock.acquire(False):
             raise in_use()
@@ -57,4 +57,4 @@ def alone(method: Called) -> Called:
         finally:
             lock.release()
 
-    return cast(Called, held)
+    return cast(Called, locked)

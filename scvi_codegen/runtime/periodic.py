@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import NAMES, SWITCH, of, takes
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.inputs import Array, Parameters, check_inputs_given, checked_parameters, checked_vector
@@ -28,29 +26,31 @@ from scvi_codegen.runtime.measurements import state_names
 from scvi_codegen.runtime.periodic_orbit import PeriodicOrbit
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.times import steps_within, times_after
+from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments, of
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["periodic_orbit"]
 
 MOST_ITERATIONS, MOST_HALVINGS = 50, 12
 EASY, GROWTH = 10.0, 4.0
 """Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
-UNDECIDED = 1e-9
+NULL_SINGULAR_VALUE = 1e-9
 """Singular values below this fraction of the largest count as zero in the pseudoinverse."""
 CLOSED = 1e-11
 """Largest closing error, relative to the size of the state and the norm of the monodromy matrix."""
-KEPT = 1e-3
+CONSERVED = 1e-3
 """Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
-BESIDE = 1e-6
+DIFFERENCE_INCREMENT = 1e-6
 """Increment of the finite differences of integrals, relative to the size of the state."""
 SETTLED = 1e-13
 """Newton step, relative to state and period, below which the iteration ends."""
-WORSE = 10.0
+MOST_INCREASE = 10.0
 """Largest factor by which a Newton step may increase the residual."""
-RESTING = 1e-6
+EQUILIBRIUM_MOTION = 1e-6
 """Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
 
 
-@takes(StateError, stepper=of("a compiled stepper", Stepper), fixed=NAMES, fixed_period=SWITCH)
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper), fixed=NAMES, fixed_period=SWITCH)
 def periodic_orbit(
     stepper: Stepper,
     q: ArrayLike,
@@ -189,7 +189,7 @@ class _OrbitSearch:
                 f"{found.error:.1e}. Give a better initial guess, or more steps"
             )
         self._check_energy(found, allowed * size)
-        if np.linalg.norm(motion.by_period) * z[-1] <= RESTING * size:
+        if np.linalg.norm(motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
             raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
         if motion.by_time.any():
             self._check_repeats(z, found, allowed * size)
@@ -207,7 +207,7 @@ class _OrbitSearch:
             options=self.options,
         )
 
-    def _by_segments(self, guess: Array) -> tuple[Array, _Closing, int]:
+    def _by_segments(self, guess: Array) -> tuple[Array, _ClosingEquations, int]:
         """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
 
         States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
@@ -233,13 +233,13 @@ class _OrbitSearch:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""
         return np.linspace(0, self.steps, count + 1).round().astype(np.intp)
 
-    def _iterated(self, z: Array, found: _Closing, iterations: int) -> tuple[Array, _Closing, int]:
+    def _iterated(self, z: Array, found: _ClosingEquations, iterations: int) -> tuple[Array, _ClosingEquations, int]:
         """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
-        while iterations < MOST_ITERATIONS and (nearer := self._nearer(z, found)) is not None:
+        while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, found)) is not None:
             (z, found), iterations = nearer, iterations + 1
         return z, found, iterations
 
-    def _check_energy(self, found: _Closing, allowed: float) -> None:
+    def _check_energy(self, found: _ClosingEquations, allowed: float) -> None:
         """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
         away, slopes = float(found.defects[-1]), found.slopes[-1]
         if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
@@ -248,7 +248,7 @@ class _OrbitSearch:
                 "fix fewer entries of the state, or give a better initial guess"
             )
 
-    def _check_repeats(self, z: Array, found: _Closing, allowed: float) -> None:
+    def _check_repeats(self, z: Array, found: _ClosingEquations, allowed: float) -> None:
         """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
         period = float(z[-1])
         if -1 not in self.held:
@@ -264,7 +264,7 @@ class _OrbitSearch:
                 f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
             )
 
-    def _nearer(self, z: Array, found: _Closing) -> tuple[Array, _Closing] | None:
+    def _newton_iterate(self, z: Array, found: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
         """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
 
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
@@ -272,7 +272,7 @@ class _OrbitSearch:
         """
         free = np.delete(np.arange(len(z)), self.held)
         inverse = np.zeros((len(z), len(found.defects)))
-        inverse[free] = np.linalg.pinv(found.slopes[:, free], UNDECIDED)
+        inverse[free] = np.linalg.pinv(found.slopes[:, free], NULL_SINGULAR_VALUE)
         change = inverse @ found.defects
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
@@ -283,11 +283,11 @@ class _OrbitSearch:
             with suppress(StepFailedError):
                 at = self._closing(trial)
                 less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
-                if less and np.linalg.norm(at.defects) < WORSE * np.linalg.norm(found.defects):
+                if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(found.defects):
                     return trial, at
         return None
 
-    def _closing(self, z: Array) -> _Closing:
+    def _closing(self, z: Array) -> _ClosingEquations:
         """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
         size = 2 * self.stepper.dimension
         starts = z[:-1].reshape(-1, size)
@@ -303,7 +303,7 @@ class _OrbitSearch:
             rows[k, :, after * size : (after + 1) * size] -= np.eye(size)
             rows[k, :, -1] = segment.by_period
         error = float(np.abs(defects).max())
-        left = self._not_implied(starts, segments)
+        left = self._independent_equations(starts, segments)
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
         slopes, wanted = rows.reshape(count * size, -1), defects.ravel()
         if self.energy is not None:
@@ -311,9 +311,9 @@ class _OrbitSearch:
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
             wanted = np.append(wanted, energy - self.energy)
             row = np.zeros(len(z))
-            row[:size] = self._slopes_of_integrals(first, self.t)[0]
+            row[:size] = self._integral_gradients(first, self.t)[0]
             slopes = np.vstack([slopes, row])
-        return _Closing(segments, error, wanted, slopes)
+        return _ClosingEquations(segments, error, wanted, slopes)
 
     def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` to the start of step ``last``."""
@@ -336,26 +336,26 @@ class _OrbitSearch:
             by_time=slopes[:, size + 1],
         )
 
-    def _not_implied(self, starts: Array, segments: Sequence[_Segment]) -> Array:
+    def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
         """Return the (2m, 2m) projection onto the equations of return not implied by conserved quantities.
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
         """
         kept = []
         for start, segment in zip(starts, segments, strict=True):
-            begin = self._slopes_of_integrals(start, segment.start_time)
-            end = self._slopes_of_integrals(segment.states[-1], segment.end_time)
+            begin = self._integral_gradients(start, segment.start_time)
+            end = self._integral_gradients(segment.states[-1], segment.end_time)
             sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(segment.monodromy, 2)
-            kept.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= KEPT * sizes)
-        conserved = self._slopes_of_integrals(starts[0], self.t)[np.all(kept, axis=0)]
+            kept.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= CONSERVED * sizes)
+        conserved = self._integral_gradients(starts[0], self.t)[np.all(kept, axis=0)]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
-        directions = directions[:, strengths > KEPT * strengths.max(initial=0.0)]
+        directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
         projection: Array = np.eye(starts.shape[1]) - directions @ directions.T
         return projection
 
-    def _slopes_of_integrals(self, state: Array, t: float) -> Array:
+    def _integral_gradients(self, state: Array, t: float) -> Array:
         """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
-        size, width = len(state), BESIDE * max(1.0, float(np.abs(state).max()))
+        size, width = len(state), DIFFERENCE_INCREMENT * max(1.0, float(np.abs(state).max()))
         states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
         q, p = np.ascontiguousarray(states[:, : size // 2]), np.ascontiguousarray(states[:, size // 2 :])
         times = np.full(2 * size, t)
@@ -388,7 +388,7 @@ class _Segment:
 
 
 @dataclass(frozen=True, eq=False)
-class _Closing:
+class _ClosingEquations:
     """Residuals of the conditions of continuity and closing.
 
     Attributes:

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_large_steps
+from scvi_codegen.runtime.descriptions import describe_run, short_title
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.one_thread import alone
-from scvi_codegen.runtime.portions import record
-from scvi_codegen.runtime.standing import short_title, stands
+from scvi_codegen.runtime.run_loop import record
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Run"]
@@ -26,13 +26,13 @@ class Run(Memory):
     def __repr__(self) -> str:
         interface = self.stepper.interface
         tau = bool(interface.energy_parameter)
-        return stands(short_title(interface), interface.solver, self, tau=tau, awaited=self._awaited)
+        return describe_run(short_title(interface), interface.solver, self, tau=tau, unset_inputs=self._unset_inputs)
 
     def __reduce__(self) -> tuple[Any, ...]:
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
-        for name in self._awaited:
+        for name in self._unset_inputs:
             del known[f"{name}_0"]
-        return (_restored, (self.stepper, self.checkpoint(), known, self._options, self.goal, self.longest))
+        return (_restored, (self.stepper, self.checkpoint(), known, self._options, self.plan, self.longest))
 
     @alone
     def record(
@@ -55,8 +55,8 @@ class Run(Memory):
         else:
             trajectory = record(self, steps, save_every=save_every, progress=progress)
         if not self._leaving:
-            warn_of_long_steps(trajectory, before=before)
-        warn_of_lost_energy(trajectory)
+            warn_of_large_steps(trajectory, before=before)
+        warn_of_energy_error(trajectory)
         return trajectory
 
 
@@ -65,9 +65,9 @@ def _restored(
     saved: bytes,
     parameters: Parameters,
     options: SolverOptions | None,
-    goal: Goal | None,
+    plan: StepPlan | None,
     longest: float = 0.0,
 ) -> Run:
-    run = Run.restored(stepper, saved, parameters=parameters, options=options, goal=goal)
+    run = Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
     run.longest = longest
     return run

@@ -15,25 +15,32 @@ from typing import Any, TypedDict, Unpack, overload
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import FUNCTION, MAPPING, takes
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.accuracy import warn_of_long_steps, warn_of_lost_energy
+from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_large_steps
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.driven import advance_to, checked_inputs, end_of, entered, parameters_of, record_pieces
-from scvi_codegen.runtime.driven_trajectory import DrivenTrajectory
 from scvi_codegen.runtime.ensembles import Ensembles
 from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import Event, EventLike
 from scvi_codegen.runtime.global_error import checked_error, confirmed_run
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.inputs import Parameters
 from scvi_codegen.runtime.observation import Observation, observed_until
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.runs_with_inputs import (
+    advance_to,
+    checked_inputs,
+    final_time,
+    first_inner_time,
+    parameters_of,
+    record_pieces,
+)
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.times import steps_to, times_after
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Stepper"]
 
@@ -73,7 +80,7 @@ class Stepper(Ensembles):
     def integrate(
         self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: Mapping[str, Any], **settings: Unpack[Settings]
     ) -> DrivenTrajectory: ...
-    @takes(StateError, progress=FUNCTION, inputs=MAPPING)
+    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
     def integrate(
         self,
         q: ArrayLike,
@@ -163,9 +170,9 @@ class Stepper(Ensembles):
             found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
             check.warn(found)
             return found
-        end = end_of(t, None if self.interface.monitor else h, steps, t_end)
+        end = final_time(t, None if self.interface.monitor else h, steps, t_end)
         values = parameters_of(self, parameters, data)
-        run = start(t_end=end if to_end else None, parameters=values(entered(t, end)))
+        run = start(t_end=end if to_end else None, parameters=values(first_inner_time(t, end)))
         check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
         save_every = checked_count(save_every, "save_every", least=1)
         driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
@@ -177,7 +184,7 @@ class Stepper(Ensembles):
         """Return whether steps are steps of tau, by a time transformation or a monitor."""
         return bool(self.interface.energy_parameter or self.interface.monitor)
 
-    @takes(StateError)
+    @checks_arguments(StateError)
     def start(
         self,
         q: ArrayLike,
@@ -196,13 +203,13 @@ class Stepper(Ensembles):
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
         if self.interface.monitor:
-            goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
-            return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
+            plan = StepPlan.monitored(self.interface.monitor, h, t_end, tolerance)
+            return Run.started(self._adaptive(), q, p, h=plan, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
         if t_end is not None and h is None:
-            goal = Goal.checked(t_end, tolerance)
-            return Run.started(self._adaptive(), q, p, h=goal, t=t, parameters=parameters, options=options)
+            plan = StepPlan.checked(t_end, tolerance)
+            return Run.started(self._adaptive(), q, p, h=plan, t=t, parameters=parameters, options=options)
         if t_end is not None or h is None:
             raise StateError(
                 "give either h (fixed step size) or t_end (adaptive step size); got "
@@ -227,14 +234,14 @@ class Stepper(Ensembles):
         ``h`` is required with a monitor and not allowed otherwise.
         """
         if self.interface.monitor:
-            goal = Goal.monitored(self.interface.monitor, h, t_end, tolerance)
-            return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, goal=goal)
+            plan = StepPlan.monitored(self.interface.monitor, h, t_end, tolerance)
+            return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
         if h is not None:
             raise StateError("omit h: the saved run contains its step size")
         if t_end is None:
             return Run.restored(self, saved, parameters=parameters, options=options)
-        goal = Goal.checked(t_end, tolerance)
-        return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, goal=goal)
+        plan = StepPlan.checked(t_end, tolerance)
+        return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
 
 
 def _recorded(
@@ -253,37 +260,37 @@ def _recorded(
     if h is not None and t_end is not None and not interface.monitor:
         whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
         if whole is None or whole % checked_count(save_every, "save_every", least=1):
-            return _said(observed_until(run, t_end, steps, save_every, t_eval, progress))
+            return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress))
         steps = whole
     _check_number(run, steps)
     if t_eval is None:
         found = run.record(steps, save_every=save_every, progress=progress)
         if run._leaving:
-            warn_of_long_steps(found)
+            warn_of_large_steps(found)
         return found
     if clocked:
         raise StateError("t_eval requires t_end instead of steps in transformed time")
     times = times_of_run(t_eval, run.t, _end_of(run, steps))
-    return _said(Observation(run, times=times).advance(steps, progress))
+    return _with_warnings(Observation(run, times=times).advance(steps, progress))
 
 
 def _check_number(run: Run, steps: int | None) -> None:
     """Raise ``StateError`` for fixed steps without their number, and for adaptive steps with one."""
-    if run.goal is None and steps is None:
+    if run.plan is None and steps is None:
         raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
-    if run.goal is not None and steps is not None:
-        raise StateError(f"adaptive steps end at t_end={run.goal.t_end:g}: omit steps={steps}, or give h and steps")
+    if run.plan is not None and steps is not None:
+        raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}, or give h and steps")
 
 
-def _said(trajectory: Trajectory) -> Trajectory:
+def _with_warnings(trajectory: Trajectory) -> Trajectory:
     """Return the trajectory after warnings about its step size and its energy."""
-    warn_of_long_steps(trajectory)
-    warn_of_lost_energy(trajectory)
+    warn_of_large_steps(trajectory)
+    warn_of_energy_error(trajectory)
     return trajectory
 
 
 def _end_of(run: Run, steps: int | None) -> float:
-    return run.goal.t_end if run.goal else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
+    return run.plan.t_end if run.plan else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
 
 
 def _rebuild(

@@ -16,18 +16,18 @@ from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparklin
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
 from scvi_codegen.files.labelled import checked_units, to_dataset
-from scvi_codegen.given.kinds import MAPPING, PATH, takes
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.constraints import constraint_values, multipliers
 from scvi_codegen.runtime.dense_output import checked_times, states_at
+from scvi_codegen.runtime.descriptions import describe_states, describe_step_size
 from scvi_codegen.runtime.event_search import crossings_of
 from scvi_codegen.runtime.events import Crossings, Event, EventLike, as_events
-from scvi_codegen.runtime.exchanges import exchanged_until
 from scvi_codegen.runtime.global_error import Confirmed, GlobalError
-from scvi_codegen.runtime.kept_states import Array, checked_row, checked_rows
-from scvi_codegen.runtime.nearby import NearbyMotions
 from scvi_codegen.runtime.quantities import quantities
-from scvi_codegen.runtime.standing import holds, lengths_of
+from scvi_codegen.runtime.saved_states import Array, checked_row, checked_rows
+from scvi_codegen.runtime.trajectory_derivatives import TrajectoryDerivatives
+from scvi_codegen.runtime.work_and_impulses import work_and_impulses_until
+from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     import pandas
@@ -43,7 +43,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Trajectory(NearbyMotions, Confirmed):
+class Trajectory(TrajectoryDerivatives, Confirmed):
     """States along a run, the initial state first.
 
     Attributes:
@@ -77,7 +77,7 @@ class Trajectory(NearbyMotions, Confirmed):
     confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
-        return holds(self, lengths_of(self.h, self.goal, tau=self.tau is not None))
+        return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None))
 
     @overload
     def __getitem__(self, rows: slice) -> Self: ...
@@ -96,7 +96,7 @@ class Trajectory(NearbyMotions, Confirmed):
             return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
         first, last, stride = checked_rows(rows, len(self))
         lengths = self.step_sizes[rows]
-        if stride > 1 and self.goal is not None:  # the next saved state is not the end of the step
+        if stride > 1 and self.plan is not None:  # the next saved state is not the end of the step
             lengths = np.full_like(lengths, np.nan)
         low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
         return replace(
@@ -138,7 +138,7 @@ class Trajectory(NearbyMotions, Confirmed):
             MethodError: if no forces act, or the method has no curve of positions.
             StateError: if the states are not at whole steps.
         """
-        return exchanged_until(self)[:, 0]
+        return work_and_impulses_until(self)[:, 0]
 
     def impulses(self) -> Array:
         """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
@@ -146,7 +146,7 @@ class Trajectory(NearbyMotions, Confirmed):
         They equal J_n - J_0 to round-off for SVI and related methods, to order s + 1 for SCVI. Raises as
         :meth:`work`.
         """
-        return exchanged_until(self)[:, 1:]
+        return work_and_impulses_until(self)[:, 1:]
 
     def multipliers(self) -> Array:
         """Return (n, c) Lagrange multipliers of the constraints; the constraint forces are g_q^T lambda.
@@ -238,7 +238,7 @@ class Trajectory(NearbyMotions, Confirmed):
         return card(self.stepper.title, facts, grid(rows))
 
     def _steps(self) -> str:
-        if self.goal:
+        if self.plan:
             return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
         return f"h = {self.h:g}"
 
@@ -280,7 +280,7 @@ class Trajectory(NearbyMotions, Confirmed):
 
         return animate(self, path, seconds=seconds, positions=positions)
 
-    @takes(path=PATH, units=MAPPING)
+    @checks_arguments(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
 

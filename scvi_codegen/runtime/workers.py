@@ -7,15 +7,15 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
-from scvi_codegen.given.counts import checked_count
+from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["MOST_PIECES", "PROGRESS_SECONDS", "Heed", "run_each", "workers_of"]
+__all__ = ["MOST_JOBS", "PROGRESS_SECONDS", "StopCheck", "run_jobs", "workers_of"]
 
 PROGRESS_SECONDS = 0.1
-MOST_PIECES = 4096
+MOST_JOBS = 4096
 """Largest number of jobs of a pool; waiting for a million futures would be slow."""
 
-Heed = Callable[[int], None]
+StopCheck = Callable[[int], None]
 """Callback for long work, with any number: it raises if another job failed."""
 
 
@@ -25,35 +25,35 @@ class _Stopped(Exception):  # noqa: N818  (a signal, not an error)
 
 def workers_of(threads: int | None) -> int:
     """Return the number of threads, by default one per core."""
-    given = 0 if threads is None else checked_count(threads, "threads", least=1)
-    return given or os.cpu_count() or 1
+    argument = 0 if threads is None else checked_count(threads, "threads", least=1)
+    return argument or os.cpu_count() or 1
 
 
-def run_each(
+def run_jobs(
     count: int,
-    work: Callable[[int, Heed], None],
+    work: Callable[[int, StopCheck], None],
     *,
     progress: Callable[[int], None] | None,
     threads: int | None,
 ) -> None:
-    """Call ``work(j, heed)`` for j < count; an exception of ``progress`` or ``work`` stops all jobs promptly.
+    """Call ``work(j, check_stop)`` for j < count; an exception of ``progress`` or ``work`` stops all jobs promptly.
 
     Args:
         progress: called with the number of completed jobs.
         threads: number of threads, by default one per core.
     """
     workers, stop = workers_of(threads), threading.Event()
-    pieces, done = min(count, MOST_PIECES), 0
+    pieces, done = min(count, MOST_JOBS), 0
 
-    def heed(_: int) -> None:
+    def check_stop(_: int) -> None:
         if stop.is_set():
             raise _Stopped
 
     def take(piece: int) -> int:
         each = range(piece, count, pieces)
         for j in each:
-            heed(j)
-            work(j, heed)
+            check_stop(j)
+            work(j, check_stop)
         return len(each)
 
     with ThreadPoolExecutor(workers) as pool:

@@ -21,8 +21,8 @@ from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp, se
 from scvi_codegen.tables.quadrature import gauss_legendre, legendre_value
 
 __all__ = [
+    "cardinal_derivatives",
     "cardinal_integrals",
-    "cardinal_slopes",
     "cardinal_values",
     "continuation",
     "differentiation_matrix",
@@ -132,14 +132,14 @@ def differentiation_matrix(points: Iterable[Number]) -> Matrix:
     return rounded(guarded_differentiation(checked_points(points)))
 
 
-def cardinal_slopes(points: Iterable[Number], at: Iterable[Number]) -> Matrix:
+def cardinal_derivatives(points: Iterable[Number], at: Iterable[Number]) -> Matrix:
     """Return l_j'(at_i), computed as values times D, since l_j' is the polynomial through its values at the points."""
     numbers, targets = checked_points(points), tuple(map(to_number, at))
     weights = barycentric_weights(numbers)
     with mp.workdps(guard_digits(numbers)):
         values = tuple(cardinal_row(numbers, weights, t) for t in targets)
-        slopes = matrix_product(values, guarded_differentiation(numbers))
-    return rounded(slopes)
+        derivatives = matrix_product(values, guarded_differentiation(numbers))
+    return rounded(derivatives)
 
 
 def cardinal_integrals(points: Iterable[Number], at: Iterable[Number], start: Number) -> Matrix:

@@ -15,7 +15,7 @@ from scvi_codegen.tables.quadrature import (
     Quadrature,
     clenshaw_curtis_weights,
     fejer_weights,
-    is_made_by,
+    is_built_in,
     quadrature_by_name,
 )
 from scvi_codegen.tables.tableau import Tableau, explicit_euler, partner_matrix, tableau_by_name
@@ -146,7 +146,7 @@ def exact_rule(quadrature: Quadrature) -> tuple[Expressions, Expressions] | None
     family, count = quadrature.name.partition(":")[0], len(quadrature)
     if family not in POINT_FAMILIES:
         return None
-    if quadrature.name != f"{family}:{count}" or not is_made_by(quadrature_by_name, quadrature.name, quadrature):
+    if quadrature.name != f"{family}:{count}" or not is_built_in(quadrature_by_name, quadrature.name, quadrature):
         return None
     points = exact_family_points(POINT_FAMILIES[family], count)
     return None if points is None else (points, exact_weights(family, count))
@@ -235,7 +235,7 @@ def exact_tableau(tableau: Tableau) -> tuple[tuple[Expressions, ...], Expression
 
         return ((Integer(0),),), (Integer(1),), (Integer(0),)
     points, most = EXACT_FAMILIES.get(family, ("", 0))
-    if s > most or not is_made_by(tableau_by_name, tableau.name, tableau):
+    if s > most or not is_built_in(tableau_by_name, tableau.name, tableau):
         return None
     if tableau.name == "gauss:4":
         return exact_gauss_four()

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from typing import Any, TypeAlias, TypeVar
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, closest
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import WHOLE, takes
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import DIGITS, Number, Vector, mp
+from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
     "NODE_FAMILIES",
@@ -142,7 +142,7 @@ def family_named(name: str, families: Mapping[str, Item], what: str) -> Item:
     raise MethodError(f"unknown {what} {name!r}{closest(str(name), families)} Known: {', '.join(families)}")
 
 
-def jacobi_value_and_slope(count: int, alpha: int, beta: int, x: Number) -> tuple[Number, Number]:
+def jacobi_value_and_derivative(count: int, alpha: int, beta: int, x: Number) -> tuple[Number, Number]:
     """Return the Jacobi polynomial of degree ``count >= 1`` and its derivative at ``x`` in (-1, 1).
 
     Three-term recurrence and derivative formula: Abramowitz & Stegun 22.7.1 and 22.8.1.
@@ -155,8 +155,8 @@ def jacobi_value_and_slope(count: int, alpha: int, beta: int, x: Number) -> tupl
         last = 2 * (k + alpha - 1) * (k + beta - 1) * twice * before
         before, value = value, (middle - last) / (2 * k * (k + both) * (twice - 2))
     twice = 2 * count + both
-    slope = count * (alpha - beta - twice * x) * value + 2 * (count + alpha) * (count + beta) * before
-    return value, slope / (twice * (1 - x * x))
+    derivative = count * (alpha - beta - twice * x) * value + 2 * (count + alpha) * (count + beta) * before
+    return value, derivative / (twice * (1 - x * x))
 
 
 def jacobi_root(count: int, alpha: int, beta: int, index: int) -> Number:
@@ -168,9 +168,9 @@ def jacobi_root(count: int, alpha: int, beta: int, index: int) -> Number:
     x = mp.cospi(mp.mpf(4 * (count - index) + 2 * alpha - 1) / (4 * count + 2 * (alpha + beta + 1)))
     converged = mp.mpf(10) ** (-mp.dps // 2 - 5)
     while True:
-        value, slope = jacobi_value_and_slope(count, alpha, beta, x)
-        x -= value / slope
-        if abs(value / slope) < converged:
+        value, derivative = jacobi_value_and_derivative(count, alpha, beta, x)
+        x -= value / derivative
+        if abs(value / derivative) < converged:
             return x
 
 
@@ -233,7 +233,7 @@ def nodes_of(name: str, degree: int, points: Callable[[int], Vector]) -> Nodes:
     return Nodes(name=name, degree=degree, points=points(point_count(degree, "the degree", least=1) + 1))
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(degree: int) -> Nodes:
     """Return the Chebyshev-Gauss-Lobatto nodes -cos(j pi / degree), both ends among them.
@@ -244,42 +244,42 @@ def chebyshev_lobatto(degree: int) -> Nodes:
     return nodes_of("chebyshev-lobatto", degree, chebyshev_lobatto_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def legendre_lobatto(degree: int) -> Nodes:
     """Return -1, 1 and the extrema of the Legendre polynomial of this degree."""
     return nodes_of("legendre-lobatto", degree, legendre_lobatto_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def equispaced(degree: int) -> Nodes:
     """Return nodes with equal gaps, both ends among them; interpolation on them is unstable beyond degree 10 or so."""
     return nodes_of("equispaced", degree, equispaced_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def legendre_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Legendre polynomial P_{degree+1}: no end among them."""
     return nodes_of("legendre-gauss", degree, legendre_gauss_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(degree: int) -> Nodes:
     """Return the degree + 1 roots of the Chebyshev polynomial T_{degree+1}: no end among them."""
     return nodes_of("chebyshev-gauss", degree, chebyshev_gauss_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_left(degree: int) -> Nodes:
     """Return the degree + 1 left Radau points: -1 among them, 1 not."""
     return nodes_of("radau-left", degree, radau_left_points)
 
 
-@takes(MethodError, degree=WHOLE)
+@checks_arguments(MethodError, degree=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_right(degree: int) -> Nodes:
     """Return the degree + 1 right Radau points: 1 among them, -1 not."""

@@ -19,7 +19,7 @@ __all__ = ["DIGITS", "Matrix", "Number", "Vector", "mp", "settled"]
 DIGITS = 60
 
 
-class _OfThread(threading.local):
+class _ThreadLocalPrecision(threading.local):
     """Thread-local pair of precision in bits and rounding mode, as mpmath's numbers access it; initially 60 digits."""
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class _OfThread(threading.local):
 class _ThreadedContext(MPContext):  # type: ignore[misc]
     """Context of mpmath whose precision is thread-local instead of global."""
 
-    _own = _OfThread()
+    _own = _ThreadLocalPrecision()
     _prec_rounding = property(lambda self: self._own, lambda self, given: None)
     _prec = property(lambda self: self._own.pair[0], lambda self, bits: None)  # mpmath sets the pair as well
     _dps = property(lambda self: prec_to_dps(self._own.pair[0]), lambda self, digits: None)

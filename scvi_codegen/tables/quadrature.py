@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.kinds import TEXT, WHOLE, takes
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.nodes import (
     ascending_points,
     chebyshev_gauss_points,
@@ -30,6 +29,7 @@ from scvi_codegen.tables.nodes import (
     to_unit,
 )
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
+from scvi_codegen.validation.argument_types import TEXT, WHOLE, checks_arguments
 
 __all__ = [
     "QUADRATURE_FAMILIES",
@@ -40,7 +40,7 @@ __all__ = [
     "gauss_lobatto",
     "gauss_radau",
     "hermite",
-    "is_made_by",
+    "is_built_in",
     "quadrature_by_name",
     "split_name",
 ]
@@ -50,8 +50,8 @@ COMPUTED_TOLERANCE = mp.mpf("1e-12")
 
 CLAIMED_TOLERANCE = mp.mpf("1e-8")
 
-MOST_ORDER = 10**6
-MOST_CONDITIONS = 64
+MAX_ORDER = 10**6
+MAX_CONDITIONS = 64
 """Maximum number of conditions of a rule with derivatives, whose weights solve as many equations."""
 
 MOST_DIGITS = 9
@@ -90,7 +90,7 @@ class Quadrature:
                     f"quadrature {self.name!r} has {len(self.points)} points and {len(weights)} weights; "
                     "give one weight for each point, and at least one point"
                 )
-        claimed = point_count(self.order, "the order of a quadrature", least=0, most=MOST_ORDER)
+        claimed = point_count(self.order, "the order of a quadrature", least=0, most=MAX_ORDER)
         tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
         found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
         if found == 0:
@@ -162,7 +162,10 @@ def next_legendre(degree: int, points: Vector, values: Matrix, before: Matrix) -
         lower = values[k - 1] if k else line
         terms = zip(points, line, lower, last, strict=True)
         lines.append(
-            tuple(((2 * degree + 1) * (x * f + k * slope) - degree * old) / (degree + 1) for x, f, slope, old in terms)
+            tuple(
+                ((2 * degree + 1) * (x * f + k * derivative) - degree * old) / (degree + 1)
+                for x, f, derivative, old in terms
+            )
         )
     return tuple(lines)
 
@@ -182,7 +185,7 @@ def gauss_type(name: str, points: Vector, order: int, weight: Callable[[Number, 
     return Quadrature(name=f"{name}:{len(points)}", points=points, weights=tuple(weights), order=order)
 
 
-@takes(MethodError, n=WHOLE)
+@checks_arguments(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss_legendre(n: int) -> Quadrature:
     """Return the n-point Gauss-Legendre rule, of order 2n.
@@ -198,7 +201,7 @@ def gauss_legendre(n: int) -> Quadrature:
     return gauss_type("gauss-legendre", legendre_gauss_points(n), 2 * n, lambda x, P2: 2 * (1 - x * x) / (n * n * P2))
 
 
-@takes(MethodError, n=WHOLE)
+@checks_arguments(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss_lobatto(n: int) -> Quadrature:
     """Return the n-point Gauss-Lobatto rule (both ends are points, n >= 2), of order 2n - 2.
@@ -209,7 +212,7 @@ def gauss_lobatto(n: int) -> Quadrature:
     return gauss_type("gauss-lobatto", legendre_lobatto_points(n), 2 * n - 2, lambda x, P2: 2 / (n * (n - 1) * P2))
 
 
-@takes(MethodError, n=WHOLE, side=TEXT)
+@checks_arguments(MethodError, n=WHOLE, side=TEXT)
 @lru_cache(maxsize=None, typed=True)
 def gauss_radau(n: int, side: Literal["left", "right"] = "left") -> Quadrature:
     """Return the n-point Gauss-Radau rule with a point at -1 (``"left"``) or at 1 (``"right"``), of order 2n - 1.
@@ -245,7 +248,7 @@ def fejer_weights(n: int, pi: Any, cosine: Callable[[Any], Any]) -> tuple[Any, .
     return tuple(2 * cosine_sum((2 * j + 1) * pi / (2 * n), cosine, n, 0) / n for j in range(n))
 
 
-@takes(MethodError, n=WHOLE)
+@checks_arguments(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def clenshaw_curtis(n: int) -> Quadrature:
     """Return the n-point Clenshaw-Curtis rule (n >= 2) on -cos(j pi / N), N = n - 1; of order n, or n + 1 for odd n.
@@ -260,7 +263,7 @@ def clenshaw_curtis(n: int) -> Quadrature:
     return Quadrature(name=f"clenshaw-curtis:{n}", points=points, weights=weights, order=n + n % 2)
 
 
-@takes(MethodError, n=WHOLE)
+@checks_arguments(MethodError, n=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def fejer(n: int) -> Quadrature:
     """Return Fejer's first rule with n points -cos((2j + 1) pi / 2n); of order n, or n + 1 for odd n.
@@ -273,7 +276,7 @@ def fejer(n: int) -> Quadrature:
     return Quadrature(name=f"fejer:{n}", points=chebyshev_gauss_points(n), weights=weights, order=n + n % 2)
 
 
-@takes(MethodError, n=WHOLE, derivatives=WHOLE)
+@checks_arguments(MethodError, n=WHOLE, derivatives=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def hermite(n: int, derivatives: int = 1) -> Quadrature:
     """Return the rule that integrates the Hermite interpolant of f and its derivatives at n Lobatto points.
@@ -288,7 +291,7 @@ def hermite(n: int, derivatives: int = 1) -> Quadrature:
     n = point_count(n, "the number of Hermite points", least=2)
     kinds = 1 + point_count(derivatives, "the number of derivatives of a Hermite rule", least=1)
     count = point_count(
-        n * kinds, "the number of values and derivatives of a Hermite rule", least=4, most=MOST_CONDITIONS
+        n * kinds, "the number of values and derivatives of a Hermite rule", least=4, most=MAX_CONDITIONS
     )
     points = legendre_lobatto_points(n)
     with mp.workdps(DIGITS + GUARD + 2 * count):
@@ -329,7 +332,7 @@ def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item
     return found, int(count)
 
 
-def is_made_by(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
+def is_built_in(by_name: Callable[[str], Item], name: str, item: Item) -> bool:
     """Return whether ``item`` equals the built-in object of that name, rather than a user's object of the same name."""
     try:
         return by_name(name) == item

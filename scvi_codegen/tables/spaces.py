@@ -16,12 +16,12 @@ from functools import lru_cache
 from itertools import pairwise
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import NUMBERS, check_kind
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, differentiation_matrix, matrix_product
 from scvi_codegen.tables.nodes import to_number
 from scvi_codegen.tables.precision import DIGITS, Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
+from scvi_codegen.validation.argument_types import NUMBERS, check_kind
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["CurveSpace", "Polynomials", "Splines", "Trigonometric", "space_by_name"]
 

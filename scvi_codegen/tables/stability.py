@@ -39,13 +39,13 @@ def determinant_polynomial(matrix: Matrix) -> Polynomial:
 
 def trimmed(coefficients: Iterable[Number], scales: Iterable[Number]) -> Polynomial:
     """Return the polynomial with coefficients below 1e-30 of their scales set to zero and trailing zeros dropped."""
-    kept = [
+    trimmed_values = [
         +value if abs(value) > ZERO_TOLERANCE * scale else mp.zero
         for value, scale in zip(coefficients, scales, strict=True)
     ]
-    while kept and kept[-1] == 0:
-        kept.pop()
-    return kept
+    while trimmed_values and trimmed_values[-1] == 0:
+        trimmed_values.pop()
+    return trimmed_values
 
 
 def divided(dividend: Polynomial, divisor: Polynomial) -> tuple[Polynomial, Polynomial]:

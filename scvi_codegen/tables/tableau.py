@@ -16,9 +16,8 @@ from itertools import count as count_from
 from itertools import pairwise
 from typing import Any
 
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.kinds import WHOLE, takes
+from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import cardinal_integrals, transpose
 from scvi_codegen.tables.nodes import (
     chebyshev_gauss_points,
@@ -30,6 +29,7 @@ from scvi_codegen.tables.nodes import (
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.quadrature import gauss_legendre, gauss_lobatto, gauss_radau, split_name
 from scvi_codegen.tables.stability import determinant_polynomial, has_roots_right, is_nonnegative, modulus_gap, reduced
+from scvi_codegen.validation.argument_types import WHOLE, checks_arguments
 
 __all__ = [
     "TABLEAU_FAMILIES",
@@ -49,7 +49,7 @@ __all__ = [
 CONDITION_TOLERANCE = mp.mpf("1e-45")
 SMALL_DENOMINATOR, ROUNDINGS = 1000, 2
 """Largest denominator of a rational that replaces a float, and the largest deviation in roundings."""
-MOST_STAGES = 64
+MAX_STAGES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,8 +171,8 @@ def collocation_tableau(abscissae: Iterable[Any], name: str = "collocation") -> 
     which they are roundings: order and symmetry of [0.1, 0.5, 0.9] are those of 1/10, 1/2, 9/10.
     """
     c = _intended(tuple(abscissae))
-    if len(c) > MOST_STAGES:
-        raise MethodError(f"{len(c)} abscissae are too many: use at most {MOST_STAGES}, and more steps")
+    if len(c) > MAX_STAGES:
+        raise MethodError(f"{len(c)} abscissae are too many: use at most {MAX_STAGES}, and more steps")
     for index, (left, right) in enumerate(pairwise(c), start=1):
         if left >= right:
             raise MethodError(
@@ -224,10 +224,10 @@ def partner_matrix(A: Sequence[Sequence[Any]], b: Sequence[Any]) -> tuple[tuple[
 
 def _stages(s: Any) -> int:
     """Check the number of stages before points are computed."""
-    return point_count(s, "the number of stages", least=0, most=MOST_STAGES)
+    return point_count(s, "the number of stages", least=0, most=MAX_STAGES)
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def gauss(s: int) -> Tableau:
     """Return the s-stage Gauss method: collocation on the Gauss-Legendre points; order 2s, symplectic, symmetric.
@@ -238,14 +238,14 @@ def gauss(s: int) -> Tableau:
     return collocation_tableau(gauss_legendre(_stages(s)).abscissae, f"gauss:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_iia(s: int) -> Tableau:
     """Return the s-stage Radau IIA method: collocation on the right Radau points; order 2s - 1."""
     return collocation_tableau(gauss_radau(_stages(s), "right").abscissae, f"radau-iia:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def radau_ia(s: int) -> Tableau:
     """Return the s-stage Radau IA method: b of the left Radau quadrature, A from D(s); order 2s - 1.
@@ -255,14 +255,14 @@ def radau_ia(s: int) -> Tableau:
     return symplectic_partner(collocation_tableau(gauss_radau(_stages(s), "left").abscissae), f"radau-ia:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def lobatto_iiia(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIA method (s >= 2): collocation on the Lobatto points; order 2s - 2, symmetric."""
     return collocation_tableau(gauss_lobatto(_stages(s)).abscissae, f"lobatto-iiia:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def lobatto_iiib(s: int) -> Tableau:
     """Return the s-stage Lobatto IIIB method (s >= 2), the symplectic partner of Lobatto IIIA; order 2s - 2.
@@ -272,19 +272,19 @@ def lobatto_iiib(s: int) -> Tableau:
     return symplectic_partner(lobatto_iiia(s), f"lobatto-iiib:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_gauss(s: int) -> Tableau:
     """Return collocation on the s Chebyshev-Gauss points: symmetric, of order s for even s and s + 1 for odd s."""
-    s = point_count(s, "the number of Chebyshev-Gauss stages", least=1, most=MOST_STAGES)
+    s = point_count(s, "the number of Chebyshev-Gauss stages", least=1, most=MAX_STAGES)
     return collocation_tableau(to_unit(chebyshev_gauss_points(s)), f"chebyshev-gauss:{s}")
 
 
-@takes(MethodError, s=WHOLE)
+@checks_arguments(MethodError, s=WHOLE)
 @lru_cache(maxsize=None, typed=True)
 def chebyshev_lobatto(s: int) -> Tableau:
     """Return collocation on the s >= 2 Chebyshev-Lobatto points: symmetric, of order s (even s) or s + 1 (odd s)."""
-    s = point_count(s, "the number of Chebyshev-Lobatto stages", least=2, most=MOST_STAGES)
+    s = point_count(s, "the number of Chebyshev-Lobatto stages", least=2, most=MAX_STAGES)
     return collocation_tableau(to_unit(chebyshev_lobatto_points(s)), f"chebyshev-lobatto:{s}")
 
 

@@ -19,26 +19,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.given.kinds import TEXT, TEXTS, of, takes
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import TEXT, TEXTS, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
-from scvi_codegen.verification.clock_derivatives import clock_derivative_checks
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
-from scvi_codegen.verification.guesses import guess_checks
 from scvi_codegen.verification.identities import identity_checks
-from scvi_codegen.verification.pace import Pace, of_one_pace, pace_checks
+from scvi_codegen.verification.predictors import predictor_checks
 from scvi_codegen.verification.roundoff import roundoff_checks
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import largest_step, structure_checks
-from scvi_codegen.verification.subject import State, Subject
+from scvi_codegen.verification.system_under_test import State, SystemUnderTest
+from scvi_codegen.verification.time_transformation_derivatives import time_transformation_derivative_checks
+from scvi_codegen.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 
 __all__ = ["Certificate", "Check", "Outcome", "verify"]
 
@@ -50,8 +50,8 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-@takes(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
-@unwarned()
+@checks_arguments(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
+@without_accuracy_warnings()
 def verify(
     system: MechanicalSystem,
     method: Method | str,
@@ -95,23 +95,23 @@ def verify(
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
     given = _given(system, stepper, q, p, h, t)
-    steps, single = stepper, of_one_pace(system, stepper.energy(given.q, given.p, given.t))
+    steps, single = stepper, at_fixed_energy(system, stepper.energy(given.q, given.p, given.t))
     if single is not system or stepper.interface.monitor:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
-    subject = Subject(single, method, steps, _newton(single, method, steps, solver, flags), given)
+    tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), given)
     paced = steps is not stepper or tolerance is not None
-    pace = Pace(subject, stepper, _in_own_time(system), system, tolerance)
+    runs_tested = VariableSteps(tested, stepper, _in_own_time(system), system, tolerance)
     checks = (
-        *(pace_checks(pace) if paced else ()),
-        *step_checks(subject),
-        *guess_checks(subject),
-        *(() if system.constraints else roundoff_checks(subject)),
-        *structure_checks(subject),
-        *derivative_checks(subject),
-        *(clock_derivative_checks(pace) if system.clock else ()),
-        *convergence_checks(subject),
-        *identity_checks(subject),
-        largest_step(subject),
+        *(variable_step_checks(runs_tested) if paced else ()),
+        *step_checks(tested),
+        *predictor_checks(tested),
+        *(() if system.constraints else roundoff_checks(tested)),
+        *structure_checks(tested),
+        *derivative_checks(tested),
+        *(time_transformation_derivative_checks(runs_tested) if system.clock else ()),
+        *convergence_checks(tested),
+        *identity_checks(tested),
+        largest_step(tested),
     )
     return issued(
         stepper.source.files,

@@ -15,17 +15,17 @@ from functools import partial
 from typing import IO, Any, NamedTuple
 
 from scvi_codegen.display.cards import Html, card, grid, plain
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import MethodError, StateError, StepFailedError, SystemDefinitionError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.native.waiting import waiting_for
+from scvi_codegen.native.announcements import announced
+from scvi_codegen.representation import summary
 
 __all__ = [
-    "BrokenError",
     "Certificate",
     "Check",
     "Finding",
     "Outcome",
+    "ViolationError",
     "checked",
     "information",
     "issued",
@@ -35,8 +35,8 @@ __all__ = [
 class Outcome(StrEnum):
     """Result of a check."""
 
-    KEPT = "satisfied"
-    BROKEN = "VIOLATED"
+    SATISFIED = "satisfied"
+    VIOLATED = "VIOLATED"
     NOT_MEASURED = "not measured"
     INFORMATION = "information"
 
@@ -55,7 +55,7 @@ class Check:
     """
 
     name: str
-    promise: str
+    statement: str
     outcome: Outcome
     measured: float | None = None
     bound: float | None = None
@@ -66,7 +66,7 @@ class Check:
         if self.bound is not None:
             numbers += f" (bound {self.bound:.3g})"
         end = "; ".join(part for part in (numbers, self.remark) if part)
-        return f"{self.outcome.value:12}  {self.name}: {self.promise}{': ' + end if end else ''}"
+        return f"{self.outcome.value:12}  {self.name}: {self.statement}{': ' + end if end else ''}"
 
 
 class Finding(NamedTuple):
@@ -78,31 +78,31 @@ class Finding(NamedTuple):
     at_least: bool = False
 
     @property
-    def kept(self) -> bool:
+    def satisfied(self) -> bool:
         """True if the number satisfies the bound; a NaN never does."""
         return self.measured >= self.bound if self.at_least else self.measured <= self.bound
 
 
-class BrokenError(Exception):
+class ViolationError(Exception):
     """Violation of a property that is not expressed by a number."""
 
 
-def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> Iterator[Check]:
+def checked(name: str, statement: str, measure: Callable[[], Finding | None]) -> Iterator[Check]:
     """Yield the check of a property; nothing if it does not apply, the reason if it cannot be measured."""
     outcome, remark, finding = Outcome.NOT_MEASURED, "", None
     try:
-        with waiting_for(f"measuring {name}"):
+        with announced(f"measuring {name}"):
             finding = measure()
         if finding is None:
             return
-        outcome, remark = Outcome.KEPT if finding.kept else Outcome.BROKEN, finding.remark
-    except BrokenError as fault:
-        outcome, remark = Outcome.BROKEN, str(fault)
+        outcome, remark = Outcome.SATISFIED if finding.satisfied else Outcome.VIOLATED, finding.remark
+    except ViolationError as fault:
+        outcome, remark = Outcome.VIOLATED, str(fault)
     except (StateError, StepFailedError, MethodError, SystemDefinitionError, ArithmeticError) as reason:
         remark = str(reason)
     yield Check(
         name=name,
-        promise=promise,
+        statement=statement,
         outcome=outcome,
         measured=finding and finding.measured,
         bound=finding and finding.bound,
@@ -112,7 +112,7 @@ def checked(name: str, promise: str, measure: Callable[[], Finding | None]) -> I
 
 def information(name: str, what: str, measured: float | None, remark: str = "") -> Check:
     """Return a measured number without a bound."""
-    return Check(name=name, promise=what, outcome=Outcome.INFORMATION, measured=measured, remark=remark)
+    return Check(name=name, statement=what, outcome=Outcome.INFORMATION, measured=measured, remark=remark)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,12 +150,12 @@ class Certificate:
     @property
     def passed(self) -> bool:
         """True if no property is violated; properties not measured are in :attr:`not_measured`."""
-        return not self.broken
+        return not self.violated
 
     @property
-    def broken(self) -> tuple[Check, ...]:
+    def violated(self) -> tuple[Check, ...]:
         """Checks of violated properties."""
-        return self._with(Outcome.BROKEN)
+        return self._with(Outcome.VIOLATED)
 
     @property
     def not_measured(self) -> tuple[Check, ...]:
@@ -196,14 +196,14 @@ class Certificate:
         write_atomically(path, partial(_write, self.to_json()))
 
 
-def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **said: Any) -> Certificate:
-    """Return the certificate of C files by name for a state; ``said`` are the other attributes."""
+def issued(files: Mapping[str, str], *, q: Iterable[float], p: Iterable[float], **attributes: Any) -> Certificate:
+    """Return the certificate of C files by name for a state; ``attributes`` are the other attributes."""
     return Certificate(
         version=_installed_version(),
         checksum=hashlib.sha256("".join(files.values()).encode()).hexdigest(),
         q=tuple(map(float, q)),
         p=tuple(map(float, p)),
-        **said,
+        **attributes,
     )
 
 
@@ -218,10 +218,10 @@ def _installed_version() -> str:
 def _row(check: Check) -> tuple[Html, ...]:
     """Return a row of the table in a notebook; violations are bold."""
     outcome = plain(check.outcome.value)
-    if check.outcome is Outcome.BROKEN:
+    if check.outcome is Outcome.VIOLATED:
         outcome = Html(f"<strong>{outcome}</strong>")
     numbers = ["" if number is None else f"{number:.3g}" for number in (check.measured, check.bound)]
-    words = "; ".join(filter(None, (check.promise, check.remark)))
+    words = "; ".join(filter(None, (check.statement, check.remark)))
     return plain(check.name), outcome, *map(plain, numbers), plain(words)
 
 

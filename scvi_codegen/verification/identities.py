@@ -36,14 +36,14 @@ from scvi_codegen.tables.quadrature import (
     gauss_radau,
 )
 from scvi_codegen.verification.certificate import Check, Finding, checked
-from scvi_codegen.verification.subject import Subject
+from scvi_codegen.verification.system_under_test import SystemUnderTest
 
 __all__ = ["identity_checks"]
 
 EQUAL, ROUNDED = 1e-30, 1e-13
 """Bounds: for equations in 60 digits; for equations whose tables are rounded to 53 bits."""
 OTHER_FORM = "position form is phase-space form for constant mass"
-LARGEST_TWIN = 6
+MAX_LEGENDRE_COORDINATES = 6
 """Largest number of coordinates for which the Legendre transform is done symbolically."""
 
 POINTS: dict[str, Callable[[int], Quadrature]] = {
@@ -57,7 +57,7 @@ POINTS: dict[str, Callable[[int], Quadrature]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Twin:
+class _Identity:
     """Method that is the same map by another path."""
 
     name: str
@@ -65,108 +65,108 @@ class _Twin:
     bound: float = EQUAL
 
 
-def identity_checks(subject: Subject) -> Iterator[Check]:
+def identity_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield the identities that apply to the method and the system."""
-    promise = "another method or formulation gives the same step"
-    for twin in _twins(subject.method, forms_of(subject.moved).separable):
-        measure = partial(_compared, subject, subject.moved, twin.method, twin.bound)
-        yield from checked(f"identity: {twin.name}", promise, measure)
-    yield from checked("identity: from H as from L", promise, partial(_legendre_twin, subject))
-    promise = "steps of the oscillator with the curves' frequency are exact"
-    yield from checked("oscillator", promise, partial(_oscillator, subject.method))
-    yield from checked("Euler", "a step is h times the rates at its start", partial(_euler, subject))
+    statement = "another method or formulation gives the same step"
+    for identity in _identities(tested.method, forms_of(tested.moved).separable):
+        measure = partial(_compared, tested, tested.moved, identity.method, identity.bound)
+        yield from checked(f"identity: {identity.name}", statement, measure)
+    yield from checked("identity: from H as from L", statement, partial(_legendre_identity, tested))
+    statement = "steps of the oscillator with the curves' frequency are exact"
+    yield from checked("oscillator", statement, partial(_oscillator, tested.method))
+    yield from checked("Euler", "a step is h times the rates at its start", partial(_euler, tested))
 
 
-def _compared(subject: Subject, system: MechanicalSystem, method: Method, bound: float) -> Finding:
-    state, own = subject.states[0], subject.solved(0)
-    other = subject.derived(method, system)(state.q, state.p, state.h, state.t)
-    apart = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / subject.scales(state)
-    return Finding(float(max(apart)), bound, method.name)
+def _compared(tested: SystemUnderTest, system: MechanicalSystem, method: Method, bound: float) -> Finding:
+    state, own = tested.states[0], tested.solved(0)
+    other = tested.derived(method, system)(state.q, state.p, state.h, state.t)
+    difference = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / tested.scales(state)
+    return Finding(float(max(difference)), bound, method.name)
 
 
 @singledispatch
-def _twins(method: Method, separable: bool) -> Iterator[_Twin]:
+def _identities(method: Method, separable: bool) -> Iterator[_Identity]:
     """Yield methods with the same step for separable or other systems; nothing for a method without such identities."""
     return iter(())
 
 
-@_twins.register
-def _(method: StoermerVerlet, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: StoermerVerlet, separable: bool) -> Iterator[_Identity]:
     if separable:
-        yield _Twin("SVI of degree 1 with the trapezoidal rule", SVI(1, "gauss-lobatto:2"), ROUNDED)
-        yield _Twin("kick, drift, kick", Composition(2), ROUNDED)
+        yield _Identity("SVI of degree 1 with the trapezoidal rule", SVI(1, "gauss-lobatto:2"), ROUNDED)
+        yield _Identity("kick, drift, kick", Composition(2), ROUNDED)
 
 
-@_twins.register
-def _(method: Composition, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: Composition, separable: bool) -> Iterator[_Identity]:
     if method.composition_order == 2:
-        yield _Twin("Lobatto IIIA-IIIB", StoermerVerlet(), ROUNDED)
+        yield _Identity("Lobatto IIIA-IIIB", StoermerVerlet(), ROUNDED)
 
 
-@_twins.register
-def _(method: SVI, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: SVI, separable: bool) -> Iterator[_Identity]:
     s, rule = method.degree, method.rule
     if not method.curves.nodal or rule.derivative_weights:
         return
     if s > 1:
         other = "equispaced" if method.node_set.name != "equispaced" else "chebyshev-lobatto"
-        yield _Twin("independent of its nodes", SVI(s, rule, other))
+        yield _Identity("independent of its nodes", SVI(s, rule, other))
     if rule.name == f"gauss-legendre:{s}":
-        yield _Twin("SVI(s, s Gauss points) = Gauss(s)", Gauss(s))
+        yield _Identity("SVI(s, s Gauss points) = Gauss(s)", Gauss(s))
     if s == 1:
-        yield _Twin("SVI(1) = SCVI(1)", SCVI(1, rule))
+        yield _Identity("SVI(1) = SCVI(1)", SCVI(1, rule))
         if rule.name == "gauss-lobatto:2" and separable:
-            yield _Twin("SVI(1, trapezoidal rule) = Stoermer-Verlet", StoermerVerlet(), ROUNDED)
+            yield _Identity("SVI(1, trapezoidal rule) = Stoermer-Verlet", StoermerVerlet(), ROUNDED)
 
 
-@_twins.register
-def _(method: SCVI, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: SCVI, separable: bool) -> Iterator[_Identity]:
     s, rule = method.degree, method.rule
     if s == 1:
-        yield _Twin("SCVI(1) = SVI(1)", SVI(1, rule))
+        yield _Identity("SCVI(1) = SVI(1)", SVI(1, rule))
     elif method.variational and method.abscissae is None:
         abscissae = method.node_set.abscissae[1:]
-        yield _Twin("its nodes as abscissae", SCVI(s, rule, abscissae=abscissae), ROUNDED)
+        yield _Identity("its nodes as abscissae", SCVI(s, rule, abscissae=abscissae), ROUNDED)
     elif method.abscissae == "gauss" and rule.name == f"gauss-legendre:{s}" and separable:
-        yield _Twin("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
+        yield _Identity("SCVI on Gauss points = SVI", SVI(s, rule), ROUNDED)
 
 
-@_twins.register
-def _(method: SpectralCollocation, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: SpectralCollocation, separable: bool) -> Iterator[_Identity]:
     abscissae = method.node_set.abscissae[1:]
-    yield _Twin("collocation at its nodes", CollocationRK(abscissae, form=method.form))
+    yield _Identity("collocation at its nodes", CollocationRK(abscissae, form=method.form))
     if separable:
-        yield _Twin(OTHER_FORM, replace(method, form=_other(method.form)))
+        yield _Identity(OTHER_FORM, replace(method, form=_other_form(method.form)))
 
 
-@_twins.register
-def _(method: RungeKutta, separable: bool) -> Iterator[_Twin]:
+@_identities.register
+def _(method: RungeKutta, separable: bool) -> Iterator[_Identity]:
     family, _, stages = method.tableau.name.partition(":")
     if family in POINTS:
         points = POINTS[family](int(stages)).abscissae
-        yield _Twin("collocation at the points of a quadrature", CollocationRK(list(points), form=method.form))
+        yield _Identity("collocation at the points of a quadrature", CollocationRK(list(points), form=method.form))
     if family == "gauss" and method.form == "phase-space":
         s = int(stages)
-        yield _Twin("Gauss(s) = SVI(s, s Gauss points)", SVI(s))
+        yield _Identity("Gauss(s) = SVI(s, s Gauss points)", SVI(s))
     if separable:
-        yield _Twin(OTHER_FORM, replace(method, form=_other(method.form)))
+        yield _Identity(OTHER_FORM, replace(method, form=_other_form(method.form)))
 
 
-def _other(form: str) -> str:
+def _other_form(form: str) -> str:
     return "position" if form == "phase-space" else "phase-space"
 
 
-def _legendre_twin(subject: Subject) -> Finding | None:
+def _legendre_identity(tested: SystemUnderTest) -> Finding | None:
     """Compare with the step of the Legendre transform: H from L, or L from H."""
-    system, method = subject.moved, subject.method
+    system, method = tested.moved, tested.method
     singular = isinstance(system, HamiltonianSystem) and not system.is_regular
     shot = isinstance(method, SCVI) and bool(system.forces)
     if singular or shot or method.needs_lagrangian or system.constraints:
         return None
-    if system.dimension > LARGEST_TWIN:
-        raise StateError(f"Legendre transform: more than {LARGEST_TWIN} coordinates")
-    twin = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
-    return _compared(subject, twin, method, EQUAL)
+    if system.dimension > MAX_LEGENDRE_COORDINATES:
+        raise StateError(f"Legendre transform: more than {MAX_LEGENDRE_COORDINATES} coordinates")
+    identity = hamiltonian_of(system) if isinstance(system, LagrangianSystem) else _lagrangian(system)
+    return _compared(tested, identity, method, EQUAL)
 
 
 def _oscillator(method: Method) -> Finding | None:
@@ -177,16 +177,16 @@ def _oscillator(method: Method) -> Finding | None:
         return None
     formula, frequency = "(q_dot**2 - w**2*q**2)/2", {"w": method.frequency}
     system = LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian=formula, parameters=frequency)
-    found, (q, p) = derived_step(system, method)([0.7], [0.4], 1), exact_motion(system).flow([0.7], [0.4], 1)
-    return Finding(float(max(abs(found.q[0] - q[0]), abs(found.p[0] - p[0]))), ROUNDED)
+    result, (q, p) = derived_step(system, method)([0.7], [0.4], 1), exact_motion(system).flow([0.7], [0.4], 1)
+    return Finding(float(max(abs(result.q[0] - q[0]), abs(result.p[0] - p[0]))), ROUNDED)
 
 
-def _euler(subject: Subject) -> Finding | None:
+def _euler(tested: SystemUnderTest) -> Finding | None:
     """Compare explicit Euler with its formula; order 1 alone would also hold for implicit Euler."""
-    what = subject.method.specification()
+    what = tested.method.specification()
     if what["method"] != "explicit-euler":
         return None
-    state, motion = subject.states[0], subject.motion
+    state, motion = tested.states[0], tested.motion
     q, p, h, t = numbers(state.q), numbers(state.p), mp.mpf(state.h), mp.mpf(state.t)
     v, force = motion.rates(q, p, t)
     if what["form"] == "phase-space":
@@ -195,8 +195,8 @@ def _euler(subject: Subject) -> Finding | None:
         raise StateError("no formula for the position form of a Hamiltonian")
     else:
         end = [*(q + v * h), *motion.momentum(q + v * h, v + motion.acceleration(q, v, t) * h, t + h)]
-    solved = subject.solved(0)
-    return Finding(float(max(abs(np.array([*solved.q, *solved.p]) - end) / subject.scales(state))), EQUAL)
+    solved = tested.solved(0)
+    return Finding(float(max(abs(np.array([*solved.q, *solved.p]) - end) / tested.scales(state))), EQUAL)
 
 
 def _lagrangian(system: MechanicalSystem) -> LagrangianSystem:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 
-__all__ = ["WEIGHTS", "Linearised", "linearised"]
+__all__ = ["WEIGHTS", "Jacobian", "linearised"]
 
 Array = NDArray[np.float64]
 Map = Callable[[Array], Array]
@@ -22,7 +22,7 @@ WIDTHS = (0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4)
 
 
 @dataclass(frozen=True, slots=True)
-class Linearised:
+class Jacobian:
     """Jacobian of a step in units of the scales.
 
     Attributes:
@@ -35,15 +35,15 @@ class Linearised:
     uncertainty: float
     scales: Array
 
-    def carried(self, change: Array) -> Array:
+    def propagated(self, change: Array) -> Array:
         """Return (2m,) bounds on the change of the end for changes of the arguments of any sign."""
         spread: Array = self.scales * (np.abs(self.matrix) @ (np.abs(change) / self.scales))
         return spread
 
 
-def linearised(step: Map, state: Array, scales: Array) -> Linearised | None:
+def linearised(step: Map, state: Array, scales: Array) -> Jacobian | None:
     """Return the Jacobian of ``step`` at ``state``; ``None`` if steps fail in the neighbourhood."""
-    best: Linearised | None = None
+    best: Jacobian | None = None
     before: Array | None = None
     for width in WIDTHS:
         try:
@@ -53,7 +53,7 @@ def linearised(step: Map, state: Array, scales: Array) -> Linearised | None:
         if before is not None:
             change = float(np.abs(now - before).max())
             if best is None or change < best.uncertainty:
-                best = Linearised(now, change, scales)
+                best = Jacobian(now, change, scales)
         before = now
     return best
 
@@ -61,7 +61,7 @@ def linearised(step: Map, state: Array, scales: Array) -> Linearised | None:
 def _differences(step: Map, state: Array, scales: Array, width: float) -> Array:
     columns = []
     for unit in np.diag(width * scales):
-        slopes = sum(w * (step(state + k * unit) - step(state - k * unit)) for k, w in WEIGHTS.items())
-        columns.append(slopes / (width * scales))
+        derivatives = sum(w * (step(state + k * unit) - step(state - k * unit)) for k, w in WEIGHTS.items())
+        columns.append(derivatives / (width * scales))
     matrix: Array = np.array(columns).T
     return matrix

@@ -27,8 +27,8 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
-from scvi_codegen.verification.subject import EPSILON, State, Subject
+from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
+from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
 
 __all__ = ["roundoff_checks"]
 
@@ -39,76 +39,76 @@ SHORT = 2.0**-40
 SHORT_STEPS = 64
 LOST = 1e-6
 """Bound on the relative error of 64 steps of h 2^-40; without compensation it is 1e-3, with it 1e-15."""
-LONG_CARRY = 1e-6
+LARGE_COMPENSATION = 1e-6
 """Compensation relative to the state in tests, instead of about 1e-17."""
-FORGOTTEN = 1e-3
+MAX_LOSS = 1e-3
 """Part of the effect of the compensation that may be lost; the term of second order in h is a tenth of it."""
 SHORTER = 1 / 64
 """Factor of h: until the last iteration the stages may lack the compensation, a term of second order in h."""
-CARRIED_STEPS = 3
+COMPENSATED_STEPS = 3
 LANES = 3
 RUNS, SPREAD = 64, 0.02
-WORK, FEWEST_STEPS, MOST_STEPS = 2**14, 2**9, 2**13
+WORK, MIN_STEPS, MAX_STEPS = 2**14, 2**9, 2**13
 """Numbers of coordinates times steps, and bounds of the number of steps, of each run."""
 STUDENT = 7.0
 """Bound on Student's t with 63 degrees of freedom; correct code exceeds it once in 10^9 cases."""
-TO_REST = SolverOptions(tolerance=2.0**-68)
+TO_CONVERGENCE = SolverOptions(tolerance=2.0**-68)
 """Solver options that iterate until nothing changes."""
-LEFT = 0.25
-"""Residual of the fixed-point iteration, in units of rounding; see ``templates/support/contraction.h``."""
+MAX_RESIDUAL = 0.25
+"""Residual of the fixed-point iteration, in units of rounding; see ``templates/support/convergence.h``."""
 NO_TRUNCATION = 2.0**-56
 """Relative energy change of one exact step below which round-off dominates."""
 
 
-def roundoff_checks(subject: Subject) -> Iterator[Check]:
+def roundoff_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield all checks of this module."""
-    for name, promise, measure in (
+    for name, statement, measure in (
         ("compensated sums", f"{SHORT_STEPS} steps of h 2^-40 equal one of {SHORT_STEPS} h 2^-40", _sums),
-        ("low words", "the compensation terms of the state enter the next step", _low_parts),
+        ("low words", "the compensation terms of the state enter the next step", _low_words),
         ("ensemble", "SIMD lanes equal single runs, including compensation terms", _ensemble),
         ("drift", "invariants drift no more than a random walk (Student's t), converged iterations", _drift),
         ("drift of ensembles", "the same for SIMD lanes", _drift_of_lanes),
-        ("residual drift", "default convergence criterion: drift below part of a rounding per step", _rests),
+        ("residual drift", "default convergence criterion: drift below part of a rounding per step", _residual_drift),
     ):
-        yield from checked(name, promise, partial(measure, subject))
+        yield from checked(name, statement, partial(measure, tested))
 
 
-def _compensated(subject: Subject) -> bool:
+def _compensated(tested: SystemUnderTest) -> bool:
     """Return True if momenta are compensated sums, not results of a Legendre transform at each end."""
-    return subject.method.symplectic or subject.method.specification().get("form") == "phase-space"
+    return tested.method.symplectic or tested.method.specification().get("form") == "phase-space"
 
 
-def _carries(subject: Subject) -> bool:
+def _has_compensation(tested: SystemUnderTest) -> bool:
     """Return True if the method has fixed-point iterations or leapfrog steps, which use the compensation."""
-    forms = forms_of(subject.moved)
-    leaps = bool(subject.method.fractions) and (forms.separable or forms.split)
-    return leaps or subject.stepper.interface.has_fallback
+    forms = forms_of(tested.moved)
+    leaps = bool(tested.method.fractions) and (forms.separable or forms.split)
+    return leaps or tested.stepper.interface.has_fallback
 
 
-def _steppers(subject: Subject) -> tuple[Stepper, ...]:
-    newton = subject.newton
-    return (subject.stepper,) if newton is None or newton is subject.stepper else (subject.stepper, newton)
+def _steppers(tested: SystemUnderTest) -> tuple[Stepper, ...]:
+    newton = tested.newton
+    return (tested.stepper,) if newton is None or newton is tested.stepper else (tested.stepper, newton)
 
 
 def _advanced(
-    subject: Subject, stepper: Stepper, state: State, steps: int, carry: Array | None = None
+    tested: SystemUnderTest, stepper: Stepper, state: State, steps: int, carry: Array | None = None
 ) -> tuple[Array, Array]:
     """Return (2m,) the final state of a run started with compensation terms, and (2m,) its compensation terms."""
-    run = stepper.start(state.q, state.p, h=state.h, t=state.t, parameters=subject.parameters)
+    run = stepper.start(state.q, state.p, h=state.h, t=state.t, parameters=tested.parameters)
     if carry is not None:
         run._resume_at(0, (state.t, 0.0), (carry[: len(state.q)], carry[len(state.q) :]))
     run.advance(steps)
     return np.concatenate([run.q, run.p]), np.concatenate(run._compensation)
 
 
-def _sums(subject: Subject) -> Finding:
-    first = subject.states[0]
+def _sums(tested: SystemUnderTest) -> Finding:
+    first = tested.states[0]
     m, worst = len(first.q), 0.0
-    kept = slice(None) if _compensated(subject) else slice(m)
-    for stepper in _steppers(subject):
+    kept = slice(None) if _compensated(tested) else slice(m)
+    for stepper in _steppers(tested):
         short = State(first.q, first.p, first.t, first.h * SHORT)
         whole = State(first.q, first.p, first.t, short.h * SHORT_STEPS)
-        ways = [_advanced(subject, stepper, *way) for way in ((short, SHORT_STEPS), (whole, 1))]
+        ways = [_advanced(tested, stepper, *way) for way in ((short, SHORT_STEPS), (whole, 1))]
         moved, expected = ((end - first.z + carry)[kept] for end, carry in ways)
         for part in (slice(m), slice(m, None)):
             size = np.abs(expected[part]).max(initial=0.0)
@@ -117,60 +117,62 @@ def _sums(subject: Subject) -> Finding:
     return Finding(worst, LOST, "relative")
 
 
-def _long_carry(state: State, scales: Array) -> Array:
-    carry: Array = LONG_CARRY * scales * np.cos(1.0 + 2.0 * np.arange(len(state.z)))
+def _large_compensation(state: State, scales: Array) -> Array:
+    carry: Array = LARGE_COMPENSATION * scales * np.cos(1.0 + 2.0 * np.arange(len(state.z)))
     return carry
 
 
-def _low_parts(subject: Subject) -> Finding | None:
+def _low_words(tested: SystemUnderTest) -> Finding | None:
     """Compare runs from one state split differently into high and low word; Newton's method ignores the low word."""
-    if not (_carries(subject) and _compensated(subject)):
+    if not (_has_compensation(tested) and _compensated(tested)):
         return None
-    state, m = subject.states[0], len(subject.given.q)
-    carry = _long_carry(state, subject.scales(state))
+    state, m = tested.states[0], len(tested.given.q)
+    carry = _large_compensation(state, tested.scales(state))
     whole = state.z + carry
     rest = (state.z - whole) + carry
     state, joined = (State(z[:m], z[m:], state.t, SHORTER * state.h) for z in (state.z, whole))
-    ways = ((state, CARRIED_STEPS, carry), (joined, CARRIED_STEPS, rest))
-    (end, low), (other, other_low) = (_advanced(subject, subject.stepper, *way) for way in ways)
-    scales = subject.scales(state)
-    apart, moved = np.abs((end - other) + (low - other_low)) / scales, np.abs(end - state.z) / scales
+    ways = ((state, COMPENSATED_STEPS, carry), (joined, COMPENSATED_STEPS, rest))
+    (end, low), (other, other_low) = (_advanced(tested, tested.stepper, *way) for way in ways)
+    scales = tested.scales(state)
+    difference, moved = np.abs((end - other) + (low - other_low)) / scales, np.abs(end - state.z) / scales
     return Finding(
-        float(apart.max() / (LONG_CARRY * moved.max())), FORGOTTEN, "relative to the effect of a large compensation"
+        float(difference.max() / (LARGE_COMPENSATION * moved.max())),
+        MAX_LOSS,
+        "relative to the effect of a large compensation",
     )
 
 
-def _ensemble(subject: Subject) -> Finding | None:
+def _ensemble(tested: SystemUnderTest) -> Finding | None:
     """Compare SIMD lanes with different states with single runs, for ordinary and very small steps."""
-    if subject.stepper.ensemble is None:
+    if tested.stepper.ensemble is None:
         return None
-    first, worst = subject.states[0], 0.0
-    scales = subject.scales(first)
+    first, worst = tested.states[0], 0.0
+    scales = tested.scales(first)
     for h, steps, unit in (
-        (first.h, CARRIED_STEPS, ROUNDINGS * (subject.rounding(first) + LONG_CARRY**2 * scales)),
+        (first.h, COMPENSATED_STEPS, ROUNDINGS * (tested.rounding(first) + LARGE_COMPENSATION**2 * scales)),
         (first.h * SHORT, SHORT_STEPS, LOST * SHORT_STEPS * SHORT * scales),
     ):
         state = State(first.q, first.p, first.t, h)
-        carry = _long_carry(state, scales) if h == first.h else np.zeros_like(scales)
-        starts = [_beside(state, scales, lane) for lane in range(LANES)]
-        found = _lanes(subject, starts, steps, carry)
-        for start, (end, low) in zip(starts, found, strict=False):  # a block may have fewer lanes
-            other, other_low = _advanced(subject, subject.stepper, start, steps, carry)
-            apart = np.abs((end - other) + (low - other_low))
-            worst = max(worst, float(np.max(apart / unit)))
+        carry = _large_compensation(state, scales) if h == first.h else np.zeros_like(scales)
+        starts = [_perturbed(state, scales, lane) for lane in range(LANES)]
+        result = _lanes(tested, starts, steps, carry)
+        for start, (end, low) in zip(starts, result, strict=False):  # a block may have fewer lanes
+            other, other_low = _advanced(tested, tested.stepper, start, steps, carry)
+            difference = np.abs((end - other) + (low - other_low))
+            worst = max(worst, float(np.max(difference / unit)))
     return Finding(worst, 1.0, f"in units of {ROUNDINGS:g} roundings, lanes with different states")
 
 
-def _beside(state: State, scales: Array, lane: int) -> State:
+def _perturbed(state: State, scales: Array, lane: int) -> State:
     z, m = state.z + 1e-3 * lane * scales * np.sin(1.0 + np.arange(len(scales))), len(state.q)
     return State(z[:m], z[m:], state.t, state.h)
 
 
-def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> Iterator[tuple[Array, Array]]:
+def _lanes(tested: SystemUnderTest, starts: list[State], steps: int, carry: Array) -> Iterator[tuple[Array, Array]]:
     """Yield final state and compensation terms of each lane, as :func:`_advanced`."""
     q, p = (np.array([getattr(start, name) for start in starts]) for name in "qp")
     first, m = starts[0], len(carry) // 2
-    work = Ensemble(subject.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=subject.parameters)
+    work = Ensemble(tested.stepper, q, p, h=first.h, steps=steps, t=first.t, parameters=tested.parameters)
     make, width = work.blocks()
     block = make(0)
     assert isinstance(block, LaneBlock)
@@ -178,7 +180,7 @@ def _lanes(subject: Subject, starts: list[State], steps: int, carry: Array) -> I
     block.lanes("carry_p")[:] = carry[m:, None]
     block.advance(steps)
     if block.left:
-        raise BrokenError("single runs succeed, SIMD lanes fail")
+        raise ViolationError("single runs succeed, SIMD lanes fail")
     low = np.concatenate([block.lanes(name) for name in ("carry_q", "carry_p")])
     for lane in range(min(width, len(starts))):
         yield np.concatenate([work.q[-1, lane], work.p[-1, lane]]), low[:, lane]
@@ -192,13 +194,13 @@ class _Invariant:
     values: Callable[[Array, Array, float], tuple[Array, Array]]
 
 
-def _invariants(subject: Subject) -> list[_Invariant]:
+def _invariants(tested: SystemUnderTest) -> list[_Invariant]:
     """Return the momentum maps that the method conserves, and the energy if its error per step is below round-off.
 
     Empty unless coefficients have low words or there are none: otherwise increments are rounded, which may cause drift.
     """
-    stepper, parameters, method = subject.stepper, subject.parameters, subject.method
-    exact_sums = _carries(subject) and forms_of(subject.moved).separable and not isinstance(method, SCVI)
+    stepper, parameters, method = tested.stepper, tested.parameters, tested.method
+    exact_sums = _has_compensation(tested) and forms_of(tested.moved).separable and not isinstance(method, SCVI)
     if not (exact_sums and method.symplectic):
         return []
 
@@ -212,16 +214,16 @@ def _invariants(subject: Subject) -> list[_Invariant]:
 
     described = stepper.interface
     exact = [k for k, kept in enumerate(described.map_exact) if kept]
-    found = [_Invariant(described.map_names[k], partial(map_values, k)) for k in exact]
-    return [*found, _Invariant("energy", energies)] if _keeps_energy(subject) else found
+    result = [_Invariant(described.map_names[k], partial(map_values, k)) for k in exact]
+    return [*result, _Invariant("energy", energies)] if _keeps_energy(tested) else result
 
 
-def _keeps_energy(subject: Subject) -> bool:
-    if subject.system.formula.has(subject.system.time):
+def _keeps_energy(tested: SystemUnderTest) -> bool:
+    if tested.system.formula.has(tested.system.time):
         return False
-    state = subject.states[0]
+    state = tested.states[0]
     try:
-        motion, end = subject.motion, subject.solved(0)
+        motion, end = tested.motion, tested.solved(0)
     except StateError:
         return False
     before = motion.energy(numbers(state.q), numbers(state.p), mp.mpf(state.t))
@@ -245,7 +247,7 @@ class _Walk:
         return abs(self.mean) / math.hypot(self.spread, EPSILON / 4) * math.sqrt(self.runs)
 
     @property
-    def sure(self) -> float:
+    def significant(self) -> float:
         """Significant part of the mean, in roundings per step."""
         return max(abs(self.mean) - STUDENT * self.spread / math.sqrt(self.runs), 0.0) / (EPSILON * self.steps)
 
@@ -255,14 +257,14 @@ class _Walk:
         return f"{self.name}, {RUNS} runs of {self.steps} steps"
 
 
-def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Iterator[_Walk]:
+def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Array, Array]]) -> Iterator[_Walk]:
     """Yield the statistics of each invariant."""
-    invariants = _invariants(subject)
+    invariants = _invariants(tested)
     if not invariants:
         return
-    given, m = subject.given, len(subject.given.q)
-    starts = given.z + SPREAD * subject.scales(given) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
-    steps = min(MOST_STEPS, max(FEWEST_STEPS, WORK // m))
+    given, m = tested.given, len(tested.given.q)
+    starts = given.z + SPREAD * tested.scales(given) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
+    steps = min(MAX_STEPS, max(MIN_STEPS, WORK // m))
     end = run(starts[:, :m], starts[:, m:], steps)
     for invariant in invariants:
         before, sizes = invariant.values(starts[:, :m], starts[:, m:], given.t)
@@ -274,40 +276,49 @@ def _walks(subject: Subject, run: Callable[[Array, Array, int], tuple[Array, Arr
         yield _Walk(invariant.name, steps, float(np.mean(changes)), float(np.std(changes, ddof=1)), len(changes))
 
 
-def _runs(subject: Subject, options: SolverOptions | None, q: Array, p: Array, steps: int) -> tuple[Array, Array]:
+def _runs(
+    tested: SystemUnderTest, options: SolverOptions | None, q: Array, p: Array, steps: int
+) -> tuple[Array, Array]:
     """Return the final states of runs, one by one."""
     ends = []
-    given: dict[str, Any] = {"h": subject.given.h, "t": subject.given.t, "parameters": subject.parameters}
+    given: dict[str, Any] = {"h": tested.given.h, "t": tested.given.t, "parameters": tested.parameters}
     for start in zip(q, p, strict=True):
-        own = subject.stepper.start(*start, **given, options=options)
+        own = tested.stepper.start(*start, **given, options=options)
         own.advance(steps)
         ends.append((own.q, own.p))
     return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
 
 
-def _judged(walks: Iterator[_Walk]) -> Finding | None:
+def _largest_student(walks: Iterator[_Walk]) -> Finding | None:
     """Return the largest Student's t."""
     return max((Finding(walk.student, STUDENT, walk.remark) for walk in walks), default=None)
 
 
-def _drift(subject: Subject) -> Finding | None:
-    return _judged(_walks(subject, partial(_runs, subject, TO_REST)))
+def _drift(tested: SystemUnderTest) -> Finding | None:
+    return _largest_student(_walks(tested, partial(_runs, tested, TO_CONVERGENCE)))
 
 
-def _rests(subject: Subject) -> Finding | None:
-    walks = _walks(subject, partial(_runs, subject, None))
-    return max((Finding(walk.sure, LEFT, walk.remark) for walk in walks), default=None)
+def _residual_drift(tested: SystemUnderTest) -> Finding | None:
+    walks = _walks(tested, partial(_runs, tested, None))
+    return max((Finding(walk.significant, MAX_RESIDUAL, walk.remark) for walk in walks), default=None)
 
 
-def _drift_of_lanes(subject: Subject) -> Finding | None:
-    if subject.stepper.ensemble is None:
+def _drift_of_lanes(tested: SystemUnderTest) -> Finding | None:
+    if tested.stepper.ensemble is None:
         return None
 
     def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
-        given = subject.given
-        runs = subject.stepper.integrate_ensemble(
-            q, p, h=given.h, steps=steps, save_every=steps, t=given.t, parameters=subject.parameters, options=TO_REST
+        given = tested.given
+        runs = tested.stepper.integrate_ensemble(
+            q,
+            p,
+            h=given.h,
+            steps=steps,
+            save_every=steps,
+            t=given.t,
+            parameters=tested.parameters,
+            options=TO_CONVERGENCE,
         )
         return runs.q[-1], runs.p[-1]
 
-    return _judged(_walks(subject, run))
+    return _largest_student(_walks(tested, run))

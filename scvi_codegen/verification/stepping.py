@@ -15,9 +15,9 @@ from scvi_codegen.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.verification.certificate import BrokenError, Check, Finding, checked
+from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.linearisation import WEIGHTS
-from scvi_codegen.verification.subject import LARGEST, State, Subject
+from scvi_codegen.verification.system_under_test import MAX_UNKNOWNS, State, SystemUnderTest
 
 __all__ = ["step_checks"]
 
@@ -27,100 +27,100 @@ ROUNDINGS = 16.0
 """Bound on the error of a step, in roundings of the size of the state."""
 ANY_UPDATE = SolverOptions(tolerance=1e300)
 """Solver options that end Newton's method after its first update."""
-SHORTEST_WAY = 1e6
+LEAST_UPDATE = 1e6
 """Least size of the first update in units of rounding, for it to distinguish a wrong matrix."""
-SMALLER, MOST_SWEEPS = 256, 10
+STEP_DIVISOR, MAX_ITERATIONS = 256, 10
 """Divisor of h, and bound on iterations at h/256.
 
 There an error factor proportional to h is at most 2^-8 per iteration: 53 bits take 7, plus a few."""
-MOST_TRIED = 30
+MAX_LIMIT = 30
 """Largest limit on iterations that is tried to reach the fallback solver."""
-RUN_STEPS, LOOKED_AT = 12, (0, 1, 2, 5, 11)
+RUN_STEPS, SAMPLED_STEPS = 12, (0, 1, 2, 5, 11)
 """Length of the run, and the steps of it that are checked; the first ones have no full predictor history."""
 STATIONARY = 1e-25
 TRANSFORM = 1e-11
-SLOPES = 1e-6
-SLOPE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
+DERIVATIVE_BOUND = 1e-6
+DERIVATIVE_WIDTHS = (3e-2, 1e-2, 3e-3, 1e-3)
 
 
-def step_checks(subject: Subject) -> Iterator[Check]:
+def step_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield all checks of this module."""
-    for name, promise, measure in (
-        ("stage equations", "a step solves the paper's equations (60 digits)", _artefact),
+    for name, statement, measure in (
+        ("stage equations", "a step solves the paper's equations (60 digits)", _default_solver),
         ("Newton's solver", "Newton's method alone solves the same equations", _newton),
         ("solvers", "the default solver and Newton's method give the same step", _agree),
         ("Newton's matrix", "its first update is that of the exact Jacobian (finite differences, 60 digits)", _matrix),
         ("fallback", "if the fixed-point iteration fails, Newton's method solves the same equations", _fallback),
         (
             "convergence rate",
-            f"error factor per iteration proportional to h or better (count at h/{SMALLER})",
-            _contraction,
+            f"error factor per iteration proportional to h or better (count at h/{STEP_DIVISOR})",
+            _convergence_rate,
         ),
         ("run", "each step of a run, with its predictor, equals a single step from the same state", _run),
         ("stationarity", "dS = p1 dq1 - p0 dq0 for the discrete action S (finite differences, 60 digits)", _action),
         ("Legendre transform", "momentum, velocity, energy are those of the formula (60 digits)", _transform),
         ("discrete Lagrangian", "p0 and p1 are its derivatives, compiled and by finite differences", _discrete),
     ):
-        yield from checked(name, promise, partial(measure, subject))
+        yield from checked(name, statement, partial(measure, tested))
 
 
-def _artefact(subject: Subject) -> Finding:
-    return _solves(subject, subject.stepper)
+def _default_solver(tested: SystemUnderTest) -> Finding:
+    return _solves(tested, tested.stepper)
 
 
-def _newton(subject: Subject) -> Finding | None:
-    if subject.newton is None or subject.newton is subject.stepper:
+def _newton(tested: SystemUnderTest) -> Finding | None:
+    if tested.newton is None or tested.newton is tested.stepper:
         return None
-    return _solves(subject, subject.newton)
+    return _solves(tested, tested.newton)
 
 
-def _solves(subject: Subject, stepper: Stepper) -> Finding:
+def _solves(tested: SystemUnderTest, stepper: Stepper) -> Finding:
     worst = 0.0
-    for index, state in enumerate(subject.states):
-        expected = subject.solved(index)
+    for index, state in enumerate(tested.states):
+        expected = tested.solved(index)
         try:
-            worst = max(worst, _apart(subject, state, subject.ends(state, stepper), expected))
+            worst = max(worst, _distance(tested, state, tested.ends(state, stepper), expected))
         except StepFailedError as failure:
-            raise BrokenError(f"the equations have a solution, but {failure}") from failure
+            raise ViolationError(f"the equations have a solution, but {failure}") from failure
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
-def _agree(subject: Subject) -> Finding | None:
+def _agree(tested: SystemUnderTest) -> Finding | None:
     """Compare the stepper under test with Newton's method; applies to large systems, too."""
-    if subject.newton is None or subject.newton is subject.stepper:
+    if tested.newton is None or tested.newton is tested.stepper:
         return None
     worst = 0.0
-    for _, state, rounding in subject.roundings():
-        change = np.abs(subject.ends(state) - subject.ends(state, subject.newton))
+    for _, state, rounding in tested.roundings():
+        change = np.abs(tested.ends(state) - tested.ends(state, tested.newton))
         worst = max(worst, float(np.max(change / rounding)))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
-def _apart(subject: Subject, state: State, end: Array, expected: SolvedStep) -> float:
+def _distance(tested: SystemUnderTest, state: State, end: Array, expected: SolvedStep) -> float:
     """Return the largest difference from the step in 60 digits, in units of rounding."""
-    return float(np.max(np.abs(end - _joined(expected).astype(float)) / subject.rounding(state)))
+    return float(np.max(np.abs(end - _joined(expected).astype(float)) / tested.rounding(state)))
 
 
 def _joined(step: SolvedStep) -> Numbers:
     return np.array([*step.q, *step.p], dtype=object)
 
 
-def _matrix(subject: Subject) -> Finding | None:
+def _matrix(tested: SystemUnderTest) -> Finding | None:
     """Compare the first Newton update from the straight line with the exact one, in units of rounding."""
-    if subject.newton is None:
+    if tested.newton is None:
         return None
-    end = _joined(subject.solved(0))
-    state, equations = subject.states[0], compiled_equations(subject.moved, subject.method)
-    if equations.unknowns > LARGEST:
-        raise StateError(f"{equations.unknowns} unknowns exceed the limit of {LARGEST} in 60 digits")
-    scales = subject.scales(state)
+    end = _joined(tested.solved(0))
+    state, equations = tested.states[0], compiled_equations(tested.moved, tested.method)
+    if equations.unknowns > MAX_UNKNOWNS:
+        raise StateError(f"{equations.unknowns} unknowns exceed the limit of {MAX_UNKNOWNS} in 60 digits")
+    scales = tested.scales(state)
     exact = _joined(equations.first_update(state.q, state.p, state.h, state.t))
-    v = subject.motion.velocity(numbers(state.q), numbers(state.p), mp.mpf(state.t))
+    v = tested.motion.velocity(numbers(state.q), numbers(state.p), mp.mpf(state.t))
     straight = np.concatenate([numbers(state.q) + v * state.h, numbers(state.p)])
-    rounding = float(np.max(subject.rounding(state) / scales))
-    if _size(end - straight, scales) < SHORTEST_WAY * rounding:
+    rounding = float(np.max(tested.rounding(state) / scales))
+    if _size(end - straight, scales) < LEAST_UPDATE * rounding:
         raise StateError("the straight line is the solution")
-    missed = _size(subject.ends(state, subject.newton, ANY_UPDATE) - exact, scales)
+    missed = _size(tested.ends(state, tested.newton, ANY_UPDATE) - exact, scales)
     return Finding(missed / rounding, ROUNDINGS, "in units of rounding")
 
 
@@ -128,63 +128,65 @@ def _size(vector: Numbers, scales: Array) -> float:
     return float(np.max(np.abs(vector.astype(float)) / scales))
 
 
-def _fallback(subject: Subject) -> Finding | None:
+def _fallback(tested: SystemUnderTest) -> Finding | None:
     """Check Newton's method as fallback of the stepper under test, reached with a limit on the iterations."""
-    if subject.newton is None or not subject.stepper.interface.has_fallback:
+    if tested.newton is None or not tested.stepper.interface.has_fallback:
         return None
-    for factor, start in itertools.product((1, 2, 4, 8, 16), subject.states):
+    for factor, start in itertools.product((1, 2, 4, 8, 16), tested.states):
         state = State(start.q, start.p, start.t, factor * start.h)
-        for most in range(3, MOST_TRIED):
+        for most in range(3, MAX_LIMIT):
             try:
-                iterations, end = _counted(subject, state, SolverOptions(max_iterations=most))
+                iterations, end = _counted(tested, state, SolverOptions(max_iterations=most))
             except StepFailedError:
                 continue
             if iterations <= most + 1:  # the sweeps converged
                 break
-            expected = subject.derived()(state.q, state.p, state.h, state.t)
-            return Finding(_apart(subject, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}")
+            expected = tested.derived()(state.q, state.p, state.h, state.t)
+            return Finding(
+                _distance(tested, state, end, expected), ROUNDINGS, f"in units of rounding, h = {state.h:.3g}"
+            )
     raise StateError("the fallback was not reached: the fixed-point iteration converges as fast as Newton's method")
 
 
-def _counted(subject: Subject, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
+def _counted(tested: SystemUnderTest, state: State, options: SolverOptions | None = None) -> tuple[int, Array]:
     """Return the number of iterations of a step, and its end state."""
-    run = subject.stepper.integrate(
-        state.q, state.p, h=state.h, steps=1, t=state.t, parameters=subject.parameters, options=options
+    run = tested.stepper.integrate(
+        state.q, state.p, h=state.h, steps=1, t=state.t, parameters=tested.parameters, options=options
     )
     return int(run.iterations[1]), np.concatenate([run.q[1], run.p[1]])
 
 
-def _contraction(subject: Subject) -> Finding:
-    first = subject.states[0]
+def _convergence_rate(tested: SystemUnderTest) -> Finding:
+    first = tested.states[0]
     try:
-        iterations, _ = _counted(subject, State(first.q, first.p, first.t, first.h / SMALLER))
+        iterations, _ = _counted(tested, State(first.q, first.p, first.t, first.h / STEP_DIVISOR))
     except StepFailedError as failure:
-        raise BrokenError(str(failure)) from failure
-    return Finding(iterations, MOST_SWEEPS)
+        raise ViolationError(str(failure)) from failure
+    return Finding(iterations, MAX_ITERATIONS)
 
 
-def _run(subject: Subject) -> Finding:
+def _run(tested: SystemUnderTest) -> Finding:
     """Compare the steps of a run, with predictor and compensation, with single steps from the same states."""
-    worst = max(_run_of(subject, stepper) for stepper in {subject.stepper, subject.newton or subject.stepper})
+    worst = max(_run_of(tested, stepper) for stepper in {tested.stepper, tested.newton or tested.stepper})
     return Finding(worst, ROUNDINGS, f"in units of rounding, {RUN_STEPS} steps, also with Newton's method alone")
 
 
-def _run_of(subject: Subject, stepper: Stepper) -> float:
-    first, worst = subject.states[0], 0.0
-    run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=subject.parameters)
-    for k in LOOKED_AT:
+def _run_of(tested: SystemUnderTest, stepper: Stepper) -> float:
+    first, worst = tested.states[0], 0.0
+    run = stepper.integrate(first.q, first.p, h=first.h, steps=RUN_STEPS, t=first.t, parameters=tested.parameters)
+    for k in SAMPLED_STEPS:
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
-        change = np.abs(subject.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
-        worst = max(worst, float(np.max(change / subject.rounding(state))))
+        change = np.abs(tested.ends(state) - np.concatenate([run.q[k + 1], run.p[k + 1]]))
+        worst = max(worst, float(np.max(change / tested.rounding(state))))
     return worst
 
 
-def _action(subject: Subject) -> Finding | None:
+def _action(tested: SystemUnderTest) -> Finding | None:
     """Check dS = p1 dq1 - p0 dq0 at the solution: S from L alone, its derivatives by finite differences."""
-    if subject.system.forces or subject.system.damping != 0:
+    if tested.system.forces or tested.system.damping != 0:
         return None
-    state, equations, solved = subject.states[0], subject.derived(), subject.solved(0)
-    slopes = equations.action_slopes(solved, state.q, state.p, state.h, state.t)
+    state, equations, solved = tested.states[0], tested.derived(), tested.solved(0)
+    slopes = equations.action_gradient(solved, state.q, state.p, state.h, state.t)
     if slopes is None:
         return None
     p0, p1 = numbers(state.p), np.array(solved.p, dtype=object)
@@ -196,51 +198,51 @@ def _action(subject: Subject) -> Finding | None:
     return Finding(float(max(map(abs, wrong)) / size), STATIONARY)
 
 
-def _transform(subject: Subject) -> Finding:
-    state, motion, stepper = subject.states[0], subject.motion, subject.stepper
+def _transform(tested: SystemUnderTest) -> Finding:
+    state, motion, stepper = tested.states[0], tested.motion, tested.stepper
     q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
     v, energy = motion.velocity(q, p, t), motion.energy(q, p, t)
-    wrong = [_relative(stepper.velocity(state.q, state.p, state.t, subject.parameters), v)]
+    wrong = [_relative(stepper.velocity(state.q, state.p, state.t, tested.parameters), v)]
     if not motion.hamiltonian:
-        wrong.append(_relative(stepper.momentum(state.q, v.astype(float), state.t, subject.parameters), p))
-    value = stepper.energy(state.q, state.p, state.t, subject.parameters)
+        wrong.append(_relative(stepper.momentum(state.q, v.astype(float), state.t, tested.parameters), p))
+    value = stepper.energy(state.q, state.p, state.t, tested.parameters)
     wrong.append(float(abs(value - energy) / (abs(p) @ abs(v) + abs(energy) or 1)))
     return Finding(max(wrong), TRANSFORM, "relative")
 
 
-def _relative(found: Array, expected: Numbers) -> float:
-    return float(max(abs(found - expected)) / (max(map(abs, expected)) or 1))
+def _relative(result: Array, expected: Numbers) -> float:
+    return float(max(abs(result - expected)) / (max(map(abs, expected)) or 1))
 
 
-def _discrete(subject: Subject) -> Finding | None:
+def _discrete(tested: SystemUnderTest) -> Finding | None:
     """Compare the compiled discrete Legendre transforms with central differences of the discrete Lagrangian."""
-    stepper, state = subject.stepper, subject.states[0]
+    stepper, state = tested.stepper, tested.states[0]
     if not stepper.interface.has_action:
         return None
-    q1, p1 = subject.step(state)
-    arguments = (state.q, q1, state.h, state.t, subject.parameters)
+    q1, p1 = tested.step(state)
+    arguments = (state.q, q1, state.h, state.t, tested.parameters)
     try:
         p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
-        slopes = _slopes_of_action(subject, state, q1)
+        slopes = _action_derivatives(tested, state, q1)
     except StepFailedError as failure:
-        raise BrokenError(f"a curve from q0 to q1 exists, but {failure}") from failure
-    sizes = subject.scales(state)[len(q1) :]
+        raise ViolationError(f"a curve from q0 to q1 exists, but {failure}") from failure
+    sizes = tested.scales(state)[len(q1) :]
     wrong = np.array([*(slopes + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
-    return Finding(float(np.max(np.abs(wrong) / sizes)), SLOPES, "relative")
+    return Finding(float(np.max(np.abs(wrong) / sizes)), DERIVATIVE_BOUND, "relative")
 
 
-def _slopes_of_action(subject: Subject, state: State, q1: Array) -> Array:
+def _action_derivatives(tested: SystemUnderTest, state: State, q1: Array) -> Array:
     """Return (2m,) derivatives of the compiled L_d with respect to (q0, q1), from the widths that agree best."""
     m, both = len(state.q), np.concatenate([state.q, q1])
 
     def action(ends: Array) -> float:
-        return subject.stepper.discrete_lagrangian(ends[:m], ends[m:], state.h, state.t, subject.parameters)
+        return tested.stepper.discrete_lagrangian(ends[:m], ends[m:], state.h, state.t, tested.parameters)
 
-    found: list[Array] = []
-    for width in SLOPE_WIDTHS:
+    result: list[Array] = []
+    for width in DERIVATIVE_WIDTHS:
         moved = width * (np.abs(q1 - state.q).max() or 1.0)
         units = np.eye(2 * m) * moved
         changes = [sum(w * (action(both + k * e) - action(both - k * e)) for k, w in WEIGHTS.items()) for e in units]
-        found.append(np.array(changes) / moved)
-    best = min(range(1, len(found)), key=lambda k: float(np.abs(found[k] - found[k - 1]).max()))
-    return found[best]
+        result.append(np.array(changes) / moved)
+    best = min(range(1, len(result)), key=lambda k: float(np.abs(result[k] - result[k - 1]).max()))
+    return result[best]

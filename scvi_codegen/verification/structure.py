@@ -15,10 +15,10 @@ from scvi_codegen.methods.method import is_conformally_symplectic, is_symplectic
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
-from scvi_codegen.verification.linearisation import Linearised
-from scvi_codegen.verification.subject import EPSILON, State, Subject
+from scvi_codegen.verification.linearisation import Jacobian
+from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
 
-__all__ = ["ROUNDINGS", "largest_step", "momentum_kept", "structure_checks"]
+__all__ = ["ROUNDINGS", "largest_step", "momentum_error", "structure_checks"]
 
 Array = NDArray[np.float64]
 
@@ -27,54 +27,54 @@ SPREAD = 10.0
 """Safety factor of the error of the finite-difference Jacobian over the disagreement of two widths."""
 TOO_ROUGH = 1e-6
 """Noise of the differences above which symplecticity is not judged."""
-STEPS, LOOKED_AT = 1000, 20
+STEPS, SAMPLED_STATES = 1000, 20
 MULTIPLIER_BOUND = 1e-10
 DOUBLINGS, BISECTIONS = 24, 10
-TRIED = 3
+CONSECUTIVE_STEPS = 3
 
 
-def structure_checks(subject: Subject) -> Iterator[Check]:
+def structure_checks(tested: SystemUnderTest) -> Iterator[Check]:
     """Yield the checks that apply to method and system."""
-    if is_symplectic(subject.method, subject.system):
-        promise = "J^T Omega J = Omega, J by finite differences of the compiled step"
-        yield from checked("symplecticity", promise, partial(_symplecticity, subject))
-    elif is_conformally_symplectic(subject.method, subject.system):
-        promise = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
-        yield from checked("conformal symplecticity", promise, partial(_symplecticity, subject))
-    if subject.system.constraints:
-        promise = f"they and their rates are 0 up to round-off at {LOOKED_AT} states of {STEPS} steps"
-        yield from checked("constraints", promise, partial(_constraints, subject))
-        promise = "the compiled multipliers are those of the exact motion (60 digits)"
-        yield from checked("multipliers", promise, partial(_multipliers, subject))
-    if subject.method.symmetric:
-        yield from checked("reversal", "a step with -h undoes the step with h", partial(_reversal, subject))
-    if subject.method.symplectic:
-        described = subject.stepper.interface
+    if is_symplectic(tested.method, tested.system):
+        statement = "J^T Omega J = Omega, J by finite differences of the compiled step"
+        yield from checked("symplecticity", statement, partial(_symplecticity, tested))
+    elif is_conformally_symplectic(tested.method, tested.system):
+        statement = "J^T Omega J = exp(-gamma h) Omega, gamma the damping, J by finite differences of the compiled step"
+        yield from checked("conformal symplecticity", statement, partial(_symplecticity, tested))
+    if tested.system.constraints:
+        statement = f"they and their rates are 0 up to round-off at {SAMPLED_STATES} states of {STEPS} steps"
+        yield from checked("constraints", statement, partial(_constraints, tested))
+        statement = "the compiled multipliers are those of the exact motion (60 digits)"
+        yield from checked("multipliers", statement, partial(_multipliers, tested))
+    if tested.method.symmetric:
+        yield from checked("reversal", "a step with -h undoes the step with h", partial(_reversal, tested))
+    if tested.method.symplectic:
+        described = tested.stepper.interface
         for k, name in enumerate(described.map_names):
             if described.map_exact[k]:
-                promise = "conserved to round-off (symmetry of the system)"
-                yield from checked(name, promise, partial(_momentum, subject, k))
+                statement = "conserved to round-off (symmetry of the system)"
+                yield from checked(name, statement, partial(_momentum, tested, k))
 
 
-def _symplecticity(subject: Subject) -> Finding:
+def _symplecticity(tested: SystemUnderTest) -> Finding:
     worst = Finding(0.0, np.inf)
-    for state in subject.states:
-        around = subject.linearised(state)
+    for state in tested.states:
+        around = tested.linearised(state)
         if around is None:
             raise StateError("steps from neighbouring states fail")
-        shrunk = math.exp(-subject.damping * state.h)
+        shrunk = math.exp(-tested.damping * state.h)
         defect, noise = _defect(around, shrunk)
-        if subject.system.constraints:
-            defect, noise = _along(subject.tangents(state), around, shrunk)
+        if tested.system.constraints:
+            defect, noise = _on_constraint_manifold(tested.tangents(state), around, shrunk)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
         place = np.unravel_index(np.argmax(defect / noise), defect.shape)
-        found = Finding(float(defect[place]), float(noise[place]), "the bound is the noise of the differences")
-        worst = max(worst, found, key=lambda finding: finding.measured / finding.bound)
+        result = Finding(float(defect[place]), float(noise[place]), "the bound is the noise of the differences")
+        worst = max(worst, result, key=lambda finding: finding.measured / finding.bound)
     return worst
 
 
-def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
+def _defect(around: Jacobian, shrunk: float) -> tuple[Array, Array]:
     """Return (2m, 2m) absolute values of J^T Omega J - Omega, and their noise, scaled by the areas of coordinate pairs.
 
     ``shrunk`` is the factor exp(-gamma h) of Omega for a damped system.
@@ -89,7 +89,7 @@ def _defect(around: Linearised, shrunk: float) -> tuple[Array, Array]:
     return np.abs(J.T @ omega @ J - shrunk * omega) / units, (half + half.T) / units
 
 
-def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, Array]:
+def _on_constraint_manifold(tangents: Array, around: Jacobian, shrunk: float) -> tuple[Array, Array]:
     """Return the defect and its noise on the constrained phase space, in units of the areas of its directions."""
     m, scale = len(around.scales) // 2, around.scales
     omega = np.kron([[0, 1], [-1, 0]], np.eye(m)) * np.outer(scale, scale)
@@ -100,72 +100,74 @@ def _along(tangents: Array, around: Linearised, shrunk: float) -> tuple[Array, A
     return np.abs(ends.T @ omega @ ends - shrunk * tangents.T @ omega @ tangents) / unit, (half + half.T) / unit
 
 
-def _constraints(subject: Subject) -> Finding:
+def _constraints(tested: SystemUnderTest) -> Finding:
     """Return the largest constraint residual and its rate along a run, in units of its rounding errors."""
-    first, stepper, parameters = subject.states[0], subject.stepper, subject.held
+    first, stepper, parameters = tested.states[0], tested.stepper, tested.constant_inputs
     q, p = stepper.project(first.q, first.p, t=first.t, parameters=parameters)
     run = stepper.integrate(q, p, h=first.h, steps=STEPS, t=first.t, parameters=parameters)
     worst = 0.0
-    for k in range(0, len(run), STEPS // LOOKED_AT):
+    for k in range(0, len(run), STEPS // SAMPLED_STATES):
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
-        units = EPSILON * np.maximum(np.abs(state.z), subject.scales(state))
-        slopes = np.abs(subject.constraint_slopes(state, units / EPSILON)).sum(axis=1) + _by_time(subject, state)
+        units = EPSILON * np.maximum(np.abs(state.z), tested.scales(state))
+        slopes = np.abs(tested.constraint_derivatives(state, units / EPSILON)).sum(axis=1) + _by_time(tested, state)
         values = np.abs(np.concatenate(stepper.constraint_values(state.q, state.p, state.t, parameters)))
-        said = slopes > 0.0  # a constraint on velocities has no position residual
-        worst = max(worst, float(np.max(values[said] / (EPSILON * slopes[said]))))
+        message = slopes > 0.0  # a constraint on velocities has no position residual
+        worst = max(worst, float(np.max(values[message] / (EPSILON * slopes[message]))))
     return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
 
 
-def _by_time(subject: Subject, state: State) -> Array:
+def _by_time(tested: SystemUnderTest, state: State) -> Array:
     """Return (2c,) changes of constraints and of their rates by a rounding of time, in units of rounding."""
     moment = 1e-5 * (abs(state.t) + abs(state.h))
     values = [
-        np.concatenate(subject.stepper.constraint_values(state.q, state.p, state.t + sign * moment, subject.held))
+        np.concatenate(
+            tested.stepper.constraint_values(state.q, state.p, state.t + sign * moment, tested.constant_inputs)
+        )
         for sign in (1, -1)
     ]
     return np.abs(values[0] - values[1]) / 2e-5
 
 
-def _multipliers(subject: Subject) -> Finding:
+def _multipliers(tested: SystemUnderTest) -> Finding:
     """Compare the compiled Lagrange multipliers with those of the exact motion."""
-    state, motion = subject.states[0], subject.motion
+    state, motion = tested.states[0], tested.motion
     q, p, t = numbers(state.q), numbers(state.p), mp.mpf(state.t)
     v = motion.velocity(q, p, t)
-    found = subject.stepper.multipliers(state.q, state.p, state.t, subject.parameters)
+    result = tested.stepper.multipliers(state.q, state.p, state.t, tested.parameters)
     exact = motion.multipliers(q, v, t)
     size = max(float(max(map(abs, exact))), np.finfo(float).tiny)
-    return Finding(float(np.abs(found - exact.astype(float)).max() / size), MULTIPLIER_BOUND, "relative")
+    return Finding(float(np.abs(result - exact.astype(float)).max() / size), MULTIPLIER_BOUND, "relative")
 
 
-def _reversal(subject: Subject) -> Finding:
+def _reversal(tested: SystemUnderTest) -> Finding:
     worst = 0.0
-    for _, state, rounding in subject.roundings():
-        q, p = subject.step(state)
+    for _, state, rounding in tested.roundings():
+        q, p = tested.step(state)
         back = State(q, p, state.t + state.h, -state.h)
-        noise = subject.rounding(back) + _carried_back(subject, back, rounding)
-        worst = max(worst, float(np.max(np.abs(subject.ends(back) - state.z) / noise)))
+        noise = tested.rounding(back) + _propagated_back(tested, back, rounding)
+        worst = max(worst, float(np.max(np.abs(tested.ends(back) - state.z) / noise)))
     return Finding(worst, ROUNDINGS, "in units of rounding, 2 states")
 
 
-def _carried_back(subject: Subject, back: State, rounding: Array) -> Array:
+def _propagated_back(tested: SystemUnderTest, back: State, rounding: Array) -> Array:
     """Return the bound on the rounding errors of the forward step after the backward step."""
-    around = subject.linearised(back)
-    return rounding if around is None else around.carried(rounding)
+    around = tested.linearised(back)
+    return rounding if around is None else around.propagated(rounding)
 
 
-def _momentum(subject: Subject, k: int) -> Finding:
+def _momentum(tested: SystemUnderTest, k: int) -> Finding:
     """Measure the change of the k-th momentum map along a run."""
-    given, stepper = subject.given, subject.stepper
+    given, stepper = tested.given, tested.stepper
     try:
         run = stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t, parameters=stepper.defaults)
     except StepFailedError as failure:
         run = Trajectory.before(failure)
-        if len(run) <= TRIED:
+        if len(run) <= CONSECUTIVE_STEPS:
             raise
-    return momentum_kept(run, k, f" of {given.h:g}")
+    return momentum_error(run, k, f" of {given.h:g}")
 
 
-def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
+def momentum_error(run: Trajectory, k: int, such: str = "") -> Finding:
     """Return the largest relative change of the k-th momentum map along a run, with its random-walk bound."""
     steps = len(run) - 1
     bound = ROUNDINGS * EPSILON * float(np.sqrt(steps))
@@ -173,14 +175,16 @@ def momentum_kept(run: Trajectory, k: int, such: str = "") -> Finding:
     return Finding(error, bound, f"relative, {steps} steps{such}")
 
 
-def largest_step(subject: Subject) -> Check:
+def largest_step(tested: SystemUnderTest) -> Check:
     """Return the largest step size at which the stage equations are solved three times in a row, by bisection."""
-    name, what = "largest step", f"largest h at which {TRIED} steps in a row are solved"
-    given = subject.states[0]
+    name, what = "largest step", f"largest h at which {CONSECUTIVE_STEPS} steps in a row are solved"
+    given = tested.states[0]
 
     def usable(h: float) -> bool:
         try:
-            subject.stepper.integrate(given.q, given.p, h=h, steps=TRIED, t=given.t, parameters=subject.parameters)
+            tested.stepper.integrate(
+                given.q, given.p, h=h, steps=CONSECUTIVE_STEPS, t=given.t, parameters=tested.parameters
+            )
         except StepFailedError:
             return False
         return True

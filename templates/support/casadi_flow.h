@@ -8,15 +8,15 @@ enum {
 };
 
 /* Sparsity patterns: dense (rows, columns, 1), or empty for arguments that a derivative does not depend on. */
-static const casadi_int GIVEN_SHAPE[] = {GIVEN, 1, 1};
+static const casadi_int INPUT_SHAPE[] = {STEP_INPUTS, 1, 1};
 static const casadi_int STATES_SHAPE[] = {FLOW_STATE, FLOW_COLUMNS, 1};
-static const casadi_int JACOBIAN_SHAPE[] = {FLOW_STATE * FLOW_COLUMNS, GIVEN, 1};
+static const casadi_int JACOBIAN_SHAPE[] = {FLOW_STATE * FLOW_COLUMNS, STEP_INPUTS, 1};
 static const casadi_int NO_STATES_SHAPE[2 + FLOW_COLUMNS + 1] = {FLOW_STATE, FLOW_COLUMNS};
 
 /* Calls the flow. A NULL result is not computed; a NULL argument counts as 0. */
 static int external_flow(flow_part part, int count, const double *x, const double *given, double *found)
 {
-  flow_way way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = count};
+  flow_call way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = count};
   solver_report report;
   return found && flow_rows(part, &way, 1, x, given, found, &report) != OK;
 }
@@ -39,7 +39,7 @@ casadi_int EXTERNAL(, _n_out)(void)
 
 const casadi_int *EXTERNAL(, _sparsity_in)(casadi_int i)
 {
-  return i == 0 ? GIVEN_SHAPE : NULL;
+  return i == 0 ? INPUT_SHAPE : NULL;
 }
 
 const casadi_int *EXTERNAL(, _sparsity_out)(casadi_int i)
@@ -50,11 +50,11 @@ const casadi_int *EXTERNAL(, _sparsity_out)(casadi_int i)
 /* Jacobian, by columns: the JVPs of the unit vectors. */
 int EXTERNAL(jac_, )(const double **arg, double **res, casadi_int *iw, double *w, int mem)
 {
-  double each[GIVEN * GIVEN] = {0};
+  double each[STEP_INPUTS * STEP_INPUTS] = {0};
   (void)iw, (void)w, (void)mem;
-  for (int i = 0; i < GIVEN; i++)
-    each[i * GIVEN + i] = 1;
-  return external_flow(FLOW_PUSH, GIVEN, arg[0], each, res[0]);
+  for (int i = 0; i < STEP_INPUTS; i++)
+    each[i * STEP_INPUTS + i] = 1;
+  return external_flow(FLOW_JVP, STEP_INPUTS, arg[0], each, res[0]);
 }
 
 casadi_int EXTERNAL(jac_, _n_in)(void)
@@ -69,7 +69,7 @@ casadi_int EXTERNAL(jac_, _n_out)(void)
 
 const casadi_int *EXTERNAL(jac_, _sparsity_in)(casadi_int i)
 {
-  return i == 0 ? GIVEN_SHAPE : i == 1 ? NO_STATES_SHAPE
+  return i == 0 ? INPUT_SHAPE : i == 1 ? NO_STATES_SHAPE
                                        : NULL;
 }
 
@@ -83,8 +83,8 @@ int EXTERNAL(adj1_, )(const double **arg, double **res, casadi_int *iw, double *
 {
   (void)iw, (void)w, (void)mem;
   if (!arg[2] && res[0])
-    memset(res[0], 0, sizeof(double) * GIVEN);
-  return arg[2] && external_flow(FLOW_PULL, 1, arg[0], arg[2], res[0]);
+    memset(res[0], 0, sizeof(double) * STEP_INPUTS);
+  return arg[2] && external_flow(FLOW_VJP, 1, arg[0], arg[2], res[0]);
 }
 
 casadi_int EXTERNAL(adj1_, _n_in)(void)
@@ -99,12 +99,12 @@ casadi_int EXTERNAL(adj1_, _n_out)(void)
 
 const casadi_int *EXTERNAL(adj1_, _sparsity_in)(casadi_int i)
 {
-  return i == 0 ? GIVEN_SHAPE : i == 1 ? NO_STATES_SHAPE
+  return i == 0 ? INPUT_SHAPE : i == 1 ? NO_STATES_SHAPE
       : i == 2                         ? STATES_SHAPE
                                        : NULL;
 }
 
 const casadi_int *EXTERNAL(adj1_, _sparsity_out)(casadi_int i)
 {
-  return i == 0 ? GIVEN_SHAPE : NULL;
+  return i == 0 ? INPUT_SHAPE : NULL;
 }

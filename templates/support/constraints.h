@@ -5,10 +5,10 @@
  * (Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. VII.1). Requires: legendre.h, newton.h, the kernels
  * constraints and constrained_motion, and CONSTRAINT_ENTRY, the indices of the entries of G = g_q or A. */
 
-#define MOST_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
+#define MAX_PROJECTIONS 100 /* Gauss-Newton iterations; more indicate that no state is near */
 #define MOMENTUM_PROJECTIONS 3 /* one suffices except for rounding and non-quadratic kinetic energies */
-#define SETTLED REAL(1e-6) /* relative to the state: accepted size of the last update where rounding prevents a smaller
-                            * residual */
+/* relative to the state: accepted size of the last update where rounding prevents a smaller residual */
+#define ACCEPTED_UPDATE REAL(1e-6)
 
 /* Factors of the saddle-point matrix [L_vv, G^T; G, 0] of a state, and a right-hand side. */
 typedef struct {
@@ -34,9 +34,10 @@ static int factorise_saddle(real t, const real *u, const real *parameters, const
   constraints(u, t, parameters, g, slope);
   memset(at->matrix, 0, sizeof(real) * band_size(&shape));
   for (int e = 0; e < MASS_ENTRIES; e++)
-    at->matrix[shape.first + PLACE[MASS_ENTRY[e][1]] * shape.stride + PLACE[MASS_ENTRY[e][0]]] = mass[e];
+    at->matrix[shape.first + POSITION_IN_MATRIX[MASS_ENTRY[e][1]] * shape.stride +
+        POSITION_IN_MATRIX[MASS_ENTRY[e][0]]] = mass[e];
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
-    const int row = PLACE[M + CONSTRAINT_ENTRY[e][0]], column = PLACE[CONSTRAINT_ENTRY[e][1]];
+    const int row = POSITION_IN_MATRIX[M + CONSTRAINT_ENTRY[e][0]], column = POSITION_IN_MATRIX[CONSTRAINT_ENTRY[e][1]];
     at->matrix[shape.first + column * shape.stride + row] = slope[e];
     at->matrix[shape.first + row * shape.stride + column] = slope[e];
   }
@@ -50,14 +51,14 @@ static void solve_saddle(const saddle *at, const real *a, const real *b, real *x
 {
   const band shape = band_of(SITES, 1);
   for (int i = 0; i < M; i++)
-    at->x[PLACE[i]] = a ? a[i] : 0;
+    at->x[POSITION_IN_MATRIX[i]] = a ? a[i] : 0;
   for (int k = 0; k < CONSTRAINTS; k++)
-    at->x[PLACE[M + k]] = b[k];
+    at->x[POSITION_IN_MATRIX[M + k]] = b[k];
   back_substitute(at->matrix, &shape, at->pivot, at->x);
   for (int i = 0; i < M; i++)
-    x[i] = at->x[PLACE[i]];
+    x[i] = at->x[POSITION_IN_MATRIX[i]];
   for (int k = 0; k < CONSTRAINTS; k++)
-    y[k] = at->x[PLACE[M + k]];
+    y[k] = at->x[POSITION_IN_MATRIX[M + k]];
 }
 
 static real largest_of(const real *x)
@@ -113,7 +114,7 @@ static int project_position(real t, real *u, const real *parameters, const saddl
   real g[CONSTRAINTS], y[CONSTRAINTS], update[M], nearest[M];
   real left = misfit(t, u, parameters, g);
   memcpy(nearest, u, sizeof nearest);
-  for (int k = 0; k < MOST_PROJECTIONS; k++) {
+  for (int k = 0; k < MAX_PROJECTIONS; k++) {
     const int status = factorise_saddle(t, u, parameters, at, g);
     real scale = 1, size, now;
     if (status != OK)
@@ -132,7 +133,7 @@ static int project_position(real t, real *u, const real *parameters, const saddl
     } while (!(now < left) && scale * size > REAL_EPSILON * largest_of(nearest));
     if (!(now < left)) {
       memcpy(u, nearest, sizeof nearest);
-      return size <= SETTLED * largest_of(nearest) ? OK : NOT_CONVERGED;
+      return size <= ACCEPTED_UPDATE * largest_of(nearest) ? OK : NOT_CONVERGED;
     }
     if (size <= REAL_EPSILON * largest_of(nearest))
       return OK;

@@ -15,7 +15,7 @@ static inline void take_step(run_memory *run, trial *now)
     run->guess = 0;
   } else {
     add_to_time(&now->at.t, &now->at.t_low, now->step.h);
-    choose_length(run, now);
+    choose_size(run, now);
   }
   run->step++;
 }

@@ -1,5 +1,5 @@
 /* Trial of an adaptive step by Newton's method. Requires: run.h, newton_solver.h, stage_error.h. Include before
- * rungs.h. */
+ * step_size_levels.h. */
 #define HOT static
 #define SHORT_STEPS_FAIL 0
 

@@ -1,7 +1,8 @@
-/* Integrals along a step solved by fixed-point iteration. Requires: coupled_sweep.h, the kernel integrand_lanes. */
+/* Integrals along a step solved by fixed-point iteration. Requires: coupled_iteration.h, the kernel integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities, which `memory` contains. */
-static inline void integrals_of_sweep(const step_data *step, const sweep_data *data, const double *memory, double *sum)
+static inline void integrals_of_sweep(const step_data *step, const iteration_data *data, const double *memory,
+    double *sum)
 {
   lanes z[GROUPS][M], scaled[GROUPS][M], u[2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];
   lanes_load(memory, z);

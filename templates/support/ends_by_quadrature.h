@@ -2,9 +2,9 @@
  * curve_points.h, the tables of the contributions of the points to p0 and p1, the kernel action_lanes. */
 typedef struct {
   lanes start, end; /* h times the weights of forces */
-} sweep_data;
+} iteration_data;
 
-static void prepare_sweep(const step_data *step, sweep_data *data)
+static void prepare_iteration(const step_data *step, iteration_data *data)
 {
   data->start = step->h * START_FORCE;
   data->end = step->h * END_FORCE;
@@ -19,7 +19,7 @@ static inline void act(const step_data *step, const curve_data *curve, lanes *ac
 }
 
 /* Corrects the initial velocity; returns the squared relative change. */
-static inline double correct_start(const step_data *step, const sweep_data *data, const lanes *mass,
+static inline double correct_start(const step_data *step, const iteration_data *data, const lanes *mass,
     const double *inverse_size, curve_data *curve)
 {
   lanes action[2 * M];
@@ -32,7 +32,7 @@ static inline double correct_start(const step_data *step, const sweep_data *data
 }
 
 /* p1 - p0 of a curve. */
-static inline void momentum_increment(const step_data *step, const sweep_data *data, const curve_data *curve,
+static inline void momentum_increment(const step_data *step, const iteration_data *data, const curve_data *curve,
     const double *dq, double *dp)
 {
   lanes action[2 * M];

@@ -2,15 +2,15 @@
  * Requires: curve.h. */
 typedef struct {
   int unused;
-} sweep_data;
+} iteration_data;
 
-static void prepare_sweep(const step_data *step, sweep_data *data)
+static void prepare_iteration(const step_data *step, iteration_data *data)
 {
   (void)step;
   data->unused = 0;
 }
 
-static inline double correct_start(const step_data *step, const sweep_data *data, const lanes *mass,
+static inline double correct_start(const step_data *step, const iteration_data *data, const lanes *mass,
     const double *inverse_size, curve_data *curve)
 {
   (void)step, (void)data, (void)mass, (void)inverse_size, (void)curve;
@@ -18,7 +18,8 @@ static inline double correct_start(const step_data *step, const sweep_data *data
 }
 
 /* p1 - p0, with p1 the momentum at the end of a curve with the increment dq; NaN if it is undefined. */
-static void momentum_increment(const step_data *step, const sweep_data *data, const curve_data *curve, const double *dq,
+static void momentum_increment(const step_data *step, const iteration_data *data, const curve_data *curve,
+    const double *dq,
     double *dp)
 {
   double u[2 * M];

@@ -17,7 +17,7 @@ enum {
 #define EVENT_TIE 0x1p-30 /* relative to the step: closer crossings may coincide */
 #define EVENT_AT_ZERO (16.0 * DBL_EPSILON) /* relative to the range of a function on a step: residual of a located
                                             * zero */
-#define EVENT_AT_REST (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
+#define EVENT_UNCHANGED (4.0 * DBL_EPSILON) /* relative to the range of a function on a step: a change that may be
                                            * rounding */
 #define EVENT_SMALL_PART 0.03 /* a polynomial whose error estimate is less than this part of its range is accepted */
 #define EVENT_STEEPNESS 8.0 /* a zero is simple if the derivative exceeds so many error estimates */
@@ -75,7 +75,7 @@ static int take_sample(const event_step *step, real fraction, event_sample *samp
   const int status = NAME(step)(step->t, fraction * step->h, step->q, step->p, step->parameters, step->options,
       sample->q, sample->p, &own, step->workspace);
   sample->fraction = fraction;
-  sample->t = step->t + part_lasts(fraction * step->h, &own);
+  sample->t = step->t + duration_of_part(fraction * step->h, &own);
   step->report->iterations += own.iterations;
   step->report->change = own.change;
   return status == OK ? evaluate_functions(step, sample) : status;
@@ -145,7 +145,7 @@ static real nearer_middle(real a, real b)
 
 /* Abscissa, nearest to the middle, where the sign of the polynomial c or the simplicity of a zero is uncertain, or 2 if
  * there is none; also returns the extrema, ascending. */
-static real doubtful_place(const real *c, real doubt, real *extrema, int *count)
+static real uncertain_abscissa(const real *c, real doubt, real *extrema, int *count)
 {
   real derivative[EVENT_DEGREE], zeros[EVENT_DEGREE], place = 2.0;
   const int zero_count = polynomial_crossings(c, EVENT_DEGREE, zeros);
@@ -260,7 +260,7 @@ static int search_part(const event_step *step, int e, const event_sample *left, 
   follows = doubt <= EVENT_SMALL_PART * range;
   if (fabs(c[0]) > range + (follows ? doubt : range))
     return status; /* far from zero */
-  split = doubtful_place(c, doubt, extrema, &count);
+  split = uncertain_abscissa(c, doubt, extrema, &count);
   if (split < 1.0 || !follows)
     split = split > 1.0 ? 0.0 : fmin(fmax(split, -0.5), 0.5);
   for (int i = 0; i <= count; i++) {
@@ -361,7 +361,7 @@ static int leave_zero(const event_step *step, int e, const event_sample *left, r
     return OK;
   }
   sign = change > 0.0 ? 1 : -1;
-  if (fabs(change) <= EVENT_AT_REST * range + 4.0 * doubt || sign * left->g[e] > 0.0)
+  if (fabs(change) <= EVENT_UNCHANGED * range + 4.0 * doubt || sign * left->g[e] > 0.0)
     return OK;
   for (; place >= EVENT_LAST_PROBE; place -= 2) {
     status = take_sample(step, ldexp(1.0, -place), &next);
@@ -422,7 +422,7 @@ static int ends_search(event_watch *watch, const event_crossing *crossing)
 
 /* After the crossing that ends the search, keeps those of other functions that have already changed sign at its state:
  * a search from there would not find them. */
-static int keep_ties(const event_step *step, long long last)
+static int keep_coincident(const event_step *step, long long last)
 {
   const long long filled = *step->filled;
   const event_crossing end = step->found[last];
@@ -457,7 +457,7 @@ static int settle_crossings(const event_step *step, long long first)
     }
   for (long long i = first; i < *step->filled; i++)
     if (ends_search(step->watch, step->found + i))
-      return keep_ties(step, i);
+      return keep_coincident(step, i);
   return OK;
 }
 

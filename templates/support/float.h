@@ -10,5 +10,6 @@ typedef float real;
                            * itself */
 #define ALL 1 /* the same if the state is to be accurate as a whole */
 #define DECAY 0.1f /* ratio of successive coefficients of a curve that is resolved to some digits */
-#define VANISHING 1e-10f /* relative to t, which has two words: steps below it indicate a singularity of the motion */
+/* relative to t, which has two words: steps below it indicate a singularity of the motion */
+#define SMALLEST_RELATIVE_STEP 1e-10f
 #define ROUNDOFF_LEVEL 1e-4f /* relative updates below it may be rounding errors: 1000 times those of a sum */

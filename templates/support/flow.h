@@ -1,5 +1,5 @@
 /* Flow of many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every
- * `every` steps, with JVPs and VJPs along it. Requires: run.h, push_and_pull.h. */
+ * `every` steps, with JVPs and VJPs along it. Requires: run.h, jvp_and_vjp.h. */
 #include <stdlib.h>
 
 #define FLOW_SAME_STATE 1e-6 /* relative to the largest number of this state and the previous one: a spurious solution
@@ -7,15 +7,15 @@
 
 enum {
   FLOW_STATE = 2 * M,
-  FLOW_PIECE = 64, /* steps per chunk, for whose vectors there is memory */
+  FLOW_CHUNK = 64, /* steps per chunk, for whose vectors there is memory */
   FLOW_NO_MEMORY = 6
 };
 
 /* Results of a flow: states; tangent vectors of the states (JVP); gradients with respect to the inputs (VJP). */
 typedef enum {
   FLOW_STATES,
-  FLOW_PUSH,
-  FLOW_PULL
+  FLOW_JVP,
+  FLOW_VJP
 } flow_part;
 
 /* Parameters of the evaluation of a row, and its memory. */
@@ -24,41 +24,41 @@ typedef struct {
   int count; /* tangent or adjoint vectors at a time */
   real *states; /* (steps + 1, FLOW_STATE) */
   real *t, *h, *q, *p, *q1, *p1; /* of the steps of a chunk */
-  real *vectors; /* (FLOW_PIECE + 1, count, GIVEN) */
+  real *vectors; /* (FLOW_CHUNK + 1, count, STEP_INPUTS) */
   real *workspace;
-} flow_way;
+} flow_call;
 
-static long long kept_states(const flow_way *way)
+static long long kept_states(const flow_call *way)
 {
   return way->steps / way->every + 1;
 }
 
 /* Allocates the memory, to be freed at way->workspace; returns 0 if there is none. Intermediate states are stored only
  * for derivatives. */
-static int make_way(flow_way *way)
+static int allocate_flow(flow_call *way)
 {
-  const size_t work = STATUS(LINEARISED_WORKSPACE), piece = (size_t)FLOW_PIECE * (2 + 4 * M);
-  const size_t vectors = (size_t)(FLOW_PIECE + 1) * (size_t)way->count * GIVEN;
+  const size_t work = STATUS(LINEARISED_WORKSPACE), piece = (size_t)FLOW_CHUNK * (2 + 4 * M);
+  const size_t vectors = (size_t)(FLOW_CHUNK + 1) * (size_t)way->count * STEP_INPUTS;
   const size_t states = way->count ? ((size_t)way->steps + 1) * FLOW_STATE : 0;
   real *place = malloc(sizeof(real) * (work + piece + vectors + states));
   way->workspace = place;
   way->t = place + work;
-  way->h = way->t + FLOW_PIECE;
-  way->q = way->h + FLOW_PIECE;
-  way->p = way->q + FLOW_PIECE * M;
-  way->q1 = way->p + FLOW_PIECE * M;
-  way->p1 = way->q1 + FLOW_PIECE * M;
-  way->vectors = way->p1 + FLOW_PIECE * M;
+  way->h = way->t + FLOW_CHUNK;
+  way->q = way->h + FLOW_CHUNK;
+  way->p = way->q + FLOW_CHUNK * M;
+  way->q1 = way->p + FLOW_CHUNK * M;
+  way->p1 = way->q1 + FLOW_CHUNK * M;
+  way->vectors = way->p1 + FLOW_CHUNK * M;
   way->states = way->vectors + vectors;
   return place != NULL;
 }
 
 /* Computes the states after every `every` steps from x, starting with x itself. On failure returns the status of the
  * step, and report->steps is the number of completed ones. */
-static int follow(const flow_way *way, const real *x, long long every, real *states, solver_report *report)
+static int follow(const flow_call *way, const real *x, long long every, real *states, solver_report *report)
 {
   run_memory run;
-  NAME(start)(&run, x[GIVEN_H - 1], x[GIVEN_H], x, x + M);
+  NAME(start)(&run, x[INPUT_H - 1], x[INPUT_H], x, x + M);
   memcpy(states, x, sizeof(real) * FLOW_STATE);
   for (long long done = 0; done < way->steps; done += every) {
     int iterations, status;
@@ -83,7 +83,7 @@ static real largest(const real *x, int n)
 }
 
 /* Index of the first step of a chunk whose recomputation does not reproduce its end, or the number of steps. */
-static int first_stray(const flow_way *way, const real *states, int length)
+static int first_mismatch(const flow_call *way, const real *states, int length)
 {
   for (int k = 0; k < length; k++, states += FLOW_STATE) {
     real off[FLOW_STATE];
@@ -98,122 +98,123 @@ static int first_stray(const flow_way *way, const real *states, int length)
 }
 
 /* Number of steps of the chunk after those done. */
-static int piece_after(const flow_way *way, long long done)
+static int chunk_size_after(const flow_call *way, long long done)
 {
-  return (int)(way->steps - done < FLOW_PIECE ? way->steps - done : FLOW_PIECE);
+  return (int)(way->steps - done < FLOW_CHUNK ? way->steps - done : FLOW_CHUNK);
 }
 
 /* Fills in the start states of the steps of a chunk. */
-static void place_piece(const flow_way *way, const real *x, long long done, int length)
+static void fill_chunk(const flow_call *way, const real *x, long long done, int length)
 {
   const real *states = way->states + done * FLOW_STATE;
   for (int k = 0; k < length; k++) {
-    way->t[k] = x[GIVEN_H - 1] + (real)(done + k) * x[GIVEN_H];
-    way->h[k] = x[GIVEN_H];
+    way->t[k] = x[INPUT_H - 1] + (real)(done + k) * x[INPUT_H];
+    way->h[k] = x[INPUT_H];
     memcpy(way->q + k * M, states + k * FLOW_STATE, sizeof(real) * M);
     memcpy(way->p + k * M, states + k * FLOW_STATE + M, sizeof(real) * M);
   }
 }
 
 /* Propagates the vectors over a chunk of steps; STRAYED if a recomputed step differs. */
-static int carry_piece(const flow_way *way, const real *x, long long done, int length, int back, solver_report *report)
+static int propagate_chunk_of_steps(const flow_call *way, const real *x, long long done, int length, int back,
+    solver_report *report)
 {
-  int status, stray;
-  place_piece(way, x, done, length);
+  int status, mismatch;
+  fill_chunk(way, x, done, length);
   status = NAME(linearise)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, back, way->count, way->vectors,
       way->q1, way->p1, report, way->workspace);
   if (status != OK) {
     report->steps = back ? done + length - 1 - report->steps : done + report->steps;
     return status;
   }
-  stray = first_stray(way, way->states + done * FLOW_STATE, length);
-  if (stray < length) {
-    report->steps = done + stray;
-    report->t = way->t[stray];
+  mismatch = first_mismatch(way, way->states + done * FLOW_STATE, length);
+  if (mismatch < length) {
+    report->steps = done + mismatch;
+    report->t = way->t[mismatch];
   }
-  return stray < length ? STATUS(STRAYED) : OK;
+  return mismatch < length ? STATUS(STRAYED) : OK;
 }
 
 /* Offset of the state at the end of a step in an array (count, kept states, FLOW_STATE) for vector c; -1 if that state
  * is not stored. */
-static long long place_of(const flow_way *way, long long step, int c)
+static long long state_offset(const flow_call *way, long long step, int c)
 {
   return step % way->every ? -1 : (c * kept_states(way) + step / way->every) * FLOW_STATE;
 }
 
-static void tell_changes(const flow_way *way, long long step, const real *vectors, real *changes)
+static void store_tangents(const flow_call *way, long long step, const real *vectors, real *changes)
 {
   for (int c = 0; c < way->count; c++)
-    if (place_of(way, step, c) >= 0)
-      memcpy(changes + place_of(way, step, c), vectors + c * GIVEN, sizeof(real) * FLOW_STATE);
+    if (state_offset(way, step, c) >= 0)
+      memcpy(changes + state_offset(way, step, c), vectors + c * STEP_INPUTS, sizeof(real) * FLOW_STATE);
 }
 
-static void add_slopes(const flow_way *way, long long step, const real *slopes, real *vectors)
+static void add_adjoints(const flow_call *way, long long step, const real *slopes, real *vectors)
 {
   for (int c = 0; c < way->count; c++)
-    for (int i = 0; i < FLOW_STATE && place_of(way, step, c) >= 0; i++)
-      vectors[c * GIVEN + i] += slopes[place_of(way, step, c) + i];
+    for (int i = 0; i < FLOW_STATE && state_offset(way, step, c) >= 0; i++)
+      vectors[c * STEP_INPUTS + i] += slopes[state_offset(way, step, c) + i];
 }
 
-/* From (count, GIVEN) tangent vectors of the inputs to (count, kept states, FLOW_STATE) tangent vectors of the
+/* From (count, STEP_INPUTS) tangent vectors of the inputs to (count, kept states, FLOW_STATE) tangent vectors of the
  * states. */
-static int push_along(const flow_way *way, const real *x, const real *changes, real *kept, solver_report *report)
+static int jvp_along(const flow_call *way, const real *x, const real *changes, real *kept, solver_report *report)
 {
-  const long long across = (long long)way->count * GIVEN;
+  const long long across = (long long)way->count * STEP_INPUTS;
   int status = OK, length = 0;
   memcpy(way->vectors, changes, sizeof(real) * (size_t)across);
-  tell_changes(way, 0, way->vectors, kept);
+  store_tangents(way, 0, way->vectors, kept);
   for (long long done = 0; done < way->steps && status == OK; done += length) {
-    length = piece_after(way, done);
+    length = chunk_size_after(way, done);
     memset(way->vectors + across, 0, sizeof(real) * (size_t)(across * length));
-    status = carry_piece(way, x, done, length, 0, report);
+    status = propagate_chunk_of_steps(way, x, done, length, 0, report);
     for (int k = 1; k <= length; k++)
-      tell_changes(way, done + k, way->vectors + k * across, kept);
+      store_tangents(way, done + k, way->vectors + k * across, kept);
     memcpy(way->vectors, way->vectors + length * across, sizeof(real) * (size_t)across);
   }
   return status;
 }
 
-/* From (count, kept states, FLOW_STATE) adjoint vectors of the states to (count, GIVEN) gradients with respect to the
- * inputs. */
-static int pull_along(const flow_way *way, const real *x, const real *kept, real *slopes, solver_report *report)
+/* From (count, kept states, FLOW_STATE) adjoint vectors of the states to (count, STEP_INPUTS) gradients with respect
+ * to the inputs. */
+static int vjp_along(const flow_call *way, const real *x, const real *kept, real *slopes, solver_report *report)
 {
-  const long long across = (long long)way->count * GIVEN;
+  const long long across = (long long)way->count * STEP_INPUTS;
   int status = OK, length = 0;
   memset(way->vectors, 0, sizeof(real) * (size_t)across);
   for (long long end = way->steps; end > 0 && status == OK; end -= length) {
-    length = piece_after(way, way->steps - end);
+    length = chunk_size_after(way, way->steps - end);
     memcpy(way->vectors + length * across, way->vectors, sizeof(real) * (size_t)across);
     memset(way->vectors, 0, sizeof(real) * (size_t)(across * length));
     for (int k = 1; k <= length; k++)
-      add_slopes(way, end - length + k, kept, way->vectors + k * across);
-    status = carry_piece(way, x, end - length, length, 1, report);
+      add_adjoints(way, end - length + k, kept, way->vectors + k * across);
+    status = propagate_chunk_of_steps(way, x, end - length, length, 1, report);
   }
-  add_slopes(way, 0, kept, way->vectors);
+  add_adjoints(way, 0, kept, way->vectors);
   memcpy(slopes, way->vectors, sizeof(real) * (size_t)across);
   return status;
 }
 
-/* Evaluates the flow or its derivatives for each of `rows` rows x of GIVEN inputs. On failure returns the status of the
- * failed step, or FLOW_NO_MEMORY; later results are undefined. */
-static int flow_rows(flow_part part, flow_way *way, long long rows, const real *x, const real *given,
+/* Evaluates the flow or its derivatives for each of `rows` rows x of STEP_INPUTS inputs. On failure returns the
+ * status of the failed step, or FLOW_NO_MEMORY; later results are undefined. */
+static int flow_rows(flow_part part, flow_call *way, long long rows, const real *x, const real *given,
     real *found, solver_report *report)
 {
-  const long long kept = kept_states(way) * FLOW_STATE, across = (long long)way->count * GIVEN;
+  const long long kept = kept_states(way) * FLOW_STATE, across = (long long)way->count * STEP_INPUTS;
   const long long values = way->count * kept;
   int status = OK;
   memset(report, 0, sizeof *report);
-  if (!make_way(way))
+  if (!allocate_flow(way))
     return FLOW_NO_MEMORY;
-  for (long long row = 0; row < rows && status == OK; row++, x += GIVEN)
+  for (long long row = 0; row < rows && status == OK; row++, x += STEP_INPUTS)
     if (part == FLOW_STATES)
       status = follow(way, x, way->every, found + row * kept, report);
     else {
       status = follow(way, x, 1, way->states, report);
-      if (status == OK && part == FLOW_PUSH)
-        status = push_along(way, x, given + row * across, found + row * values, report);
-      if (status == OK && part == FLOW_PULL)
-        status = pull_along(way, x, given + row * values, found + row * across, report);
+      if (status == OK && part == FLOW_JVP)
+        status = jvp_along(way, x, given + row * across, found + row * values, report);
+      if (status == OK && part == FLOW_VJP)
+        status = vjp_along(way, x, given + row * values, found + row * across, report);
     }
   free(way->workspace);
   return status;

@@ -1,7 +1,7 @@
 /* States of an FMU: get, set, serialise. Requires: fmu.h. */
 
 /* Copies the state to the importer's memory, which is allocated if there is none. */
-static fmi3Status keep_state(const fmu *one, const void *state, fmi3FMUState *kept)
+static fmi3Status copy_state_to(const fmu *one, const void *state, fmi3FMUState *kept)
 {
   *kept = *kept ? *kept : malloc(sizeof(fmu_state));
   if (!*kept)
@@ -13,7 +13,7 @@ static fmi3Status keep_state(const fmu *one, const void *state, fmi3FMUState *ke
 FMI_EXPORT fmi3Status FMI(GetFMUState)(fmi3Instance instance, fmi3FMUState *state)
 {
   const fmu *one = instance;
-  return keep_state(one, &one->now, state);
+  return copy_state_to(one, &one->now, state);
 }
 
 FMI_EXPORT fmi3Status FMI(SetFMUState)(fmi3Instance instance, fmi3FMUState state)
@@ -55,5 +55,5 @@ FMI_EXPORT fmi3Status FMI(DeserializeFMUState)(fmi3Instance instance, const fmi3
 {
   if (size != sizeof(fmu_state) || memcmp(bytes, TOKEN, sizeof TOKEN) != 0)
     return failed(instance, fmi3Error, "these bytes are not a serialized state of this FMU");
-  return keep_state(instance, bytes, state);
+  return copy_state_to(instance, bytes, state);
 }

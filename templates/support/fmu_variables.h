@@ -1,4 +1,4 @@
-/* Variables of an FMU by value reference. Requires: fmu.h, INPUTS, INPUT_PARTS, INPUT_PLACE. */
+/* Variables of an FMU by value reference. Requires: fmu.h, INPUTS, INPUT_PARTS, INPUT_INDEX. */
 
 /* Returns true if the model description has the reference; the internal parts of an input other than its value are
  * hidden. */
@@ -6,7 +6,7 @@ static bool is_known(fmi3ValueReference reference)
 {
   const int64_t place = (int64_t)reference - FIRST_PARAMETER;
   for (int i = 0; i < INPUTS; i++)
-    if (place > INPUT_PLACE[i] && place < INPUT_PLACE[i] + INPUT_PARTS)
+    if (place > INPUT_INDEX[i] && place < INPUT_INDEX[i] + INPUT_PARTS)
       return false;
   return reference < REFERENCES;
 }

@@ -1,5 +1,5 @@
 /* Velocity corrections from residual momenta r, with forces and momenta linearised in the correction. Requires:
- * places.h, point_weights.h, a mass. */
+ * point_arguments.h, point_weights.h, a mass. */
 enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q by rows */
 
 /* Product of a matrix row and x. */
@@ -12,7 +12,7 @@ static inline lanes row_times(const lanes *row, const lanes *x)
 }
 
 /* First-order changes of the forces, F, and of the momenta at fixed velocity, P, by velocity changes r. */
-static inline void forces_follow(const sweep_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M],
+static inline void forces_follow(const iteration_data *data, lanes (*value)[VALUES], lanes (*r)[M], lanes (*F)[M],
     lanes (*P)[M])
 {
   lanes scaled[GROUPS][M], moved[M];
@@ -30,7 +30,7 @@ static inline void forces_follow(const sweep_data *data, lanes (*value)[VALUES],
 
 /* r = mass^-1 r at all points, then once more with the residual of the linearised equations: one iteration converges
  * like two without further evaluations. */
-static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
+static inline void correct(const iteration_data *data, lanes (*value)[VALUES], lanes (*mass)[MASS], lanes (*r)[M])
 {
   lanes first[GROUPS][M], force[GROUPS][M], impulse[GROUPS][M], momentum[GROUPS][M];
   memcpy(first, r, sizeof first);
@@ -46,7 +46,8 @@ static inline void correct(const sweep_data *data, lanes (*value)[VALUES], lanes
 }
 
 /* Forces at the converged velocities z, linearised at the last correction r, which is small. */
-static inline void forces_at_rest(const step_data *step, const sweep_data *data, lanes (*value)[VALUES], lanes (*z)[M],
+static inline void converged_forces(const step_data *step, const iteration_data *data, lanes (*value)[VALUES],
+    lanes (*z)[M],
     lanes (*r)[M], lanes (*F)[M])
 {
   lanes momentum[GROUPS][M];

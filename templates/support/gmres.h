@@ -94,7 +94,7 @@ static double find_correction(linear_system *of, solver_report *report)
     if (!(all.rest[0] > enough && all.rest[0] < INFINITY))
       return all.rest[0];
     if (cycle > 0)
-      reconsider(of, all.rest[0] / last);
+      choose_preconditioner(of, all.rest[0] / last);
     last = all.rest[0];
     scale(of, left, 1.0 / all.rest[0], left);
     add_combination(of, &all, build_basis(of, &all, enough, report));

@@ -1,7 +1,9 @@
-/* Integrals along a step solved by fixed-point iteration. Requires: hamiltonian_sweep.h, the kernel integrand_lanes. */
+/* Integrals along a step solved by fixed-point iteration. Requires: hamiltonian_iteration.h, the kernel
+ * integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities and forces, which `memory` contains. */
-static inline void integrals_of_sweep(const step_data *step, const sweep_data *data, const double *memory, double *sum)
+static inline void integrals_of_sweep(const step_data *step, const iteration_data *data, const double *memory,
+    double *sum)
 {
   lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];
   lanes_load(memory, z);

@@ -9,14 +9,14 @@ static void take_trial(run_memory *run, trial *now)
     run->guess = 0;
   } else {
     add_compensated(&now->at.t, &now->at.t_low, run->h, 0.0);
-    choose_length(run, now);
+    choose_size(run, now);
   }
   run->t = now->at.t;
   run->t_low = now->at.t_low;
   run->step++;
 }
 
-static int take_trials(run_memory *run, const travel *way, solver_report *report)
+static int take_trials(run_memory *run, const job *way, solver_report *report)
 {
   solver_options standard = NAME(default_options)();
   trial now = {
@@ -39,9 +39,9 @@ static int take_trials(run_memory *run, const travel *way, solver_report *report
 int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double tolerance, long long steps,
     const solver_options *options, solver_report *report)
 {
-  const travel way = {take_trials, given, options, t_end, tolerance, steps};
+  const job way = {take_trials, given, options, t_end, tolerance, steps};
   solver_report unread;
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
-  return go_together(run, &way, report);
+  return run_workers(run, &way, report);
 }

@@ -1,6 +1,6 @@
 /* Comparison of a step of an indexed system with two steps of half its size, as in halves.h. The half steps are solved
  * in place, so that F of the step is lost; forces of former steps are preserved. Requires: comparison.h,
- * HALVES_VECTORS, solve and go_on of a solver. */
+ * HALVES_VECTORS, solve and continue_steps of a solver. */
 
 /* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half;
  * increments of momenta by the step. */
@@ -32,7 +32,7 @@ typedef struct {
   double *whole;
 } numbers;
 
-static numbers positions_of(const run_memory *run, const state_at_start *kept)
+static numbers vectors_of_state(const run_memory *run, const state_at_start *kept)
 {
   const numbers of = {run->q, run->carry_q, kept->q, kept->carry_q, kept->whole};
   return of;
@@ -58,14 +58,14 @@ static void note_increments(const numbers *x, double *increments, section own)
 /* Performs a step without a predictor. */
 static int make_part(run_memory *run, const problem *given, long long n, const solver_options *options)
 {
-  const struct guess_tables tables = {NULL, NULL, NULL};
+  const struct predictor_tables_of tables = {NULL, NULL, NULL};
   solver_report report = {0};
   long long guess = 0;
   double error;
   const int status = solve(run, given, n, &tables, &guess, 0.0, &error, options, &report);
   if (status != OK)
     return status;
-  go_on(run, n);
+  continue_steps(run, n);
   add_compensated(&run->t, &run->t_low, run->h, 0.0);
   return OK;
 }
@@ -80,7 +80,7 @@ static int make_halves(run_memory *run, const problem *given, long long n, doubl
   status = make_part(run, given, n, options);
   if (status != OK)
     return status;
-  positions = positions_of(run, kept);
+  positions = vectors_of_state(run, kept);
   note_increments(&positions, kept->first, mine(run, n));
   return make_part(run, given, n, options);
 }
@@ -97,7 +97,7 @@ static double difference(const run_memory *run, const numbers *x, long long n)
       of_block = larger(of_block, fabs(x->start[i]) + fabs(increment_of(x, i)));
     add_block(&all, of_block, 0.0);
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
   largest = largest_of(&all, 0) + DBL_MIN;
   begin_sums(&all, run, n);
   while (next_block(&all)) {
@@ -110,7 +110,7 @@ static double difference(const run_memory *run, const numbers *x, long long n)
     }
     add_block(&all, of_block, 0.0);
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
   most = largest_of(&all, 0);
   return most > ROUNDING_OF_HALVES ? most : 0.0;
 }
@@ -120,14 +120,14 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
     const solver_options *options, double *error)
 {
   const state_at_start kept = state_in(run, n), now = {run->q, run->p, run->carry_q, run->carry_p, NULL, NULL, NULL};
-  const numbers q = positions_of(run, &kept), p = momenta_of(run, &kept);
+  const numbers q = vectors_of_state(run, &kept), p = momenta_of(run, &kept);
   const section own = mine(run, n);
   const double whole = run->h, t = run->t, t_low = run->t_low;
   const long long uneven = run->uneven;
   double before = -1.0, h = whole;
   int status = OK, go = 1;
   copy_state(&now, &kept, own);
-  go_on(run, n);
+  continue_steps(run, n);
   note_increments(&q, kept.whole, own);
   note_increments(&p, kept.whole_p, own);
   *error = 0.0;

@@ -1,6 +1,6 @@
 /* Linear systems of Newton's method for the points of a step of an indexed system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
- * multiplied by vectors, term group by term group. Requires: indexed_sweep.h; products and diagonals of F'. */
+ * multiplied by vectors, term group by term group. Requires: indexed_points.h; products and diagonals of F'. */
 
 typedef struct {
   const run_memory *run;
@@ -13,7 +13,7 @@ typedef struct {
   const lanes *X;
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;
-  int by_waves, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
+  int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
                         * cycle was not enough */
   double left; /* reduction of the residual by the first of them */
 } linear_system;
@@ -26,7 +26,7 @@ static void multiply(const linear_system *of, const lanes *x, lanes *y)
   for (long long i = of->own.first; i < of->own.end; i++) {
     const double unit = of->by.square * of->run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++)
-      y[g * n + i] = x[g * n + i] - unit * given_by_all(PRODUCT, g, &of->forces[i], n);
+      y[g * n + i] = x[g * n + i] - unit * contribution_of_points(PRODUCT, g, &of->forces[i], n);
   }
 }
 
@@ -36,7 +36,7 @@ static void apply_inverses(const linear_system *of, const lanes *x, lanes *y, se
   for (long long i = here.first; i < here.end; i++) {
     lanes all[GROUPS];
     for (int g = 0; g < GROUPS; g++)
-      all[g] = given_by_all(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
+      all[g] = contribution_of_points(of->inverse + i * POINTS * GROUPS, g, x + i, of->n);
     for (int g = 0; g < GROUPS; g++)
       y[g * of->n + i] = all[g];
   }
@@ -85,7 +85,7 @@ static void keep_inverse(linear_system *of, long long i, double slope, double by
 }
 
 /* h^2 x / m of a coordinate, x averaged over the points. */
-static double slope_of(const linear_system *of, const lanes *x, long long i)
+static double mean_derivative(const linear_system *of, const lanes *x, long long i)
 {
   double mean = 0.0;
   for (int j = 0; j < KEPT; j++)
@@ -98,5 +98,5 @@ static void find_own_inverses(linear_system *of)
 {
   diagonals(of->run, of->given, of->X, of->forces, of->n);
   for (long long i = of->own.first; i < of->own.end; i++)
-    keep_inverse(of, i, slope_of(of, of->forces, i), 1.0);
+    keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
 }

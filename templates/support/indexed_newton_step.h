@@ -8,10 +8,10 @@
 static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
 {
   const long long count = GROUPS * n;
-  lanes *work = (lanes *)run->work + SWEEP_VECTORS * count;
+  lanes *work = (lanes *)run->work + ITERATION_VECTORS * count;
   const linear_system of = {.run = run,
       .given = given,
-      .by = lengths_of(run->h),
+      .by = sizes_of_steps(run->h),
       .n = n,
       .count = count,
       .own = mine(run, n),
@@ -36,7 +36,7 @@ static void find_residual(linear_system *of, const lanes *X, const lanes *F)
     double low;
     const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
     for (int g = 0; g < GROUPS; g++) {
-      const lanes sum = given_by_all(PRODUCT, g, &F[i], n) + given_by_all(PRODUCT_LOW, g, &F[i], n);
+      const lanes sum = contribution_of_points(PRODUCT, g, &F[i], n) + contribution_of_points(PRODUCT_LOW, g, &F[i], n);
       const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
       of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
     }
@@ -59,7 +59,7 @@ static double size_of_state(const linear_system *of, const lanes *X)
     }
     add_block(&all, size, 0.0);
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
   return sum_of(&all, 0);
 }
 
@@ -85,13 +85,13 @@ static void start_nearer(linear_system *of, const parts_of_work *parts)
 
 /* Iterates until the points converge. The tables extrapolate from *guess steps. On success *guess is the number of
  * steps for the next predictor, and *error the error estimate. */
-static int solve(run_memory *run, const problem *given, long long n, const struct guess_tables *tables,
+static int solve(run_memory *run, const problem *given, long long n, const struct predictor_tables_of *tables,
     long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
   const parts_of_work parts = divide(run, n);
   linear_system of = linear_of(run, given, &parts, n);
   double largest = first_positions(run, &parts, &of.by, n, tables, *guess);
-  iteration now = at_its_start();
+  iteration now = new_iteration();
   forces_at_points(run, given, parts.X, parts.F, n);
   largest = largest_moved(run, parts.F, &of.by, n, largest);
   of.by_size = measures_of(largest);
@@ -108,7 +108,7 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
     total[0] = inner_product(&of, of.correction, of.correction);
     total[2] = size_of_state(&of, parts.X);
     of.state = sqrt(total[2]);
-    judge(&now, changes_of(total, &of.by_size, n, options), options, report);
+    record_change(&now, relative_changes(total, &of.by_size, n, options), options, report);
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
                                                            * correction */
       now.status = -1, now.last.of_all = left;

@@ -26,7 +26,7 @@ static int all_sums_finite(const run_memory *run, const parts_of_work *parts, lo
       faults |= (0.0 * (run->q[i] + parts->dq[i]) != 0.0) | (0.0 * (run->p[i] + parts->dp[i]) != 0.0);
     add_block(&all, faults, 0.0);
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
   return sum_of(&all, 0) == 0.0;
 }
 

@@ -1,4 +1,5 @@
-/* Trial of an adaptive step of an indexed system. Requires: rungs.h, ladder_tables.h, indexed_step.h; DOUBTS. */
+/* Trial of an adaptive step of an indexed system. Requires: step_size_levels.h, predictor_tables.h, indexed_step.h;
+ * DOUBTS. */
 #define HOT static
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
@@ -17,9 +18,9 @@ typedef struct {
 /* Performs one trial of the next step: its curve and error estimate, infinite if it failed. */
 static void try_step(run_memory *run, trial *now, double least, const solver_options *options, solver_report *report)
 {
-  struct guess_tables tables = {NULL, NULL, NULL};
+  struct predictor_tables_of tables = {NULL, NULL, NULL};
   (void)least;
-  run->h = next_length(length_of(run->rung), (now->t_end - now->at.t) - now->at.t_low, &now->last);
+  run->h = next_size(size_of_level(run->grid_level), (now->t_end - now->at.t) - now->at.t_low, &now->last);
   report->t = now->at.t;
   now->guess = now->last || !choose_tables(run, &tables) ? 0 : run->guess;
   if (solve(run, now->given, now->n, &tables, &now->guess, now->limits.decay, &now->error,
@@ -36,7 +37,7 @@ static SELDOM int changes_little(run_memory *run, const trial *step)
   const section own = mine(run, n);
   sums all;
   copy_state(&now, &kept, own);
-  go_on(run, n);
+  continue_steps(run, n);
   begin_sums(&all, run, n);
   while (next_block(&all)) {
     double change = 0.0, size = 0.0;
@@ -46,7 +47,7 @@ static SELDOM int changes_little(run_memory *run, const trial *step)
     }
     add_block(&all, change, size);
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
   copy_state(&kept, &now, own);
   return largest_of(&all, 0) < SMALL_PART * largest_of(&all, 1);
 }

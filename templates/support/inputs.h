@@ -1,5 +1,5 @@
 /* Inputs: piecewise polynomials of time. A run ends a step at their breakpoints and continues with the parameters of
- * the next pieces. Requires: step.h, and INPUT_PLACE, the indices of the parameters of each input. */
+ * the next pieces. Requires: step.h, and INPUT_INDEX, the indices of the parameters of each input. */
 
 #define NO_STEP (sizeof(real) < sizeof(double) ? 1e-3 : 1e-9) /* relative to a step: a shorter remaining interval needs
                                                                * no step */
@@ -36,7 +36,7 @@ real NAME(next_breakpoint)(const run_memory *run, real t_end, real h, input_data
     end = breakpoint_before(inputs + i, run->t, end, slack);
   }
   for (int i = 0; i < INPUTS; i++) {
-    real *own = parameters + INPUT_PLACE[i];
+    real *own = parameters + INPUT_INDEX[i];
     const int k = piece_at(inputs + i, run->t + (end - run->t) / 2);
     inputs[i].piece = k;
     memcpy(own, inputs[i].coefficients + 4 * k, 4 * sizeof(real));

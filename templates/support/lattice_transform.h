@@ -111,10 +111,10 @@ static void make_pass(const run_memory *run, const pass *now, complex_lanes x, c
         place = 0, shift += line;
     }
   }
-  wait_for_others(run);
+  wait_at_barrier(run);
 }
 
-static inline void exchange(complex_lanes *x, complex_lanes *y)
+static inline void swap(complex_lanes *x, complex_lanes *y)
 {
   const complex_lanes kept = *x;
   *x = *y;
@@ -128,7 +128,7 @@ static void transform(const run_memory *run, const axis *along, complex_lanes *x
   while (now.left > 1) {
     now.factor = factor_of(now.left);
     make_pass(run, &now, *x, *y, n);
-    exchange(x, y);
+    swap(x, y);
     now.left /= now.factor;
     now.done *= now.factor;
   }
@@ -141,7 +141,7 @@ typedef struct {
   roots of_one[AXES];
 } lattice;
 
-static long long places_of(const lattice *one)
+static long long positions_of(const lattice *one)
 {
   long long places = 1;
   for (int a = 0; a < one->axes; a++)

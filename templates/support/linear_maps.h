@@ -1,5 +1,5 @@
 /* Linear maps between tangent vectors of the inputs of a step, of its unknowns, of the arguments and results of kernels
- * at points, and of the rows of its equations; and their transposes. Requires: real, M, B, GIVEN, WIDTH, band.h,
+ * at points, and of the rows of its equations; and their transposes. Requires: real, M, B, STEP_INPUTS, WIDTH, band.h,
  * stages.h; if DAMPED, damping.h. */
 
 #ifdef DAMPED
@@ -33,9 +33,9 @@ typedef struct {
 typedef struct {
   const int (*pair)[2];
   int count, first, to, from;
-} slope_block;
+} derivative_block;
 
-typedef void slope_kernel(const real *u, real t, const real *parameters, real *value, real *slope);
+typedef void derivative_kernel(const real *u, real t, const real *parameters, real *value, real *slope);
 typedef void value_kernel(const real *u, real t, const real *parameters, real *value);
 
 /* Stage group: points with the same kernel. Numbers of points, arguments, results and derivatives; sources of arguments
@@ -45,13 +45,13 @@ typedef void value_kernel(const real *u, real t, const real *parameters, real *v
 typedef struct {
   int points, arguments, results, slopes, given, gathers, scatters, blocks;
   const linear_loop *gather, *scatter;
-  const slope_block *block;
+  const derivative_block *block;
   const real *weight, *abscissa;
-  slope_kernel *kernel;
+  derivative_kernel *kernel;
   value_kernel *by_given;
-  const int (*given_pair)[2];
+  const int (*input_pair)[2];
   value_kernel *curvature;
-} point_family;
+} stage_group;
 
 static real power_of(real h, int k)
 {
@@ -62,7 +62,7 @@ static real power_of(real h, int k)
 }
 
 /* Arguments at each point. */
-static void arguments_of(const point_family *f, const step_data *step, const real *z, real *at)
+static void arguments_of(const stage_group *f, const step_data *step, const real *z, real *at)
 {
   for (int g = 0; g < f->gathers; g++) {
     const linear_loop *loop = f->gather + g;
@@ -73,14 +73,14 @@ static void arguments_of(const point_family *f, const step_data *step, const rea
   }
 }
 
-static real time_of(const point_family *f, const step_data *step, int n)
+static real time_of(const stage_group *f, const step_data *step, int n)
 {
   return step->t + (f->abscissa ? f->abscissa[n] * step->h : 0);
 }
 
 /* End of the derivatives of a stage group; if DAMPED, those with respect to gamma h follow those with respect to
  * inputs. */
-static inline long long end_of_slopes(const point_family *f)
+static inline long long end_of_derivatives(const stage_group *f)
 {
   const long long each = f->arguments + f->results + f->slopes + f->given;
 #ifdef DAMPED
@@ -92,7 +92,7 @@ static inline long long end_of_slopes(const point_family *f)
 
 /* Computes at each point, with fixed unknowns: derivatives with respect to h of the arguments and of the factors of the
  * results; of the results with respect to the arguments; to parameters and time; to gamma h. Returns their end. */
-static real *slopes_of(const point_family *f, const step_data *step, const real *z, real *by_h)
+static real *derivatives_of_group(const stage_group *f, const step_data *step, const real *z, real *by_h)
 {
   const real h = step->h;
   real *value = by_h + f->points * f->arguments, *slope = value + f->points * f->results;
@@ -118,11 +118,11 @@ static real *slopes_of(const point_family *f, const step_data *step, const real 
     for (int n = 0; n < f->points; n++)
       for (int i = 0; i < f->scatter[s].sites; i++)
         value[n * f->results + f->scatter[s].offset + i] *= (real)f->scatter[s].power / h;
-  return by_h + end_of_slopes(f);
+  return by_h + end_of_derivatives(f);
 }
 
 /* From unknowns to arguments. */
-static void gather_wide(const point_family *f, real h, int back, wide *dz, wide *u)
+static void gather_wide(const stage_group *f, real h, int back, wide *dz, wide *u)
 {
   for (int g = 0; g < f->gathers; g++) {
     const linear_loop *loop = f->gather + g;
@@ -136,32 +136,32 @@ static void gather_wide(const point_family *f, real h, int back, wide *dz, wide 
 }
 
 /* From q0 and h to arguments. */
-static void start_wide(const point_family *f, int back, const real *by_h, wide *v, wide *u)
+static void start_wide(const stage_group *f, int back, const real *by_h, wide *v, wide *u)
 {
   for (int g = 0; g < f->gathers; g++)
     for (int n = 0; f->gather[g].from_state && n < f->points; n++)
       for (int i = 0; i < M; i++)
         flow(back, u + n * f->arguments + f->gather[g].offset + i, 1, v + i);
   for (int i = 0; i < f->points * f->arguments; i++)
-    flow(back, u + i, by_h[i], v + GIVEN_H);
+    flow(back, u + i, by_h[i], v + INPUT_H);
 }
 
 /* From parameters, t and h to results. */
-static void given_wide(const point_family *f, int back, const real *by_h, const real *given, wide *v, wide *value)
+static void inputs_wide(const stage_group *f, int back, const real *by_h, const real *given, wide *v, wide *value)
 {
   for (int n = 0; n < f->points; n++)
     for (int e = 0; e < f->given; e++) {
-      wide *result = value + n * f->results + f->given_pair[e][0], *from = v + 2 * M + f->given_pair[e][1];
+      wide *result = value + n * f->results + f->input_pair[e][0], *from = v + 2 * M + f->input_pair[e][1];
       flow(back, result, given[n * f->given + e], from);
-      if (from == v + GIVEN_H - 1)
-        flow(back, result, given[n * f->given + e] * f->abscissa[n], v + GIVEN_H);
+      if (from == v + INPUT_H - 1)
+        flow(back, result, given[n * f->given + e] * f->abscissa[n], v + INPUT_H);
     }
   for (int i = 0; i < f->points * f->results; i++)
-    flow(back, value + i, by_h[i], v + GIVEN_H);
+    flow(back, value + i, by_h[i], v + INPUT_H);
 }
 
 /* From arguments to results. */
-static void multiply_wide(const point_family *f, int back, const real *slope, wide *u, wide *value)
+static void multiply_wide(const stage_group *f, int back, const real *slope, wide *u, wide *value)
 {
   for (int k = 0; k < f->blocks; k++)
     for (int n = 0; n < f->points; n++)
@@ -172,7 +172,7 @@ static void multiply_wide(const point_family *f, int back, const real *slope, wi
 }
 
 /* From results to rows, from row `first` of each site on. */
-static void scatter_wide(const point_family *f, real h, real growth, int back, int first, wide *value, wide *rows)
+static void scatter_wide(const stage_group *f, real h, real growth, int back, int first, wide *value, wide *rows)
 {
   for (int s = 0; s < f->scatters; s++) {
     const linear_loop *loop = f->scatter + s;
@@ -187,7 +187,7 @@ static void scatter_wide(const point_family *f, real h, real growth, int back, i
 }
 
 /* From v and dz, where they are not NULL, to arguments. */
-static void arguments_wide(const point_family *f, real h, int back, const real *by_h, wide *v, wide *dz, wide *u)
+static void arguments_wide(const stage_group *f, real h, int back, const real *by_h, wide *v, wide *dz, wide *u)
 {
   if (v)
     start_wide(f, back, by_h, v, u);
@@ -203,7 +203,7 @@ typedef struct {
 
 /* From v to all rows, or from dz to the last ones, through the points of a stage group; back: the transpose. Returns
  * the end of its derivatives. */
-static const real *through_family(const point_family *f, const step_change *by, int back, const real *slopes,
+static const real *through_group(const stage_group *f, const step_change *by, int back, const real *slopes,
     wide *points, wide *v, wide *dz, wide *rows)
 {
   const real h = by->h;
@@ -217,17 +217,17 @@ static const real *through_family(const point_family *f, const step_change *by, 
     arguments_wide(f, h, back, slopes, v, dz, points);
   multiply_wide(f, back, slope, points, value);
   if (v)
-    given_wide(f, back, by_h, given, v, value);
+    inputs_wide(f, back, by_h, given, v, value);
   for (int i = 0; v && by->grown && i < f->points * f->results; i++)
     flow(back, value + i, given[f->points * f->given + i], by->grown);
   if (back)
     arguments_wide(f, h, back, slopes, v, dz, points);
   else
     scatter_wide(f, h, by->growth, back, v ? 0 : B, value, rows);
-  return slopes + end_of_slopes(f);
+  return slopes + end_of_derivatives(f);
 }
 
-static void exchange_wide(wide *a, wide *b)
+static void swap_wide(wide *a, wide *b)
 {
   const wide kept = *a;
   *a = *b;
@@ -239,11 +239,11 @@ static void lower_wide(const real *a, const band *shape, const real *pivot, int 
 {
   const real *column = a + shape->first + k * shape->stride;
   if (!back)
-    exchange_wide(x + k, x + (int)pivot[k]);
+    swap_wide(x + k, x + (int)pivot[k]);
   for (int i = k + 1; i < least(k + shape->reach + 1, shape->rows); i++)
     flow(back, x + i, -column[i], x + k);
   if (back)
-    exchange_wide(x + k, x + (int)pivot[k]);
+    swap_wide(x + k, x + (int)pivot[k]);
 }
 
 /* Eliminates unknown k in the back substitution, or its transpose. */

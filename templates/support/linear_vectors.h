@@ -20,7 +20,7 @@ static double inner_product(const linear_system *of, const lanes *x, const lanes
     }
     add_block(&all, lanes_total(a + b), 0.0);
   }
-  wait_for_others(of->run);
+  wait_at_barrier(of->run);
   return sum_of(&all, 0);
 }
 

@@ -1,18 +1,18 @@
 /* Tangent or adjoint vectors over a sequence of steps, forward or backward. On failure report->t is the time of the
- * failed step. Requires: carry_steps, which propagates them over at most STEPS_AT_ONCE steps. */
+ * failed step. Requires: propagate_steps, which propagates them over at most STEPS_AT_ONCE steps. */
 int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,
     const real *parameters, const solver_options *options, int back, int count, real *vectors, real *q1, real *p1,
     solver_report *report, real *workspace)
 {
   const solver_options standard = NAME(default_options)();
-  carriage over = {t, h, q, p, parameters, options ? options : &standard, back, count, vectors, q1, p1, workspace,
+  propagation over = {t, h, q, p, parameters, options ? options : &standard, back, count, vectors, q1, p1, workspace,
       report, 0, 0};
   int status = OK;
   memset(report, 0, sizeof *report);
   for (long long done = 0; status == OK && done < steps; done += STEPS_AT_ONCE) {
     const long long left = steps - done, own = left < STEPS_AT_ONCE ? left : STEPS_AT_ONCE;
     const long long first = back ? left - own : done;
-    status = carry_steps(&over, first, first + own);
+    status = propagate_steps(&over, first, first + own);
   }
   return status;
 }

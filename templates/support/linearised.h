@@ -1,7 +1,7 @@
-/* Linearisation of a step. Requires: newton.h, linear_maps.h, and FAMILIES. */
+/* Linearisation of a step. Requires: newton.h, linear_maps.h, and STAGE_GROUPS. */
 
 enum {
-  COUNT_OF_FAMILIES = sizeof FAMILIES / sizeof *FAMILIES
+  COUNT_OF_GROUPS = sizeof STAGE_GROUPS / sizeof *STAGE_GROUPS
 };
 
 /* The solved step, its derivatives at the points, and memory for tangent or adjoint vectors. */

@@ -1,5 +1,5 @@
 /* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
- * trajectories, which become inactive, never for all. Requires: trajectories.h, contraction.h, and the tables
+ * trajectories, which become inactive, never for all. Requires: trajectories.h, convergence.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
 
 /* Stored values at the points, of the last step and of the one before, which the next step overwrites. */
@@ -45,13 +45,13 @@ typedef struct {
   int pending;
 } progress;
 
-static inline progress before_sweeps(void)
+static inline progress before_iterations(void)
 {
   const progress none = {lanes_of(0.0), lanes_of(INFINITY), lanes_of(INFINITY), 1};
   return none;
 }
 
-static inline int needs_sweep(const progress *now)
+static inline int needs_iteration(const progress *now)
 {
   return now->pending;
 }
@@ -64,7 +64,7 @@ static inline void take_change(progress *now, lanes change, const solver_options
   double *active = report->active;
   int pending = 0;
   for (int j = 0; j < LANES; j++) {
-    const int status = sweep_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
+    const int status = iteration_status(after.lane[j], last.lane[j], before.lane[j], &wanted, k);
     active[j] = status < 0 ? 0.0 : active[j];
     pending += (active[j] > 0.0) & (status == 0);
   }
@@ -76,13 +76,13 @@ static inline void take_change(progress *now, lanes change, const solver_options
 }
 
 /* Trajectories whose iteration stagnates are left to the solver of single trajectories. */
-static inline int stirs(const progress *now, const solver_options *options, int k)
+static inline int must_amplify(const progress *now, const solver_options *options, int k)
 {
   (void)now, (void)options, (void)k;
   return 0;
 }
 
-#define STIR 0.0
+#define AMPLIFICATION 0.0
 
 static inline int outcome(const progress *now, const solver_report *report)
 {

@@ -1,4 +1,4 @@
-/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, strays.h. */
+/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, spurious_solutions.h. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)
@@ -10,5 +10,5 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   gather(END_POSITION, 1, step->h, newtons.z, M, dq, 0, 1);
   memset(dq + M, 0, sizeof(double) * M);
   memset(dp + M, 0, sizeof(double) * M);
-  return status == OK && strays(step, newtons.z, dq, report->iterations - before) ? STATUS(STRAYED) : status;
+  return status == OK && is_spurious(step, newtons.z, dq, report->iterations - before) ? STATUS(STRAYED) : status;
 }

@@ -4,9 +4,9 @@ typedef struct {
 #ifdef DAMPED
   damping_data damping;
 #endif
-} sweep_data;
+} iteration_data;
 
-static void prepare_sweep(const step_data *step, sweep_data *data)
+static void prepare_iteration(const step_data *step, iteration_data *data)
 {
   for (int n = 0; n < GROUPS; n++) {
     data->position_weight[n] = step->h * POSITION_WEIGHT[n];

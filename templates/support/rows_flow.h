@@ -1,11 +1,11 @@
 /* Flow of many rows, for callers with arrays. Requires: flow.h. */
 
-/* part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with respect to the inputs (VJP); of rows x (rows,
- * GIVEN), each with `count` tangent vectors, (GIVEN), or adjoint vectors, (kept states, FLOW_STATE). On failure the
- * results are undefined. */
+/* part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with respect to the inputs (VJP); of rows x
+ * (rows, STEP_INPUTS), each with `count` tangent vectors, (STEP_INPUTS), or adjoint vectors, (kept states,
+ * FLOW_STATE). On failure the results are undefined. */
 int NAME(flow_rows)(int part, long long steps, long long every, int count, long long rows, const real *x,
     const real *given, real *found, solver_report *report)
 {
-  flow_way way = {.steps = steps, .every = every, .count = count};
+  flow_call way = {.steps = steps, .every = every, .count = count};
   return flow_rows((flow_part)part, &way, rows, x, given, found, report);
 }

@@ -1,5 +1,6 @@
-/* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, PLACE, band.h, step.h,
- * gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the coordinates. */
+/* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, POSITION_IN_MATRIX,
+ * band.h, step.h, gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
+ * coordinates. */
 
 /* u = q0 + u at every point, including the compensation of q0. */
 static inline void offset(const step_data *step, int points, real *u, int across)
@@ -30,12 +31,13 @@ static inline void scatter(const real *table, int points, const real *weight, re
 
 /* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns (j,
  * b), for every derivative and its pair of sites i, j. */
-static inline void scatter_slopes(const real *row, const real *column, int points, const real *weight, real scale,
+static inline void scatter_derivatives(const real *row, const real *column, int points, const real *weight, real scale,
     const int (*pair)[2], int count, const real *slope, int across, real *jacobian, const band *shape)
 {
   const int blocks = shape->rows / SITES;
   for (int e = 0; e < count; e++) {
-    real *corner = jacobian + shape->first + PLACE[pair[e][1]] * blocks * shape->stride + PLACE[pair[e][0]] * blocks;
+    real *corner = jacobian + shape->first + POSITION_IN_MATRIX[pair[e][1]] * blocks * shape->stride +
+        POSITION_IN_MATRIX[pair[e][0]] * blocks;
     for (int b = 0; b < B; b++) {
       real sum[B] = {0};
       for (int n = 0; n < points; n++) {

@@ -1,5 +1,5 @@
-/* Trial of an adaptive step of a system with few coordinates. Requires: rungs.h, halves.h; attempt of a solver, which
- * tries a step. */
+/* Trial of an adaptive step of a system with few coordinates. Requires: step_size_levels.h, halves.h; attempt of a
+ * solver, which tries a step. */
 #define DOUBTS SHORT_STEPS_FAIL
 
 /* Data shared by the trials of a step. */
@@ -10,7 +10,7 @@ typedef struct {
   error_limits limits;
   real t_end, error, dq[2 * M], dp[2 * M]; /* increments, then their low words */
   real apart; /* error estimate by two half steps, in the measure of `error`; 0 if they were not computed */
-  long long guess, rung; /* level of the step size */
+  long long guess, grid_level; /* level of the step size */
   long long change; /* of the level, from the previous step to this */
   real length; /* step size; 0 before the first trial */
   int last; /* 1 if the step ends at t_end */
@@ -22,11 +22,11 @@ HOT void try_step(run_memory *run, trial *now, real least, const solver_options 
 {
   const real rest = (now->t_end - now->at.t) - now->at.t_low;
   real h;
-  if (now->length == 0 || now->rung != run->rung) {
-    now->rung = run->rung;
-    now->length = length_of(run->rung);
+  if (now->length == 0 || now->grid_level != run->grid_level) {
+    now->grid_level = run->grid_level;
+    now->length = size_of_level(run->grid_level);
   }
-  h = next_length(now->length, rest, &now->last);
+  h = next_size(now->length, rest, &now->last);
   report->t = now->step.t = now->at.t;
   if (now->last || now->step.h != h) {
     now->step.h = h;

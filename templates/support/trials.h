@@ -1,16 +1,16 @@
 /* Trials of an adaptive step until its error estimate is admissible, and comparison with two half steps. Requires:
- * rungs.h, comparison.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last and apart;
- * try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps, in momenta too
- * if requested; changes_little, 1 if the momenta change by a small part of the largest one; SHORT_STEPS_FAIL, 1 if
- * rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. Include before the code that accepts
- * the step. */
+ * step_size_levels.h, comparison.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
+ * and apart; try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps,
+ * in momenta too if requested; changes_little, 1 if the momenta change by a small part of the largest one;
+ * SHORT_STEPS_FAIL, 1 if rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. Include
+ * before the code that accepts the step. */
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
-#define DOUBTED 16 /* steps that are compared after one that was shortened by a comparison */
+#define STEPS_COMPARED_AFTER_DOUBT 16 /* steps that are compared after one that was shortened by a comparison */
 
 /* Number of levels by which the first step may be increased at once. */
-static int rungs_up(const trial *now)
+static int levels_up(const trial *now)
 {
   real error = now->error;
   int up = 0;
@@ -28,18 +28,18 @@ static void try_first_step(run_memory *run, trial *now, const solver_options *op
   const real span = MATH(fabs)(now->t_end - now->at.t);
   real shorter = run->h != 0 ? REAL_MIN : (real)INFINITY;
   int found = 0, up = 1;
-  run->rung = rung_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
+  run->grid_level = level_below(run->h != 0 ? MATH(fabs)(run->h) : span * FIRST_STEP);
   try_step(run, now, 0, options, report);
   while (!now->last && up > 0) {
     const int failed = !(now->error < INFINITY), small = now->error <= now->limits.most;
     const int as_expected = now->error > error_at(shorter, up / 2) && now->error < error_at(shorter, up + 1);
     const int rises = failed ? !SHORT_STEPS_FAIL : as_expected;
     found = found || small;
-    up = small ? rungs_up(now) : 0;
+    up = small ? levels_up(now) : 0;
     if (up == 0 && !(found && rises))
       up = MOST_UP;
     shorter = now->error;
-    run->rung += up;
+    run->grid_level += up;
     if (up > 0)
       try_step(run, now, 0, options, report);
   }
@@ -51,18 +51,19 @@ static int shorten(run_memory *run, const trial *now, int most)
   int down = 2;
   while (down < most && !(error_at(now->error, -down) <= now->limits.most))
     down++;
-  run->rung -= down;
+  run->grid_level -= down;
   run->error_before = error_at(run->error_before, -down);
   run->guess = 0;
   run->rejected++;
-  return length_of(run->rung) > VANISHING * (MATH(fabs)(now->at.t) + REAL_EPSILON * MATH(fabs)(now->t_end - now->at.t));
+  const real left = MATH(fabs)(now->t_end - now->at.t);
+  return size_of_level(run->grid_level) > SMALLEST_RELATIVE_STEP * (MATH(fabs)(now->at.t) + REAL_EPSILON * left);
 }
 
 /* Tries the next step with smaller and smaller sizes until its error is admissible; returns VANISHED on underflow. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
-  now->change = run->change - run->rung;
+  now->change = run->change - run->grid_level;
   if (run->error_before > 0)
     try_step(run, now, least, options, report);
   else
@@ -70,7 +71,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
   while (!(now->error <= now->limits.most * GROWTH)) {
     const int failed = run->error_before > 0 && !(now->error < INFINITY);
     if (failed) {
-      run->failed = run->rung;
+      run->failed = run->grid_level;
       run->avoiding = AVOIDED;
     }
     if (!shorten(run, now, failed ? DOWN_FAILED : MOST_DOWN))
@@ -78,7 +79,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
     try_step(run, now, least, options, report);
   }
   now->error = larger(now->error, least);
-  now->change += run->rung;
+  now->change += run->grid_level;
   return OK;
 }
 
@@ -86,28 +87,28 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
  * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
  * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
  * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
-static inline int is_doubted(run_memory *run, const trial *now)
+static inline int needs_momenta(run_memory *run, const trial *now)
 {
-  return DOUBTS && (run->doubted > 0 || (now->change <= -OCTAVE && changes_little(run, now)));
+  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -OCTAVE && changes_little(run, now)));
 }
 
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
-static SELDOM int compare_step(run_memory *run, trial *now, int doubted, const solver_options *options,
+static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare, const solver_options *options,
     solver_report *report)
 {
   const real allowed = larger(
-      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), doubted ? ROUNDOFF_LEVEL : SPURIOUS);
+      ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    int status = compare_trial(run, now, doubted, options, &apart);
+    int status = compare_trial(run, now, steps_to_compare, options, &apart);
     if (status > STATUS(STRAYED))
       return status;
     if (status == OK && apart <= allowed) {
       now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
-      run->doubted -= run->doubted > 0;
+      run->steps_to_compare -= run->steps_to_compare > 0;
       return OK;
     }
-    run->doubted = DOUBTED;
+    run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
     now->error = INFINITY;
     if (!shorten(run, now, MOST_DOWN))
       return STATUS(VANISHED);
@@ -121,22 +122,22 @@ static SELDOM int compare_step(run_memory *run, trial *now, int doubted, const s
 /* Compares the first step, one of COMPARED later, and those in doubt. */
 static inline int confirm_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
-  const int doubted = is_doubted(run, now);
+  const int steps_to_compare = needs_momenta(run, now);
   now->apart = 0;
-  return doubted || run->step % COMPARED == 0 ? compare_step(run, now, doubted, options, report) : OK;
+  return steps_to_compare || run->step % COMPARED == 0 ? compare_step(run, now, steps_to_compare, options, report) : OK;
 }
 
 /* Chooses the size of the next step. The error of a loose tolerance may allow steps at which the iteration fails: the
  * size of such a step is not tried again for some steps (cf. Hairer & Wanner, Solving ODEs II, IV.8). */
-static inline void choose_length(run_memory *run, const trial *now)
+static inline void choose_size(run_memory *run, const trial *now)
 {
   int change = next_change(now->error, run->error_before, &now->limits);
-  if (run->avoiding > 0 && run->avoiding-- && run->rung + change >= run->failed)
-    change = (int)(run->failed - 1 - run->rung);
+  if (run->avoiding > 0 && run->avoiding-- && run->grid_level + change >= run->failed)
+    change = (int)(run->failed - 1 - run->grid_level);
   run->guess = now->guess;
   run->change_before = run->change;
   run->change = change;
-  run->rung += change;
+  run->grid_level += change;
   run->error_before = error_at(now->error, change);
 }
 

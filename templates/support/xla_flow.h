@@ -4,7 +4,7 @@
 #include "xla/ffi/api/c_api.h"
 
 /* Returns 1 if XLA only asks for the version of the interface that the handler was compiled for; sets it. */
-static int tells_version(const XLA_FFI_CallFrame *frame)
+static int answers_version(const XLA_FFI_CallFrame *frame)
 {
   for (XLA_FFI_Extension_Base *each = frame->extension_start; each; each = each->next)
     if (each->type == XLA_FFI_Extension_Metadata) {
@@ -31,11 +31,11 @@ static XLA_FFI_Error *failure(const XLA_FFI_CallFrame *frame, int status, const 
 
 /* Numbers of steps, and of steps between stored states, from the attributes, which are sorted by name; `count`
  * vectors. */
-static flow_way way_of(const XLA_FFI_CallFrame *frame, int count)
+static flow_call way_of(const XLA_FFI_CallFrame *frame, int count)
 {
   const long long *every = ((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
   const long long *steps = ((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
-  const flow_way way = {.steps = *steps, .every = *every, .count = count};
+  const flow_call way = {.steps = *steps, .every = *every, .count = count};
   return way;
 }
 
@@ -47,12 +47,12 @@ static long long rows_of(const XLA_FFI_Buffer *x)
   return rows;
 }
 
-/* Evaluates the flow: x (.., GIVEN), for derivatives also vectors (.., count, size). */
+/* Evaluates the flow: x (.., STEP_INPUTS), for derivatives also vectors (.., count, size). */
 static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
 {
   const XLA_FFI_Buffer *x = frame->args.args[0], *given = part == FLOW_STATES ? x : frame->args.args[1];
   const XLA_FFI_Buffer *found = frame->rets.rets[0];
-  flow_way way = way_of(frame, part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1]);
+  flow_call way = way_of(frame, part == FLOW_STATES ? 0 : (int)given->dims[x->rank - 1]);
   solver_report report;
   const int status = flow_rows(part, &way, rows_of(x), x->data, given->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
@@ -60,15 +60,15 @@ static XLA_FFI_Error *flow_of_frame(flow_part part, XLA_FFI_CallFrame *frame)
 
 XLA_FFI_Error *NAME(xla_states)(XLA_FFI_CallFrame *frame)
 {
-  return tells_version(frame) ? NULL : flow_of_frame(FLOW_STATES, frame);
+  return answers_version(frame) ? NULL : flow_of_frame(FLOW_STATES, frame);
 }
 
 XLA_FFI_Error *NAME(xla_push)(XLA_FFI_CallFrame *frame)
 {
-  return tells_version(frame) ? NULL : flow_of_frame(FLOW_PUSH, frame);
+  return answers_version(frame) ? NULL : flow_of_frame(FLOW_JVP, frame);
 }
 
 XLA_FFI_Error *NAME(xla_pull)(XLA_FFI_CallFrame *frame)
 {
-  return tells_version(frame) ? NULL : flow_of_frame(FLOW_PULL, frame);
+  return answers_version(frame) ? NULL : flow_of_frame(FLOW_VJP, frame);
 }

@@ -1,20 +1,20 @@
 /* Derivatives of gradients as an XLA custom call. Requires: xla_flow.h, flow_second.h. */
 
-/* x (.., GIVEN), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count, GIVEN); results
- * like the latter. */
+/* x (.., STEP_INPUTS), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count,
+ * STEP_INPUTS); results like the latter. */
 XLA_FFI_Error *NAME(xla_bend)(XLA_FFI_CallFrame *frame)
 {
-  flow_way way;
+  flow_call way;
   solver_report report;
   const XLA_FFI_Buffer *x, *slopes, *changes, *found;
   int status;
-  if (tells_version(frame))
+  if (answers_version(frame))
     return NULL;
   x = frame->args.args[0];
   slopes = frame->args.args[1];
   changes = frame->args.args[2];
   found = frame->rets.rets[0];
   way = way_of(frame, (int)slopes->dims[x->rank - 1]);
-  status = bend_rows(&way, rows_of(x), x->data, slopes->data, changes->data, found->data, &report);
+  status = hessian_rows(&way, rows_of(x), x->data, slopes->data, changes->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
 }

@@ -12,9 +12,9 @@ from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
 from scvi_codegen.advice.known_digits import known_digits
-from scvi_codegen.advice.promise import broken_promise
+from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.cli import main
-from scvi_codegen.cli.wording import in_known_digits
+from scvi_codegen.cli.formatting import in_known_digits
 
 PUSHED = sc.LagrangianSystem.from_text(
     name="pushed",
@@ -238,13 +238,13 @@ class TestPromises:
         motion = sc.solve_ivp(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
         assert motion.success
         assert motion.y[0, -1] == pytest.approx(1.999, abs=1e-6)
-        assert motion.trajectory.goal is not None
+        assert motion.trajectory.plan is not None
 
     def test_a_step_that_is_worse_than_the_tolerance_breaks_it(self, kepler):
         trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.2, steps=100)
         system = sc.problem("kepler").system
-        assert "alone has a relative error" in broken_promise(system, trajectory, trajectory.step_error / 20.0)
-        assert broken_promise(system, trajectory, 1e-3) == ""
+        assert "alone has a relative error" in missed_tolerance(system, trajectory, trajectory.step_error / 20.0)
+        assert missed_tolerance(system, trajectory, 1e-3) == ""
 
     @pytest.mark.parametrize(
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
@@ -257,11 +257,11 @@ class TestPromises:
         advice = sc.advise(problem.system, method, problem.q, p, 20.0, tolerance)
         found = stepper.integrate(problem.q, p, h=advice.h, steps=advice.steps)
         assert found.step_error > 100 * tolerance
-        assert broken_promise(problem.system, found, tolerance) == ""
+        assert missed_tolerance(problem.system, found, tolerance) == ""
         best = sc.compile_stepper(problem.system, "svi:8").integrate(problem.q, p, t_end=20.0)
         error = np.linalg.norm(found.q[-1] - best.q[-1]) / np.linalg.norm(best.q[-1])
         assert error < tolerance
-        assert "a second run with other steps differs by" in broken_promise(problem.system, found, error / 5)
+        assert "a second run with other steps differs by" in missed_tolerance(problem.system, found, error / 5)
 
     def test_an_estimate_that_is_too_small_hides_nothing(self):
         """Where a second run is at hand: a step's error says nothing of how errors grow."""
@@ -269,13 +269,13 @@ class TestPromises:
         trajectory = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0], [0.0, 1.2], h=0.2, steps=2000)
         known = known_digits(system, trajectory, most=20_000)
         tolerance = trajectory.step_error
-        assert broken_promise(system, trajectory, tolerance) == ""
-        assert "a second run with other steps differs by" in broken_promise(system, trajectory, tolerance, known)
+        assert missed_tolerance(system, trajectory, tolerance) == ""
+        assert "a second run with other steps differs by" in missed_tolerance(system, trajectory, tolerance, known)
 
     def test_an_energy_that_is_not_conserved_breaks_it(self):
         euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)
-        assert "energy" in broken_promise(sc.problem("kepler").system, trajectory, 1e-4)
+        assert "energy" in missed_tolerance(sc.problem("kepler").system, trajectory, 1e-4)
 
     @pytest.mark.parametrize(
         "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
@@ -285,12 +285,12 @@ class TestPromises:
         damped = sc.LagrangianSystem.from_text(**text, **given)
         trajectory = sc.compile_stepper(damped, "svi:8").integrate([1.0], [0.0], h=0.1, steps=100)
         assert abs(np.ptp(trajectory.energy())) > 0.1
-        assert broken_promise(damped, trajectory, 1e-9) == ""
-        assert "energy" in broken_promise(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
+        assert missed_tolerance(damped, trajectory, 1e-9) == ""
+        assert "energy" in missed_tolerance(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
 
     def test_it_is_withdrawn_aloud(self, monkeypatch):
         for module in ("cli.commands.run", "advice.solve_ivp"):
-            monkeypatch.setattr(f"scvi_codegen.{module}.broken_promise", lambda *_: "the tolerance is not kept")
+            monkeypatch.setattr(f"scvi_codegen.{module}.missed_tolerance", lambda *_: "the tolerance is not kept")
         result = run("kepler --span 5 --advise 1e-6")
         assert result.exit_code == 1
         assert "the tolerance is not kept" in result.stderr

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import scvi_codegen as sc
-from scvi_codegen.advice import promise
+from scvi_codegen.advice import tolerance_check
 from scvi_codegen.advice.advice import advise
-from scvi_codegen.advice.known_digits import Known, _at_the_end, _tenfold, known_digits
-from scvi_codegen.advice.promise import broken_promise
+from scvi_codegen.advice.known_digits import Known, _final_error, _tenfold, known_digits
+from scvi_codegen.advice.tolerance_check import missed_tolerance
 
 T, SPAN = 2.5, 7.5
 STIFFER = {"k": 9.0, "a": 0.75}
@@ -65,9 +65,9 @@ def test_advice_is_of_the_parameters_and_the_time_given(driven):
 def test_a_lucky_end_is_not_the_error():
     apart = np.full((160, 1), 1e-3)
     apart[-1] = 1e-9
-    assert 0.9e-3 < _at_the_end(apart)[0] < 1e-3
+    assert 0.9e-3 < _final_error(apart)[0] < 1e-3
     apart[-1], apart[:140] = 5e-3, 1.0
-    assert _at_the_end(apart)[0] == 5e-3
+    assert _final_error(apart)[0] == 5e-3
 
 
 @pytest.mark.parametrize("span", [20.0, 50.0])
@@ -112,15 +112,15 @@ def of_promise(**more):
 def test_a_promise_is_held_against_the_end(known, more, words):
     system = sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     regular, chaotic = (Known(q=np.array([known]), p=np.array([9.0]), tenfold=tenfold) for tenfold in (math.inf, 2.0))
-    found = broken_promise(system, of_promise(**more), 1e-6, regular)
+    found = missed_tolerance(system, of_promise(**more), 1e-6, regular)
     assert (words in found) if words else found == ""
-    assert bool(broken_promise(system, of_promise(**more), 1e-6, chaotic)) == bool(more)
+    assert bool(missed_tolerance(system, of_promise(**more), 1e-6, chaotic)) == bool(more)
 
 
 def test_without_a_second_run_one_is_made_of_doubts_alone(driven, monkeypatch):
     asked = []
-    monkeypatch.setattr(promise, "known_digits", lambda system, run, *, most: asked.append(most))
-    assert broken_promise(driven, of_promise(), 1e-6) == ""
+    monkeypatch.setattr(tolerance_check, "known_digits", lambda system, run, *, most: asked.append(most))
+    assert missed_tolerance(driven, of_promise(), 1e-6) == ""
     assert asked == []
-    assert "alone has a relative error" in broken_promise(driven, of_promise(step_error=1e-4), 1e-6)
+    assert "alone has a relative error" in missed_tolerance(driven, of_promise(step_error=1e-4), 1e-6)
     assert asked == [10_000 + 4 * 63]

@@ -13,7 +13,7 @@ from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES, adaptive_case
 from scvi_codegen.benchmark.references import field_of, final_states, states_after
-from scvi_codegen.benchmark.step_lengths import plot_step_lengths, step_lengths
+from scvi_codegen.benchmark.step_size_plot import plot_step_sizes, step_sizes
 from scvi_codegen.errors import StateError
 from scvi_codegen.native import building
 
@@ -111,11 +111,11 @@ def test_all_modes_run_and_agree():
 
 
 def test_steps_in_the_picture_follow_the_motion(tmp_path):
-    for name, (t, lengths) in step_lengths().items():
+    for name, (t, lengths) in step_sizes().items():
         assert len(t) == len(lengths) > 20, name
         assert lengths.max() > 8.0 * lengths.min()
     pytest.importorskip("matplotlib")
-    plot_step_lengths(tmp_path / "steps.svg")
+    plot_step_sizes(tmp_path / "steps.svg")
     assert (tmp_path / "steps.svg").stat().st_size > 1000
 
 

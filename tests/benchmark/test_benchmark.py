@@ -21,8 +21,8 @@ from scvi_codegen.benchmark import (
     compile_systems,
     compile_times,
     compositions,
+    constrained_bodies,
     hand_written,
-    held,
     measuring,
     mechanisms,
     paper_tables,
@@ -31,7 +31,7 @@ from scvi_codegen.benchmark import (
     start_up,
 )
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
-from scvi_codegen.benchmark.contenders import held_bodies, ours, peers
+from scvi_codegen.benchmark.contenders import constrained_contenders, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
@@ -107,9 +107,9 @@ class TestCases:
     @pytest.mark.parametrize("name", ["pendulum", "double-pendulum", "chain:5"])
     def test_rods_in_angles_obey_their_lagrangian_and_move_as_the_constraints_do(self, name):
         both = CONSTRAINED_CASES[name]()
-        assert np.abs(angles_of(both.places.q) - both.angles.q).max() < 1e-15
-        stepper = compile_stepper(both.places.system, "svi:4")
-        end = stepper.integrate(*stepper.project(both.places.q[0]), h=0.02, steps=50).q[-1]
+        assert np.abs(angles_of(both.positions.q) - both.angles.q).max() < 1e-15
+        stepper = compile_stepper(both.positions.system, "svi:4")
+        end = stepper.integrate(*stepper.project(both.positions.q[0]), h=0.02, steps=50).q[-1]
         accelerations = partial(rod_accelerations, of=both.angles.parameters, functions=np)
         start = np.concatenate([both.angles.q[0], both.angles.velocity[0]])
         exact = solve_ivp(
@@ -382,7 +382,7 @@ class TestCommand:
         said = []
         plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
         names = ["planar-pendulum", "drift"]
-        text = bench.benchmark(names, plan, json_path=str(path), say=said.append).text()
+        text = bench.benchmark(names, plan, json_path=str(path), report_activity=said.append).text()
         assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
         assert "skipped cyrk: CyRK is not installed" in text
         data = json.loads(path.read_text())
@@ -393,14 +393,14 @@ class TestCommand:
         assert "planar-pendulum: reference" in said
 
     def test_ctrl_c_keeps_what_was_measured(self, tmp_path, monkeypatch):
-        def interrupt(plan, say):
+        def interrupt(plan, report_activity):
             raise KeyboardInterrupt
 
-        def fail(plan, say):
+        def fail(plan, report_activity):
             raise StateError("no")
 
         done = ResultTable(name="done", title="kept", columns={"a": ""}, rows=({"a": "b"},))
-        sections = {"one": lambda plan, say: done, "bad": fail, "two": interrupt, "three": interrupt}
+        sections = {"one": lambda plan, report_activity: done, "bad": fail, "two": interrupt, "three": interrupt}
         monkeypatch.setattr(bench, "SECTIONS", sections)
         path = tmp_path / "out.json"
         shown = []
@@ -414,7 +414,7 @@ class TestCommand:
     def test_each_section_is_written_when_measured_and_not_measured_again(self, tmp_path, monkeypatch):
         path, measured = tmp_path / "out.json", []
 
-        def section(name, plan, say):
+        def section(name, plan, report_activity):
             on_disk = json.loads(path.read_text())["tables"] if path.exists() else []
             measured.append((name, [each["name"] for each in on_disk]))
             if name == "two" and len(measured) == 2:
@@ -552,32 +552,39 @@ class TestTables:
 
     def test_held_bodies_are_the_same_in_angles_on_rods_and_in_mujoco(self):
         """The chain twice by this project, and both by MuJoCo where it is installed: small steps, one motion."""
-        chain, linkage = (held_bodies.HELD[name]() for name in ("chain", "four-bar"))
-        on_rods, in_angles = held_bodies.our_motion(chain, "svi:4"), held_bodies.motion_in_angles(chain, "svi:4")
+        chain, linkage = (constrained_contenders.LINKAGES[name]() for name in ("chain", "four-bar"))
+        on_rods, in_angles = (
+            constrained_contenders.our_motion(chain, "svi:4"),
+            constrained_contenders.motion_in_angles(chain, "svi:4"),
+        )
         assert max(move(0.01, 100).energy for move in (on_rods, in_angles)) < 1e-6
-        assert on_rods(0.01, 100).stretch < 1e-14
-        assert held_bodies.our_motion(linkage, "svi:3")(0.02, 50).energy < 1e-8
+        assert on_rods(0.01, 100).length_error < 1e-14
+        assert constrained_contenders.our_motion(linkage, "svi:3")(0.02, 50).energy < 1e-8
         if importlib.util.find_spec("mujoco") is None:
             pytest.skip("mujoco is not installed (extra bench)")
-        assert held_bodies.mujoco_motion(chain, "RK4")(0.001, 1000).energy < 1e-6
-        soft, stiff = (held_bodies.mujoco_motion(linkage, "RK4", stiff=stiff)(0.001, 1000) for stiff in (False, True))
-        assert stiff.stretch < 1e-5 < soft.stretch < 1e-2
+        assert constrained_contenders.mujoco_motion(chain, "RK4")(0.001, 1000).energy < 1e-6
+        soft, stiff = (
+            constrained_contenders.mujoco_motion(linkage, "RK4", stiff=stiff)(0.001, 1000) for stiff in (False, True)
+        )
+        assert stiff.length_error < 1e-5 < soft.length_error < 1e-2
         assert stiff.energy < 1e-4
 
     def test_what_is_unstable_says_so_and_leaves_no_file(self, monkeypatch, tmp_path):
         """MuJoCo would write its warnings into the working folder."""
         pytest.importorskip("mujoco", reason="extra bench")
         monkeypatch.chdir(tmp_path)
-        chain = held_bodies.HELD["chain"]()
-        move = held_bodies.mujoco_motion(chain, "Euler")
-        rows = list(held._rows(chain, "MuJoCo", move, (100, 1000), bench.Plan()))
+        chain = constrained_contenders.LINKAGES["chain"]()
+        move = constrained_contenders.mujoco_motion(chain, "Euler")
+        rows = list(constrained_bodies._rows(chain, "MuJoCo", move, (100, 1000), bench.Plan()))
         assert ["unstable" in row.get("why_not", "") for row in rows] == [True, False]
         assert not list(tmp_path.iterdir())
 
     def test_rows_of_held_bodies_are_told_at_equal_time(self, monkeypatch):
-        monkeypatch.setattr(held, "OUR_STEPS", (1000, 500))
-        monkeypatch.setattr(held, "_others", lambda bodies: [("other", held.our_motion(bodies, "svi:1"))])
-        rows = held.run_held(bench.Plan(quick=True), lambda text: None).rows
+        monkeypatch.setattr(constrained_bodies, "OUR_STEPS", (1000, 500))
+        monkeypatch.setattr(
+            constrained_bodies, "_others", lambda bodies: [("other", constrained_bodies.our_motion(bodies, "svi:1"))]
+        )
+        rows = constrained_bodies.run_constrained_bodies(bench.Plan(quick=True), lambda text: None).rows
         others = [row for row in rows if row["by"] == "other"]
         assert {row["bodies"] for row in rows} == {"chain", "four-bar"}
         assert all(row["ratio"] > 0.0 for row in others if row["ours_then"] is not None)

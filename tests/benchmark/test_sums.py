@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import cluster, long_sums, shared_steps, sums
+from scvi_codegen.benchmark import cluster, indexed_energies, sums, threads
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
 from scvi_codegen.indexed_compiler import compile_indexed
@@ -80,14 +80,14 @@ def test_growth_is_measured(monkeypatch):
 
 @pytest.mark.full
 def test_threads_are_measured():
-    rows = shared_steps.run_threads(QUICK, quiet).rows
+    rows = threads.run_threads(QUICK, quiet).rows
     assert [row["problem"] for row in rows] == ["ring"] * 2 + ["atoms"] * 2
     assert all(row["one_us"] > 0.0 and row["threads_2"] > 0.0 for row in rows)
 
 
 @pytest.mark.full
 def test_energies_stay_at_rounding():
-    for row in long_sums.run_energies(QUICK, quiet).rows:
+    for row in indexed_energies.run_energies(QUICK, quiet).rows:
         exact = row["by"].endswith("svi:8")
         assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from scvi_codegen import load_model, problem
 from scvi_codegen.cli import main
-from scvi_codegen.cli.conservation import BALANCED_COORDINATES, BALANCED_STEPS, energy_balance
+from scvi_codegen.cli.conservation import MAX_BALANCE_COORDINATES, MAX_BALANCE_STEPS, energy_balance
 
 MODEL = """
 [system]
@@ -76,7 +76,7 @@ def test_damping_and_inputs_have_one():
     [
         {"(x - y)**4/4": "(2 + cos(t))*(x - y)**4/12"},
         {"svi:4": "radau-iia:2"},
-        {"steps = 70": f"steps = {BALANCED_STEPS + 1}"},
+        {"steps = 70": f"steps = {MAX_BALANCE_STEPS + 1}"},
         {'[forces]\nx = "-x_dot/10"\n': ""},
     ],
     ids=["L has time", "a method without account", "many steps", "no forces"],
@@ -95,5 +95,5 @@ def test_where_there_is_none(changed):
 def test_many_coordinates_have_none():
     """Nothing is asked of the run."""
     system = problem("outer-solar-system").system
-    assert system.dimension > BALANCED_COORDINATES
+    assert system.dimension > MAX_BALANCE_COORDINATES
     assert energy_balance(system, None, 10) is None  # type: ignore[arg-type]

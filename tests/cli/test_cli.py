@@ -23,7 +23,7 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
-from scvi_codegen.cli.choices import Choices, read_model
+from scvi_codegen.cli.choices import ModelOptions, read_model
 from scvi_codegen.cli.conservation import energy_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
@@ -34,8 +34,8 @@ from scvi_codegen.models.problems import PROBLEMS, problem
 pytestmark = pytest.mark.long
 
 COMMAND = shutil.which("scvi-codegen", path=str(Path(sys.executable).parent))
-NOTHING = Choices(
-    **dict.fromkeys(Choices.__dataclass_fields__) | {"parameter": ()}  # type: ignore[arg-type]
+NOTHING = ModelOptions(
+    **dict.fromkeys(ModelOptions.__dataclass_fields__) | {"parameter": ()}  # type: ignore[arg-type]
 )
 
 
@@ -481,7 +481,7 @@ class TestGenerate:
         output_of("generate", "planar-pendulum", "-o", "pendulum_svi", "--force")
 
     def test_folder_names_are_checked(self):
-        assert "call it 'pendulum_svi'" in error_of("generate", "planar-pendulum", "-o", "Pendulum-SVI")
+        assert "use 'pendulum_svi'" in error_of("generate", "planar-pendulum", "-o", "Pendulum-SVI")
 
 
 class TestDerive:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from scvi_codegen.cli import checkup, main
+from scvi_codegen.cli import equipment, main
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
@@ -35,7 +35,9 @@ def findings(status: int = 0) -> dict[str, dict[str, Any]]:
 @pytest.fixture
 def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is of no account."""
-    monkeypatch.setattr(checkup, "_trial", lambda folder: checkup.Equipment(name="trial", status="lacks", found=""))
+    monkeypatch.setattr(
+        equipment, "_trial", lambda folder: equipment.CheckResult(name="trial", status="lacks", found="")
+    )
 
 
 def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
@@ -71,7 +73,7 @@ def test_without_a_compiler_it_says_what_to_install(tmp_path, monkeypatch):
 
 def test_a_compiler_that_is_named_and_not_there(monkeypatch):
     monkeypatch.setenv("CC", "no-such-cc")
-    assert "named by the environment variable CC ('no-such-cc')" in findings(1)["compiler"]["remedy"]
+    assert "in the environment variable CC ('no-such-cc')" in findings(1)["compiler"]["remedy"]
 
 
 def test_a_compiler_that_refuses_is_quoted(monkeypatch):
@@ -136,7 +138,7 @@ def test_extras_are_those_of_the_project_with_what_they_lack(monkeypatch):
             raise importlib.metadata.PackageNotFoundError(name)
         return found
 
-    monkeypatch.setattr(checkup, "version", version)
+    monkeypatch.setattr(equipment, "version", version)
     found = findings()
     assert found["extra plot"]["status"] == "lacks"
     assert found["extra plot"]["remedy"] == "missing matplotlib >= 3.8: pip install 'scvi-codegen[plot]'"

@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 import scvi_codegen as sc
 from scvi_codegen import benchmark
 from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.cli import frame, main
+from scvi_codegen.cli import command_group, main
 from scvi_codegen.models.model_file import parse_model
 
 KEPLER = ("kepler", "--step", "0.1", "--steps", "50", "--method", "svi:4")
@@ -155,4 +155,4 @@ def test_a_certificate_is_the_one_that_is_saved():
 
 def test_what_is_no_number_is_none():
     values = {"a": math.nan, "b": [math.inf, 1.5], "c": np.array([1.0, np.nan]), "d": np.int64(3), "e": Path("x")}
-    assert frame._plain(values) == {"a": None, "b": [None, 1.5], "c": [1.0, None], "d": 3, "e": "x"}
+    assert command_group._plain(values) == {"a": None, "b": [None, 1.5], "c": [1.0, None], "d": 3, "e": "x"}

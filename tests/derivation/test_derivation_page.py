@@ -39,12 +39,12 @@ from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern
 from scvi_codegen.display.page.blocks import Formula, Paragraph
 from scvi_codegen.display.page.typesetting import SPACE
-from scvi_codegen.ir import curve_sweeps, sweeps
-from scvi_codegen.ir.sweep import Sweep
+from scvi_codegen.ir import curve_iterations, iterations
+from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.phase_space import with_auxiliaries
 from scvi_codegen.rendering.outline import functions_of, reached
-from scvi_codegen.rendering.text import render
+from scvi_codegen.rendering.program_source import render
 
 TILTED = """m*(1 + q**2/3)*q_dot**2/2 + a*q*q_dot*sin(t) - k*q**4/4 + q_dot**4/40"""
 METHODS = [
@@ -197,8 +197,8 @@ class TestPage:
     def test_every_kind_of_sweep_is_explained(self):
         kinds = [
             each
-            for each in (vars(sweeps) | vars(curve_sweeps)).values()
-            if isinstance(each, type) and issubclass(each, Sweep)
+            for each in (vars(iterations) | vars(curve_iterations)).values()
+            if isinstance(each, type) and issubclass(each, FixedPointIteration)
         ]
         assert set(SWEEPS) == {each for each in kinds if not isabstract(each)}
         singular = sc.HamiltonianSystem.from_text(

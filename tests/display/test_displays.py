@@ -53,9 +53,9 @@ def advice() -> sc.Advice:
     return sc.advise(kepler.system, sc.StoermerVerlet(), kepler.q, [0.0, 1.7], 5.0, 1e-3)
 
 
-def certificate(outcome: Outcome = Outcome.KEPT) -> sc.Certificate:
-    check = Check(name="order", promise="it is <4>", outcome=outcome, measured=3.98, bound=3.7, remark="from 4 steps")
-    unknown = Check(name="drift", promise="none", outcome=Outcome.NOT_MEASURED, remark="no symmetry")
+def certificate(outcome: Outcome = Outcome.SATISFIED) -> sc.Certificate:
+    check = Check(name="order", statement="it is <4>", outcome=outcome, measured=3.98, bound=3.7, remark="from 4 steps")
+    unknown = Check(name="drift", statement="none", outcome=Outcome.NOT_MEASURED, remark="no symmetry")
     return sc.Certificate(
         title="Kepler problem by SVI",
         system="Kepler problem",
@@ -199,7 +199,7 @@ class TestSymmetry:
 
 class TestOutcomes:
     def test_a_certificate_shows_its_checks_and_what_is_broken(self):
-        kept, broken = certificate()._repr_html_(), certificate(Outcome.BROKEN)._repr_html_()
+        kept, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
         assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in kept
         assert "<strong>" not in kept
         assert "<strong>VIOLATED</strong>" in broken

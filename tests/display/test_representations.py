@@ -12,7 +12,7 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.display.summary import LONGEST
+from scvi_codegen.representation import LONGEST
 
 NEEDS_LIBRARIES = {"ControlledMotion", "GravitatingBodies", "JaxFlow", "TorchFlow"}
 """Made by optional libraries only."""

@@ -9,7 +9,7 @@ from sabotage import changed_property, changed_result
 
 from scvi_codegen.lowering import constraints as lowered_constraints
 from scvi_codegen.lowering import derivatives as lowered_derivatives
-from scvi_codegen.lowering import families
+from scvi_codegen.lowering import stage_groups
 from scvi_codegen.mechanics import forms as mechanics
 from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.tables.quadrature import gauss_lobatto
@@ -69,7 +69,7 @@ RATTLES = tuple(
     for what, *edit in (
         ("a hidden constraint without g_t", r"value \+ M, 1, lambda\)", "value + M + CONSTRAINTS, 1, lambda)"),
         ("half of the force at the end", r"now->force\[i \* B \+ DEGREE\];", "now->force[i * B + DEGREE] / 2;"),
-        ("constraints of the start of a step", r"step->t \+ HELD_ABSCISSA\[n\] \* step->h;", "step->t;"),
+        ("constraints of the start of a step", r"step->t \+ RATTLE_ABSCISSA\[n\] \* step->h;", "step->t;"),
         ("masses that are not inverted", r"now->inverse_mass\[i\] = 1 / now", "now->inverse_mass[i] = now"),
     )
 ) + tuple(
@@ -78,8 +78,8 @@ RATTLES = tuple(
         ("slopes of the next point", r"slope = now->slope \+ e \* B, \*own", "slope = now->slope + e * B + 1, *own"),
         (
             "positions off by 1e-12 of a step",
-            r"HELD_POSITION\[b\]\[r\] \* z",
-            "HELD_POSITION[b][r] * (1 + 1e-12) * z",
+            r"RATTLE_POSITION\[b\]\[r\] \* z",
+            "RATTLE_POSITION[b][r] * (1 + 1e-12) * z",
         ),
     )
 )
@@ -107,7 +107,7 @@ CONSTRAINTS = (
         "a multiplier's force off its gradient",
         case("linkage/lobatto-svi"),
         constrained_stages,
-        "with_reactions",
+        "with_constraint_forces",
         changed_result(lambda found: (found[0] * (1 + sympy.Rational(1, 10**6)), *found[1:])),
     ),
     here(
@@ -125,7 +125,7 @@ CONSTRAINTS = (
         "multipliers without what velocities add",
         case("linkage/lobatto-svi"),
         lowered_constraints,
-        "along_motion",
+        "time_derivatives",
         lambda _: lambda system, functions: (sympy.S.Zero,) * len(functions),
     ),
     here(
@@ -135,7 +135,7 @@ CONSTRAINTS = (
         "_with_end",
         lambda original: lambda table, rows, points: without_last_of(original(table, rows, points), rows),
     ),
-    here("constraints 1e-9 off", case("linkage/lobatto-svi"), families, "system_kernel", constraints_off),
+    here("constraints 1e-9 off", case("linkage/lobatto-svi"), stage_groups, "system_kernel", constraints_off),
     text(
         "multipliers of the other sign",
         case("linkage/lobatto-svi"),
@@ -147,7 +147,7 @@ CONSTRAINTS = (
         "reactions off what the blade pushes along",
         case("sleigh/lobatto-svi"),
         constrained_stages,
-        "with_reactions",
+        "with_constraint_forces",
         changed_result(lambda found: (found[0] * (1 + sympy.Rational(1, 10**6)), *found[1:])),
     ),
     here(
@@ -168,7 +168,7 @@ CONSTRAINTS = (
         "multipliers without what turning adds",
         case("sleigh/lobatto-svi"),
         lowered_constraints,
-        "along_motion",
+        "time_derivatives",
         lambda _: lambda system, functions: (sympy.S.Zero,) * len(functions),
     ),
     text("multipliers of the other sign on a blade", case("sleigh/lobatto-svi"), r"y\[j\] = -y\[j\]", "y[j] = +y[j]"),
@@ -181,35 +181,41 @@ CONSTRAINTS = (
 )
 
 C_TEXT = (
-    ("points at the time of the start", "driven/svi", "given_wide", r"f->abscissa\[n\], v", "0, v"),
-    ("arguments stretched by h too much", "cart/svi", "slopes_of", r"\(real\)loop->power \* ", ""),
-    ("results not stretched by h", "wire/lobatto-svi", "slopes_of", r"\*= \(real\)f->scatter\[s\]\.power / h", "*= 0"),
+    ("points at the time of the start", "driven/svi", "inputs_wide", r"f->abscissa\[n\], v", "0, v"),
+    ("arguments stretched by h too much", "cart/svi", "derivatives_of_group", r"\(real\)loop->power \* ", ""),
+    (
+        "results not stretched by h",
+        "wire/lobatto-svi",
+        "derivatives_of_group",
+        r"\*= \(real\)f->scatter\[s\]\.power / h",
+        "*= 0",
+    ),
     ("q1 by h at its start alone", "vortices/svi", "end_position", r"END_POSITION\[b\] \* z\[i \* B \+ b\]", "0"),
-    ("momenta held", "double/scvi", "push_step", r"momentum_rows\(at, 0\);", ""),
+    ("momenta held", "double/scvi", "jvp_step", r"momentum_rows\(at, 0\);", ""),
     ("rows exchanged no more on the way back", "linkage/lobatto-svi", "lower_wide", r"if \(back\)", "if (0)"),
-    ("slopes by momenta lost on the way back", "double/gauss", "pull_on", r"momentum_rows\(at, 1\);", ""),
+    ("slopes by momenta lost on the way back", "double/gauss", "vjp_with_unknowns", r"momentum_rows\(at, 1\);", ""),
     (
         "time that does not pass on the way back",
         "driven/svi",
         "end_time",
-        r"flow\(back, at->v \+ GIVEN_H - 1",
-        "flow(0, at->v + GIVEN_H - 1",
+        r"flow\(back, at->v \+ INPUT_H - 1",
+        "flow(0, at->v + INPUT_H - 1",
     ),
     (
         "time that goes on without the step",
         "driven/svi",
         "end_time",
-        r"flow\(back, at->v \+ GIVEN_H - 1, 1,",
-        "flow(back, at->v + GIVEN_H - 1, back,",
+        r"flow\(back, at->v \+ INPUT_H - 1, 1,",
+        "flow(back, at->v + INPUT_H - 1, back,",
     ),
-    ("swept changes stretched by h once too little", "kepler/svi-3", "push_swept", r"2\.0 \* dh", "1.0 * dh"),
-    ("swept slopes by momenta without the drift", "kepler/svi-3", "pull_swept", r"v\[M \+ i\] \+= drift;", ""),
-    ("swept momenta that h does not change", "double/svi", "push_swept", r"dh \* at->E\[n\]\[i\]", "0 * dh"),
-    ("swept slopes by masses of the other sign", "double/svi", "given_back", r"part : -part", "part : part"),
+    ("swept changes stretched by h once too little", "kepler/svi-3", "jvp_by_iteration", r"2\.0 \* dh", "1.0 * dh"),
+    ("swept slopes by momenta without the drift", "kepler/svi-3", "vjp_by_iteration", r"v\[M \+ i\] \+= drift;", ""),
+    ("swept momenta that h does not change", "double/svi", "jvp_by_iteration", r"dh \* at->E\[n\]\[i\]", "0 * dh"),
+    ("swept slopes by masses of the other sign", "double/svi", "add_input_gradient", r"part : -part", "part : part"),
     (
         "sweeps of changes that end early",
         "kepler/svi-3",
-        "changes_rest",
+        "vectors_status",
         r"<= LEFT_TO_COME \* before",
         "<= 1e-14 * before",
     ),
@@ -251,9 +257,7 @@ C_TEXT = (
     ),
 )
 SECOND = (
-    text(
-        "the end position does not bend", case("kepler/svi-3"), r"bend_end_position\(to\);", "(void)bend_end_position;"
-    ),
+    text("the end position does not bend", case("kepler/svi-3"), r"add_end_hessian\(to\);", "(void)add_end_hessian;"),
     text(
         "second derivatives at the start of the step",
         case("driven/svi"),

@@ -21,8 +21,8 @@ def certify(names: list[str]) -> None:
         except (BuildError, SyntaxError, NameError) as error:
             print(f"{type(error).__name__}: {' '.join(str(error).split())[:120]}")
             sys.exit(3)
-        if certificate.broken:
-            print(f"BROKEN {name}: {', '.join(check.name for check in certificate.broken)}")
+        if certificate.violated:
+            print(f"BROKEN {name}: {', '.join(check.name for check in certificate.violated)}")
             sys.exit(1)
 
 

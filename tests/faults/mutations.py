@@ -37,8 +37,8 @@ from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
 from scvi_codegen.ir import arithmetic, numbers
-from scvi_codegen.lowering import families
-from scvi_codegen.lowering.solvers import collocation as collocation_sweep
+from scvi_codegen.lowering import stage_groups
+from scvi_codegen.lowering.solvers import collocation as collocation_iteration
 from scvi_codegen.lowering.solvers import separable
 from scvi_codegen.mechanics import forms as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -81,7 +81,7 @@ ROUNDOFF = (
         "(0 * step->carry_q[i] +",
     ),
     ("weights of 53 bits", "round/svi-8", "sweep", r"data->kick_low, F", "(const weight[GROUPS]){0}, F"),
-    ("h^2 of 53 bits", "kepler/svi-3", "prepare_sweep", r"data->square_low = .*;", "data->square_low = 0.0;"),
+    ("h^2 of 53 bits", "kepler/svi-3", "prepare_iteration", r"data->square_low = .*;", "data->square_low = 0.0;"),
     ("drifts of 53 bits", "oscillator/svi-8", "sweep", r" \+ DRIFT_LOW\[n\] \* drift\[i\]", ""),
 )
 
@@ -123,36 +123,36 @@ MUTATIONS = (
     function(
         "a power of h too much in a gather",
         case("double/svi"),
-        families,
+        stage_groups,
         "_gather_loop",
         changed_result(lambda loop: replace(loop, power=loop.power + 1) if loop.name.endswith("_1") else loop),
     ),
     function(
         "a power of h missing in a scatter",
         case("double/svi"),
-        families,
+        stage_groups,
         "_scatter_loop",
         changed_result(lambda loop: replace(loop, power=loop.power - 1) if loop.name.endswith("_0") else loop),
     ),
     function(
         "a slope five per cent off",
         case("double/svi"),
-        families,
-        "_slope_blocks",
+        stage_groups,
+        "_derivative_blocks",
         slopes(lambda k, slope: slope * sympy.Rational(21, 20) if k == 0 else slope),
     ),
     function(
         "a slope lost",
         case("double/sc"),
-        families,
-        "_slope_blocks",
+        stage_groups,
+        "_derivative_blocks",
         slopes(lambda k, slope: sympy.S.Zero if k == 1 else slope),
     ),
     function(
         "the slope of H_p off",
         case("vortices/svi"),
-        families,
-        "_slope_blocks",
+        stage_groups,
+        "_derivative_blocks",
         slopes(lambda k, slope: slope * sympy.Rational(11, 10) if k == 1 else slope),
     ),
     # The C text.
@@ -230,7 +230,7 @@ MUTATIONS = (
     function(
         "L_q and L_v exchanged at both ends",
         case("kepler/printed"),
-        collocation_sweep,
+        collocation_iteration,
         "_printed_ends",
         changed_result(lambda ends: replace(ends, start_force=ends.end_force, end_force=ends.start_force)),
     ),
@@ -365,7 +365,11 @@ MUTATIONS = (
         changed_property(scaled_first(1 + sympy.Rational(1, 10**6))),
     ),
     function(
-        "another potential, consistently", case("double/svi"), stage_system.ScalarFamily, "slopes", of_another_system
+        "another potential, consistently",
+        case("double/svi"),
+        stage_system.ScalarStageGroup,
+        "slopes",
+        of_another_system,
     ),
     function("L_vq v lost", case("double/sc"), mechanics, "_along", without_rates_of("theta1", "theta2")),
     function("L_vt lost", case("cart/sc"), mechanics, "_along", without_rates_of("t")),

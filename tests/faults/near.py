@@ -22,7 +22,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     "templates/main": ("models/test_package.py",),
     "templates/parts/main": ("models/test_package_inputs.py",),
     "templates/support/density": ("runtime/test_density.py", "runtime/test_low_words.py"),
-    "templates/support/hamiltonian_sweep": (
+    "templates/support/hamiltonian_iteration": (
         "mechanics/test_hamiltonian.py",
         "lowering/test_iterations.py",
         "lowering/test_sweeps.py",
@@ -44,7 +44,14 @@ NEAR: dict[str, tuple[str, ...]] = {
     ),
     **{
         f"templates/support/{stem}": ("runtime/test_swept_derivatives.py", "runtime/test_sensitivity.py")
-        for stem in ("by_sweeps", "carry_by", "changes_at", "coupled_changes", "separable_changes", "one_by_one")
+        for stem in (
+            "vectors_by_iteration",
+            "carry_by",
+            "changes_at",
+            "coupled_derivatives",
+            "separable_derivatives",
+            "vectors_step_by_step",
+        )
     },
     "scvi_codegen/lowering/swept": ("runtime/test_swept_derivatives.py",),
     "templates/support/linear": ("runtime/test_sensitivity.py", "rendering/test_derivatives_text.py"),
@@ -110,7 +117,7 @@ NEAR: dict[str, tuple[str, ...]] = {
             "observed",
             "rungs",
             "stage_error",
-            "sweep_error",
+            "iteration_error",
             "sweep_or",
             "trial",
         )
@@ -146,7 +153,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     },
     **{
         f"templates/support/{stem}": ("runtime/test_indexed_waves.py", "runtime/test_indexed_newton.py")
-        for stem in ("gmres", "indexed_waves", "lattice_", "linear_vectors")
+        for stem in ("gmres", "fourier_preconditioner", "lattice_", "linear_vectors")
     },
     "templates/support/fmu": ("models/test_fmu.py",),
     "templates/fmu": ("models/test_fmu.py",),
@@ -200,7 +207,7 @@ NEAR: dict[str, tuple[str, ...]] = {
     },
     **{
         f"scvi_codegen/runtime/{stem}": ("runtime/test_exchanges.py", "runtime/test_step_error.py")
-        for stem in ("retaken", "accuracy")
+        for stem in ("recomputed_steps", "accuracy")
     },
     **{
         f"scvi_codegen/runtime/{stem}": ("runtime/test_deviations.py", "runtime/test_tangents.py")

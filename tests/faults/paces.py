@@ -28,7 +28,7 @@ PACES = (
     text(
         "time held where h changes",
         case("slowed/svi-3"),
-        r"flow\(back, time, weight \* rate, at->v \+ GIVEN_H\);",
+        r"flow\(back, time, weight \* rate, at->v \+ INPUT_H\);",
         "",
         within="end_time",
     ),
@@ -50,7 +50,7 @@ PACES = (
         "the energy of the start that falls with the momentum",
         case("slowed/svi-3"),
         lowered_derivatives,
-        "_level_slopes",
+        "_energy_derivatives",
         changed_result(
             lambda kernel: replace(kernel, results=(*kernel.results[:2], *kernel.results[:1], *kernel.results[3:]))
         ),

@@ -117,7 +117,7 @@ def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, ed
 @contextlib.contextmanager
 def _sabotaged(apply: Callable[[Sabotage], None] | None) -> Iterator[Sabotage]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiler, "remembered_text", lambda *arguments: arguments[-1]())
+        patch.setattr(compiler, "cached_source", lambda *arguments: arguments[-1]())
         sabotage = Sabotage(patch)
         try:
             if apply is not None:

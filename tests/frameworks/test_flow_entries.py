@@ -8,13 +8,13 @@ from functools import cache
 
 import numpy as np
 from numpy.testing import assert_allclose
-from pumped_leapfrog import EVERY, GIVEN, ROWS, STEPS, hessian, slopes, states, stepper, weights
+from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, slopes, states, stepper, weights
 
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
 
-KEPT, SIZE = STEPS // EVERY + 1, len(GIVEN)
+KEPT, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)
 compiled = cache(stepper)
 WAYS = {"rtol": 0, "atol": 2e-12}
 
@@ -49,7 +49,9 @@ def test_derivatives_of_rows_forward_and_back():
 
 def test_second_derivatives_of_rows():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
-    found = called(flow().second_library, "bend_rows", (STEPS, EVERY, SIZE, 2), [ROWS, same, changes], (2, SIZE, SIZE))
+    found = called(
+        flow().second_library, "hessian_rows", (STEPS, EVERY, SIZE, 2), [ROWS, same, changes], (2, SIZE, SIZE)
+    )
     exact = np.array([hessian(row) for row in ROWS])
     assert_allclose(found, exact, rtol=0, atol=1e-7 * abs(exact).max())
 

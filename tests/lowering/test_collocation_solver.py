@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from samples import sweep
 
-from scvi_codegen.ir.curve_sweeps import CollocationSweep
-from scvi_codegen.ir.sweeps import SeparableSweep
+from scvi_codegen.ir.curve_iterations import CollocationIteration
+from scvi_codegen.ir.iterations import SeparableIteration
 from scvi_codegen.methods import (
     SCVI,
     SVI,
@@ -43,14 +43,14 @@ def difference(left, right):
 @pytest.mark.parametrize("method", [*POSITION, *PRINTED], **named)
 def test_every_coupled_system_has_an_iteration_on_accelerations(sample, method):
     kinds = {type(sweep(sample(name).system, method)) for name in COUPLED}
-    assert kinds == {CollocationSweep}
+    assert kinds == {CollocationIteration}
 
 
 def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample):
     system = sample("kepler").system
-    assert {type(sweep(system, method)) for method in POSITION} == {SeparableSweep}
-    assert {type(sweep(system, method)) for method in PRINTED} == {CollocationSweep}
-    assert isinstance(sweep(system, SCVI(1, variational=False)), SeparableSweep)
+    assert {type(sweep(system, method)) for method in POSITION} == {SeparableIteration}
+    assert {type(sweep(system, method)) for method in PRINTED} == {CollocationIteration}
+    assert isinstance(sweep(system, SCVI(1, variational=False)), SeparableIteration)
 
 
 def test_more_points_than_lanes_are_left_to_newton(sample):

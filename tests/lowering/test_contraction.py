@@ -71,18 +71,18 @@ def test_slow_sweeps_are_not_taken_for_rounding():
 VERDICTS = """
 #include <float.h>
 #include <math.h>
-enum {{ M = 3, SWEEPS_AFTER = {after} }};
+enum {{ M = 3, FINAL_ITERATIONS = {after} }};
 typedef double number;
 typedef struct {{ double tolerance; long long max_iterations; int absolute; }} solver_options;
 static double larger(double a, double b) {{ return a > b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}
-#include "{folder}/contraction.h"
+#include "{folder}/convergence.h"
 #include "{folder}/inverse_sizes.h"
 int verdict(double change, double last, double before, double tolerance, int absolute, int k)
 {{
   const solver_options options = {{tolerance, 40, absolute}};
-  return sweep_status(change * change, last * last, before * before, &options, k);
+  return iteration_status(change * change, last * last, before * before, &options, k);
 }}
 int continued(long long steps, double change) {{ return (int)steps_to_continue(steps, change * change); }}
 void scales(double absolute, double *size)

@@ -7,8 +7,8 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.compiler import program_of
-from scvi_codegen.ir.sweep import Kept
-from scvi_codegen.lowering.solvers.ladder import ladder_of
+from scvi_codegen.ir.iteration import StoredValues
+from scvi_codegen.lowering.solvers.predictor_tables import predictor_of
 from scvi_codegen.rendering.target import DOUBLE
 from scvi_codegen.tables.basis import legendre_functional
 from scvi_codegen.tables.precision import mp
@@ -38,7 +38,7 @@ def test_coefficients_have_106_bits(method):
 @pytest.mark.parametrize("degree", [2, 8])
 def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree):
     sweep = program_of(system, sc.SVI(degree)).sweep
-    ladder, same = ladder_of(sweep), ladder_of(sweep).reach
+    ladder, same = predictor_of(sweep), predictor_of(sweep).reach
     for found, wanted in (
         (ladder.alone[same], sweep.guess.last_alone),
         (ladder.last[same][same], sweep.guess.last),
@@ -52,8 +52,8 @@ def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree)
 def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
     system = sc.problem("double-pendulum").system
     sweep = program_of(system, method).sweep
-    ladder, points = ladder_of(sweep), np.array(sweep.guess.abscissae, dtype=float)
-    accelerations = sweep.kept is Kept.ACCELERATIONS  # z = h a is kept
+    ladder, points = predictor_of(sweep), np.array(sweep.guess.abscissae, dtype=float)
+    accelerations = sweep.kept is StoredValues.ACCELERATIONS  # z = h a is kept
 
     def curve(t):
         return 1.0 + t - 2.0 * t**3 + t**5

@@ -19,12 +19,12 @@ from scvi_codegen import (
     generate_source,
 )
 from scvi_codegen.errors import MethodError, StepFailedError
-from scvi_codegen.ir.program import WORTH_REMEMBERING
-from scvi_codegen.lowering.families import lowered_family
-from scvi_codegen.lowering.sites import sites_of
+from scvi_codegen.ir.program import LEAST_REUSED_UNKNOWNS
+from scvi_codegen.lowering.stage_groups import lowered_stage_group
+from scvi_codegen.lowering.unknown_layout import layout_of
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.systems import fput_chain
-from scvi_codegen.rendering.text import workspace_size
+from scvi_codegen.rendering.program_source import workspace_size
 from scvi_codegen.runtime.stepper import Stepper
 
 SIZE = 12
@@ -110,7 +110,7 @@ class TestKeptFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
     def test_there_are_enough(self, method):
-        assert chain(method).interface.unknowns >= WORTH_REMEMBERING
+        assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
     def test_a_run_goes_on_bit_for_bit_however_it_is_cut(self, method):
         q, p = state()
@@ -156,9 +156,9 @@ def test_a_wrong_sign_in_a_scatter_is_named_before_anything_is_compiled():
     """Newton's matrix is the Jacobian of a gradient: by one of other results the iteration would never converge."""
     system = LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
     stages = discretise(system, SVI(2))
-    (family,), sites = stages.families, sites_of(stages, 1)
-    lowered_family(system, family, sites)
+    (family,), sites = stages.families, layout_of(stages, 1)
+    lowered_stage_group(system, family, sites)
     first, *others = family.scatters
     wrong = replace(first, results=tuple(-each for each in first.results))
     with pytest.raises(MethodError, match=r"(?s)'quadrature' are not the gradient of its scalar.*check the signs"):
-        lowered_family(system, replace(family, scatters=(wrong, *others)), sites)
+        lowered_stage_group(system, replace(family, scatters=(wrong, *others)), sites)

@@ -5,7 +5,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.files.cache import CACHE_VARIABLE
-from scvi_codegen.ir import parts as cutting
+from scvi_codegen.ir import kernel_parts as cutting
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, Operation
 from scvi_codegen.native.building import PORTABLE_FLAGS
 
@@ -35,7 +35,7 @@ def test_parts_are_of_about_equal_size_and_keep_only_what_is_read_later(cut_afte
     cut = cutting.parts(kernel(sums, [w[-1]]))
     assert [sum(kind == "w" for kind, _, _ in part.statements) for part in cut] == [10, 10, 10, 10]
     assert [part.uses("u") for part in cut] == [True, False, False, False]
-    assert cutting.kept_numbers(cut) == 2  # the one that is read, and the one that is written meanwhile
+    assert cutting.kept_length(cut) == 2  # the one that is read, and the one that is written meanwhile
 
 
 def test_a_short_kernel_stays_whole():

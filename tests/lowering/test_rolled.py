@@ -10,7 +10,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.compiler import program_of
-from scvi_codegen.mechanics import rolled as module
+from scvi_codegen.mechanics import term_groups as module
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.methods import as_method
 
@@ -58,7 +58,7 @@ def hamiltonian(name: str, count: int) -> sc.HamiltonianSystem:
 @pytest.fixture
 def few(monkeypatch):
     """Families of three terms are rolled."""
-    monkeypatch.setattr(module, "LEAST_ROLLED", 3)
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 3)
     module.rolled.cache_clear()
     yield
     module.rolled.cache_clear()
@@ -81,7 +81,7 @@ def test_steps_energies_and_ensembles_are_those_of_the_system_written_out(make, 
     assert module.rolled(system) is not None
     looped = sc.compile_stepper(system, method, **FLAGS)
     assert "static const int" in looped.source.code
-    monkeypatch.setattr(module, "LEAST_ROLLED", 10**6)
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
     module.rolled.cache_clear()
     written = sc.compile_stepper(make("written_out", 5), method, **FLAGS)
     q, v = np.random.default_rng(2).normal(size=(2, len(system.coordinates)))
@@ -97,7 +97,7 @@ def test_steps_energies_and_ensembles_are_those_of_the_system_written_out(make, 
 @pytest.mark.usefixtures("few")
 def test_symmetries_are_those_of_the_system_written_out(monkeypatch):
     looped = symmetries(bodies("in_loops", 14))
-    monkeypatch.setattr(module, "LEAST_ROLLED", 10**6)
+    monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
     module.rolled.cache_clear()
     assert [str(each) for each in looped] == [str(each) for each in symmetries(bodies("written_out", 14))]
     assert len(looped) == 9

@@ -13,7 +13,7 @@ from scvi_codegen.ir.numbers import exact_number, lower_matrix, lower_vector
 from scvi_codegen.methods import SCVI, SVI, RadauIIA, SpectralCollocation
 from scvi_codegen.models.systems import double_pendulum, kepler
 from scvi_codegen.rendering.target import DOUBLE, SINGLE
-from scvi_codegen.tables.basis import cardinal_integrals, cardinal_slopes, next_step
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_integrals, next_step
 from scvi_codegen.tables.nodes import chebyshev_lobatto, legendre_gauss
 from scvi_codegen.tables.precision import mp
 
@@ -74,5 +74,5 @@ def test_no_generated_table_holds_a_zero_that_is_none(system, method):
 def test_tables_of_60_digits_have_exact_zeros(degree):
     for nodes in (chebyshev_lobatto(degree), legendre_gauss(degree)):
         c = nodes.abscissae
-        for table in (cardinal_integrals(c, (*c, 1), 0), cardinal_slopes(c, c), next_step(c)):
+        for table in (cardinal_integrals(c, (*c, 1), 0), cardinal_derivatives(c, c), next_step(c)):
             assert all(entry == 0 or abs(entry) > mp.mpf(10) ** -40 for row in table for entry in row)

@@ -119,7 +119,7 @@ def test_of_many_coordinates_no_slopes_are_asked_for():
 def test_momenta_follow_forces_and_velocities_follow_momenta():
     system = hamiltonian_of(problem("charged-particle").system)
     stepper, (slope, velocity, _) = swept(system), functions(system)
-    assert "support/hamiltonian_sweep.h" in stepper.source.files
+    assert "support/hamiltonian_iteration.h" in stepper.source.files
     for q0, p0 in states(system.dimension):
         t, v0 = T + H / 2, velocity(q0, p0, T)
         p = p0 - H / 2 * slope(q0 + H / 2 * v0, p0, t)

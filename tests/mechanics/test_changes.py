@@ -16,8 +16,8 @@ from scvi_codegen import (
     problem,
     variational_system,
 )
-from scvi_codegen.mechanics.changes import with_changes
 from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.variational import with_tangent_vectors
 
 
 def test_changes_follow_the_variational_equations():
@@ -29,7 +29,7 @@ def test_changes_follow_the_variational_equations():
         parameters={"m": 2.0, "k": 0.5},
         forces={"x": "cos(t)*y"},
     )
-    varied = with_changes(system, 2)
+    varied = with_tangent_vectors(system, 2)
     assert [q.name for q in varied.coordinates] == [
         *("x", "y"),
         *("x_change_1", "y_change_1"),
@@ -50,15 +50,15 @@ def test_names_that_are_taken_are_left_alone():
     system = LagrangianSystem.from_text(
         name="taken", coordinates=["x", "x_change_1"], lagrangian="(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1"
     )
-    assert len({q.name for q in with_changes(system, 2).coordinates}) == 6
+    assert len({q.name for q in with_tangent_vectors(system, 2).coordinates}) == 6
 
 
 def test_masses_that_move_have_no_changes_of_this_kind():
-    assert with_changes(problem("double-pendulum").system, 1) is None
+    assert with_tangent_vectors(problem("double-pendulum").system, 1) is None
     magnetic = LagrangianSystem.from_text(
         name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"
     )
-    assert with_changes(magnetic, 1) is None
+    assert with_tangent_vectors(magnetic, 1) is None
 
 
 @pytest.mark.parametrize("method", [SVI(5), SVI(3, "gauss-lobatto:5"), Gauss(3)], ids=["svi", "other points", "gauss"])

@@ -15,9 +15,9 @@ from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
 from scvi_codegen.mechanics.hamiltonian import (
     HamiltonianSystem,
+    equivalent_lagrangian,
     hamiltonian_of,
     lagrangian_of,
-    lagrangian_twin,
 )
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import positive_parameters
@@ -177,7 +177,7 @@ def test_legendre_there_and_back(name: str) -> None:
 def test_what_has_no_legendre_transform_is_named() -> None:
     with pytest.raises(SystemDefinitionError, match="velocities do not determine momenta"):
         lagrangian_of(hyperbolic())
-    assert lagrangian_twin(hyperbolic()) is None
+    assert equivalent_lagrangian(hyperbolic()) is None
     quintic = LagrangianSystem.from_text(name="quintic", coordinates=["q"], lagrangian="q_dot**2/2 + q_dot**6/6 - q**2")
     with pytest.raises(SystemDefinitionError, match="define the other function yourself"):
         hamiltonian_of(quintic)

@@ -5,9 +5,9 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.indexed.expansion import unroll_sums
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
 DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"

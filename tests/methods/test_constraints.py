@@ -106,8 +106,8 @@ def test_multipliers_are_solved_for_alone_where_masses_are_constant(s, moving):
         forces={"x2": "cos(t)*y2"},
     )
     ours, newton = (compile_stepper(chain, lobatto(s), solver=solver) for solver in ("auto", "newton"))
-    assert "held_force(" in ours.source.amalgamated().code
-    assert "held_force(" not in newton.source.amalgamated().code
+    assert "constrained_force(" in ours.source.amalgamated().code
+    assert "constrained_force(" not in newton.source.amalgamated().code
     start = newton.project([0.6, -0.8, 1.5, -0.4], newton.momentum([0.6, -0.8, 1.5, -0.4], [0.1] * 4, 0.0))
     for way, bound in (({"h": 0.01, "steps": 100}, 1e-12), ({"h": -0.03, "steps": 20}, 1e-12), ({"t_end": 0.5}, 1e-8)):
         exactly = {} if "h" in way else {"tolerance": 1e-4}
@@ -344,9 +344,9 @@ def test_positions_do_not_follow_constraints_that_jump():
     with pytest.raises(StateError, match="the input 'u' is not set"):
         stepper.start(given["q"], velocity=given["velocity"], h=0.05)
     run = stepper.start(given["q"], velocity=given["velocity"], h=0.05, parameters={"u_0": 0.0})
-    for go_on in (lambda: run.set_inputs(u=0.3), lambda: run.update(parameters={"u_0": 0.3})):
+    for continue_recording in (lambda: run.set_inputs(u=0.3), lambda: run.update(parameters={"u_0": 0.3})):
         with pytest.raises(StateError, match=r"at t = 0 the position constraint .* jumps"):
-            go_on()
+            continue_recording()
         assert run.parameters[0] == 0.0
 
 

@@ -348,7 +348,7 @@ def test_models_and_names_that_do_not_serve_are_refused(tmp_path):
     model = pushed()
     for wrong, words in (
         (replace(model, h=None, tolerance=1e-6), "fixed step size"),
-        (replace(model, h=-0.1), "forward"),
+        (replace(model, h=-0.1), "must be positive"),
         (replace(Model.from_problem(problem("kepler"), SVI(4)), monitor="distance"), "monitor"),
     ):
         with pytest.raises(ModelFileError, match=words):
@@ -388,7 +388,7 @@ class TestPlatforms:
 
     def test_each_has_a_place_of_its_own(self, tmp_path, monkeypatch):
         monkeypatch.setattr(fmu_module, "library_for", lambda name, source, *, flags: f"{name} {flags}".encode())
-        here = fmu_module._here()
+        here = fmu_module._this_platform()
         path = generate_fmu(pushed(), tmp_path / "push.fmu", platforms=tuple(TARGETS), flags=("-O1",))
         archive = zipfile.ZipFile(path)
         found = {name for name in archive.namelist() if name.startswith("binaries")}

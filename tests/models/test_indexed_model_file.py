@@ -187,7 +187,7 @@ def test_steps_that_choose_their_length(net: Path) -> None:
     model = sc.load_indexed_model(net)
     assert (model.h, model.tolerance, model.covered) == (None, 1e-6, -3.0)
     own = model.integrate()
-    assert own.t[-1] == model.start().goal.t_end == -3.0
+    assert own.t[-1] == model.start().plan.t_end == -3.0
     other = sc.compile_indexed(model.system, "svi:2").integrate(
         model.q, t_end=-3.0, tolerance=given["tolerance"], tables=model.tables, parameters=model.parameters
     )

@@ -17,7 +17,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
 from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
 from scvi_codegen.models.package import generate_package, load_package
-from scvi_codegen.runtime.longest_step import RUNGS, longest_step
+from scvi_codegen.runtime.largest_step import REFINEMENTS, largest_step
 
 SHAKEN = """
 [system]
@@ -119,10 +119,10 @@ def test_a_folder_is_gone_on_with(shaken: Path, tmp_path: Path) -> None:
 def test_the_longest_step_keeps_the_tolerance_and_a_longer_one_does_not(unit: float, tolerance: float) -> None:
     kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
     stepper = sc.compile_stepper(kepler, sc.SVI(8), monitor=f"{unit}*(q1**2 + q2**2)**(3/4)")
-    h = longest_step(stepper, *start, 20.0, tolerance)
-    errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / RUNGS))]
+    h = largest_step(stepper, *start, 20.0, tolerance)
+    errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
     assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
-    assert longest_step(stepper, *start, -20.0, tolerance) == h
+    assert largest_step(stepper, *start, -20.0, tolerance) == h
 
 
 def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
@@ -156,7 +156,7 @@ def test_inputs_are_met_at_their_breakpoints() -> None:
         model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
         driven = model.stepper().integrate(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
         run = model.start(model.stepper())
-        for steps in model.stretches(run):
+        for steps in model.input_segments(run):
             run.record(steps)
         assert np.array_equal(run.q, driven.q[-1])
         errors.append(abs(driven.q[-1] - exact)[0])
@@ -191,7 +191,7 @@ def test_a_model_says_what_it_is_not(shaken: Path, tmp_path: Path) -> None:
     stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
     with pytest.raises(ModelFileError, match="without a time transformation"):
         sc.Model(system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, monitor="frequency")
-    with pytest.raises(ModelFileError, match="controller is symplectic or reversible"):
+    with pytest.raises(ModelFileError, match="controller must be symplectic or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
 
 

@@ -12,7 +12,7 @@ from style import check_style
 from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.runtime.driven import checked_inputs, parameters_of, stretches
+from scvi_codegen.runtime.runs_with_inputs import checked_inputs, parameters_of, prepared_segments
 
 KNOTS, VALUES = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -ffp-contract=off"
@@ -84,7 +84,7 @@ def test_stretches_of_c_are_those_of_python(model, seed):
     table, kept = _tables(stepper, inputs)
     values = np.array(stepper.defaults)
     next_steps = stepper.binding.function("next_steps")
-    for n in stretches(ours, inputs, end, parameters_of(stepper, None, inputs)):
+    for n in prepared_segments(ours, inputs, end, parameters_of(stepper, None, inputs)):
         ours.advance(n)
         assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == n
         assert theirs.h == ours.h

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from scvi_codegen.errors import BuildError
-from scvi_codegen.native import building, waiting
+from scvi_codegen.native import announcements, building
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.native.processes import _alone, running
 from scvi_codegen.rendering.source import Source
@@ -138,9 +138,9 @@ def part(name: str) -> Source:
 
 def told(monkeypatch, seconds: float, patience: float) -> list[str]:
     """What is said while something takes so many seconds."""
-    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", patience)
+    monkeypatch.setattr(announcements, "PATIENCE_SECONDS", patience)
     said: list[str] = []
-    with waiting.told_to(said.append), waiting.waiting_for("deriving"):
+    with announcements.announce_to(said.append), announcements.announced("deriving"):
         time.sleep(seconds)
     return said
 
@@ -160,7 +160,7 @@ class Terminal(io.StringIO):
 @pytest.mark.parametrize(("stream", "shown"), [(Terminal(), "scvi-codegen: {} ...\n"), (io.StringIO(), "")])
 def test_compiling_is_spoken_of_on_a_terminal_alone(slow_compiler, monkeypatch, stream, shown):
     monkeypatch.setattr(building, "COMPILE_SECONDS", 0.5)
-    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", 0.05)
+    monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.05)
     monkeypatch.setattr(sys, "stderr", stream)
     with pytest.raises(BuildError):
         building.load(Source(prefix="tiny", header="", code="\n" * 1234, declarations=""), flags=PORTABLE_FLAGS)

@@ -7,7 +7,7 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen import LagrangianSystem, StoermerVerlet, compile_stepper
 
-GIVEN = ("x", "y", "p_x", "p_y", "m", "k", "a", "w", "t", "h")
+STEP_INPUTS = ("x", "y", "p_x", "p_y", "m", "k", "a", "w", "t", "h")
 DEFAULTS = {"m": 1.0, "k": 1.0, "a": 0.0, "w": 1.0}
 ROWS = np.array(
     [
@@ -31,7 +31,7 @@ def stepper():
 
 
 def states(row):
-    """(kept, 4) states from the numbers of ``GIVEN``, which may be complex."""
+    """(kept, 4) states from the numbers of ``STEP_INPUTS``, which may be complex."""
     q, p, (m, k, a, w, t, h) = row[:2], row[2:4], row[4:]
     kept = [np.concatenate([q, p])]
 

@@ -10,7 +10,7 @@ from sympy import Symbol
 from sympy.core.function import AppliedUndef
 
 from scvi_codegen.derivation.page.columns import column_of
-from scvi_codegen.derivation.page.result_names import argument_symbol, place_name, result_symbol
+from scvi_codegen.derivation.page.result_names import argument_symbol, point_index, result_symbol
 from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row_formulas
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
@@ -46,13 +46,13 @@ class Evaluation:
             number, row = place + first, place + 1
             arguments = {self.system.time: self.values["t_k"] + sympy.Float(str(abscissa), DIGITS) * self.values["h"]}
             for gather in family.gathers:
-                left = argument_symbol(self.system, gather, place_name(family))
+                left = argument_symbol(self.system, gather, point_index(family))
                 right = renamed(formulas.get(left, left), "n", row)
                 arguments[gather.arguments[0]] = self.value(right)
             if name:
                 self.values[name] = sympy.Float(str(weight), DIGITS)
             for scatter in family.scatters:
-                symbol = result_symbol(self.system, family, scatter, place_name(family, number))
+                symbol = result_symbol(self.system, family, scatter, point_index(family, number))
                 result = scatter.results[0].xreplace(arguments).xreplace(self.parameters)
                 self.values[symbol.name] = sympy.N(result, DIGITS)
 

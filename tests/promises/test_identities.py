@@ -276,7 +276,7 @@ def test_otherwise_it_is_not(sample, compiled):
         ({"abscissae": "gauss", "nodes": "chebyshev-lobatto"}, "not both"),
         ({"abscissae": "gauss", "variational": False}, "requires nodes at both ends"),
         ({"abscissae": "radau-ia"}, "there are no abscissae called 'radau-ia'"),
-        ({"abscissae": [0.2, 0.8]}, "a curve of degree 3 has 3 abscissae, not 2"),
+        ({"abscissae": [0.2, 0.8]}, "a curve of degree 3 requires 3 abscissae, not 2"),
         ({"abscissae": [0.2, 0.2, 0.8]}, "not greater than the one before"),
     ],
 )

@@ -20,8 +20,8 @@ from scvi_codegen.models.problems import problem
 PACKAGE = Path(scvi_codegen.__file__).parent
 
 FLOORS = """
-    errors version
-    given indices
+    errors version representation
+    validation indices
     tables files
     formulas display ir
     mechanics rendering

@@ -25,7 +25,7 @@ from scvi_codegen.methods import (
 from scvi_codegen.models.problems import problem
 from scvi_codegen.verification.certificate import Outcome
 from scvi_codegen.verification.convergence import convergence_checks
-from scvi_codegen.verification.subject import State, Subject
+from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 PLATEAU = 1e-11
 """Errors below are left out; round-off and the reference contribute up to 1e-13."""
@@ -129,7 +129,7 @@ def test_every_method_has_its_order_with_quadratures_of_derivatives_and_other_cu
 )
 def test_the_certificate_measures_that_order_below_rounding(compiled, sample, method):
     state, stepper = State(*sample("kepler").state, 0.3, 0.05), compiled("kepler", method)
-    subject = Subject(problem("kepler").system, method, stepper, None, state)
+    subject = SystemUnderTest(problem("kepler").system, method, stepper, None, state)
     (order,) = (check for check in convergence_checks(subject) if check.name == "order")
     assert order.outcome is Outcome.KEPT, order
     assert method.order - 0.25 < order.measured < method.order + 0.3

@@ -15,8 +15,8 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.stepper import Stepper
 
 Q, P = [0.3, 0.8], [-1.1, 0.4]
@@ -60,8 +60,8 @@ def test_a_stepper_is_what_it_was(option: str) -> None:
         kept = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
         assert [name for name in kept if getattr(copy, name) != getattr(own, name)] == []
         assert {"changes": copy._variational_source(2), "second_derivatives": copy.second_derivatives} == made
-        goal: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "monitor" else {"h": H, "steps": STEPS}
-        runs = [each.integrate(Q, P, **goal) for each in (own, copy)]
+        plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "monitor" else {"h": H, "steps": STEPS}
+        runs = [each.integrate(Q, P, **plan) for each in (own, copy)]
         assert_same(*runs)
         assert [len(each) for each in runs[0].events] == [len(each) for each in runs[1].events]
         if option != "monitor":
@@ -103,7 +103,7 @@ def test_a_run_goes_on_as_it_would_have(argument: str, steps: int) -> None:
     given = RUNS[argument]
     run = stepper("").start(Q, None if "velocity" in given else P, **given)
     run.record(steps)
-    check_same_run(run, copied(run), lambda each: each.record(None if each.goal else STEPS))
+    check_same_run(run, copied(run), lambda each: each.record(None if each.plan else STEPS))
 
 
 def test_a_run_of_a_monitor_goes_on_as_it_would_have() -> None:
@@ -113,7 +113,7 @@ def test_a_run_of_a_monitor_goes_on_as_it_would_have() -> None:
 
 
 def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
-    for name in ("t", "h", "goal", "options", "steps", "longest"):
+    for name in ("t", "h", "plan", "options", "steps", "longest"):
         assert getattr(copy, name) == getattr(run, name), name
     assert np.array_equal(copy.parameters, run.parameters)
     assert copy.checkpoint() == run.checkpoint()
@@ -122,8 +122,8 @@ def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
 
 def test_a_run_may_be_given_another_goal_and_keeps_it() -> None:
     run = stepper("").start(Q, P, t_end=5.0)
-    run.update(goal=Goal(t_end=0.7, tolerance=1e-6))
-    assert copied(run).goal == Goal(t_end=0.7, tolerance=1e-6)
+    run.update(plan=StepPlan(t_end=0.7, tolerance=1e-6))
+    assert copied(run).plan == StepPlan(t_end=0.7, tolerance=1e-6)
     assert copied(run).record().t[-1] == 0.7
 
 

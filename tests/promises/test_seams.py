@@ -19,13 +19,13 @@ import scvi_codegen
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.exact.step import DerivedStep
-from scvi_codegen.lowering.sites import sites_of
+from scvi_codegen.lowering.unknown_layout import layout_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.methods.galerkin_stages import nodal_quadrature_family, position_block
+from scvi_codegen.methods.galerkin_stages import nodal_quadrature_group, position_block
 from scvi_codegen.methods.method import Method, Specification
-from scvi_codegen.methods.stage_system import Block, Gather, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.nodes import Nodes, nodes_by_name
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import gauss_lobatto
@@ -116,7 +116,7 @@ for solver in ("fixed-point", "newton"):
     ends.append(np.array([*run.q[-1], *run.p[-1]]))
 print(abs(ends[0] - ends[1]).max() < 1e-13)
 """
-    assert run(extended, script).split() == ["SeparableSweep", "ShootingSweep", "True"]
+    assert run(extended, script).split() == ["SeparableIteration", "ShootingIteration", "True"]
 
 
 # Blocks of another size than the coordinates: multipliers of constraints.
@@ -146,7 +146,7 @@ class Constrained(Method):
         s, k = self.degree, len(self.constraints)
         nodes = nodes_by_name("legendre-lobatto", s)
         none, stationary = Table.constant(s + 1, s), [0, *range(1, s)]
-        action = nodal_quadrature_family(system, nodes, gauss_lobatto(s + 1), other_blocks=s)
+        action = nodal_quadrature_group(system, nodes, gauss_lobatto(s + 1), other_blocks=s)
         rows = [
             Table.joined(gather.table.columns(stationary), none, gather.table.columns([s])) for gather in action.gathers
         ]
@@ -163,7 +163,7 @@ class Constrained(Method):
                 *(Row(number="27b", kind="stage", momentum=mp.zero) for _ in range(s - 1)),
                 *(Row(number="g", kind="stage", momentum=mp.zero, size=k) for _ in range(s)),
             ),
-            families=(action.point_family(rows), self._reactions(system, nodes), self._surface(system, nodes)),
+            families=(action.to_stage_group(rows), self._reactions(system, nodes), self._surface(system, nodes)),
             end_position=Table.named("", [[0] * s + [1] + [0] * s]),
             end_momentum=mp.zero,
             end_numbers=("27", "27c"),
@@ -171,12 +171,12 @@ class Constrained(Method):
 
     paper_form = stage_system
 
-    def _reactions(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
+    def _reactions(self, system: MechanicalSystem, nodes: Nodes) -> StageGroup:
         """(lambda . g)_q at the nodes 0 .. s - 1, in the rows of their positions."""
         s, rule = self.degree, gauss_lobatto(self.degree + 1)
         product, multipliers = self._product()
         here = Table.joined(Table.identity(s), Table.constant(s, 1 + s))
-        return PointFamily(
+        return StageGroup(
             name="reaction",
             abscissae=nodes.abscissae[:s],
             weights=rule.unit_weights[:s],
@@ -193,12 +193,12 @@ class Constrained(Method):
         multipliers = sympy.symbols(f"lambda_:{len(self.constraints)}", real=True)
         return sympy.Add(*(x * g for x, g in zip(multipliers, self.constraints, strict=True))), multipliers
 
-    def _surface(self, system: MechanicalSystem, nodes: Nodes) -> PointFamily:
+    def _surface(self, system: MechanicalSystem, nodes: Nodes) -> StageGroup:
         """g at the nodes 1 .. s, which must vanish."""
         s = self.degree
         places = Table.joined(Table.constant(s, 1), Table.identity(s), Table.constant(s, s))
         rows = Table.joined(Table.constant(s, s), Table.identity(s), Table.constant(s, 1))
-        return PointFamily(
+        return StageGroup(
             name="surface",
             abscissae=nodes.abscissae[1:],
             weights=(mp.one,) * s,
@@ -259,7 +259,7 @@ class ConstrainedIncrements(Constrained):
         rows = [_widened(scatter.table, none) for scatter in action.scatters]
         product, multipliers = self._product()
         first, last = range(s), range(1, s + 1)
-        reaction = PointFamily(
+        reaction = StageGroup(
             name="reaction",
             computes="(lambda . g)_q",
             abscissae=action.abscissae[:s],
@@ -277,7 +277,7 @@ class ConstrainedIncrements(Constrained):
                 ),
             ),
         )
-        surface = PointFamily(
+        surface = StageGroup(
             name="surface",
             computes="g",
             abscissae=action.abscissae[1:],
@@ -372,4 +372,4 @@ def test_two_sizes_need_blocks_and_rows_of_each() -> None:
     system, surface = rod()
     stages = ConstrainedIncrements(2, (surface,)).stage_system(system)
     with pytest.raises(MethodError, match="2 blocks and 1 rows of 1"):
-        sites_of(replace(stages, rows=stages.rows[:-1]), 2)
+        layout_of(replace(stages, rows=stages.rows[:-1]), 2)

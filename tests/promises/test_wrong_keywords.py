@@ -8,9 +8,9 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ArgumentError, StateError
-from scvi_codegen.given.keywords import ELSEWHERE, keyword_meant
-from scvi_codegen.given.words import WORDS
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.keywords import EXPLANATIONS, keyword_hint
+from scvi_codegen.validation.synonyms import SYNONYMS
 
 PUSHED = sc.LagrangianSystem.from_text(
     name="pushed pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", forces={"q": "u"}, inputs=["u"]
@@ -85,12 +85,12 @@ def test_functions_say_what_was_meant(function, wrong, meant):
 
 def test_no_word_hides_a_keyword():
     """What a function has is never said to be another, and every place that is named is one."""
-    assert keyword_meant("q", ["y0"]) == "; did you mean 'y0'?"
-    assert keyword_meant("n", ["mass"]).startswith(": pass the number to run.advance(n)")
-    assert not [here for here, elsewhere in WORDS.items() if {*here.split()} & {*elsewhere.split()}]
+    assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
+    assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
+    assert not [here for here, elsewhere in SYNONYMS.items() if {*here.split()} & {*elsewhere.split()}]
     for name in ("integrate", "integrate_ensemble", "momentum"):
         assert hasattr(Stepper, name)
-        assert any(f".{name}" in place for place in ELSEWHERE.values())
+        assert any(f".{name}" in place for place in EXPLANATIONS.values())
 
 
 def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):

@@ -12,7 +12,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ScviCodegenError
-from scvi_codegen.given.kinds import TEXT, takes
+from scvi_codegen.validation.argument_types import TEXT, checks_arguments
 
 WRONG = (object(), b"bytes", 1j)
 """No argument of any public function may be one of these."""
@@ -166,7 +166,7 @@ def test_names_alone_are_no_list_of_names():
 
 
 def test_checked_functions_stay_what_they_were():
-    @takes(name=TEXT)
+    @checks_arguments(name=TEXT)
     def greet(name: str, times: int = 1) -> str:
         """Politely."""
         return f"hello {name}" * times

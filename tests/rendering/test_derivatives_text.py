@@ -11,7 +11,7 @@ from scvi_codegen import SCVI, SVI, Gauss, hamiltonian_of, problem, reparametris
 from scvi_codegen.compiler import program_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.methods.discretise import discretise
-from scvi_codegen.rendering.text import render_derivatives
+from scvi_codegen.rendering.program_source import render_derivatives
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]
 CASES = {

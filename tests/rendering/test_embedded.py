@@ -23,9 +23,9 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
+from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.target import SINGLE
-from scvi_codegen.rendering.text import EMBEDDED, Embedded
 
 HERE = Path(__file__).parent / "embedded"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -267,7 +267,7 @@ def test_the_command_line_writes_a_folder_without_python(tmp_path):
 
 def test_lanes_are_refused_by_name():
     system = problem("kepler").system
-    with pytest.raises(MethodError, match="vector registers"):
+    with pytest.raises(MethodError, match="unavailable with embedded"):
         generate_source(system, SVI(2), solver="fixed-point", embedded="double")
     with pytest.raises(MethodError, match="double or single"):
         generate_source(system, SVI(2), embedded="half")

@@ -13,7 +13,7 @@ from programs import needs
 
 from scvi_codegen import SVI, SolverOptions, compile_stepper, problem
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.lowering.solvers.ladder import REACH
+from scvi_codegen.lowering.solvers.predictor_tables import REACH
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.rendering.source import Source
 
@@ -53,20 +53,20 @@ LADDER = """
 #include <stdio.h>
 typedef double real;
 typedef struct { int guess; long long change, change_before; } run_memory;
-struct guess_tables { const real *alone, *last, *before; };
-static const real LADDER_ALONE[5][1] = {{0}}, LADDER_LAST[5][5][1] = {{{0}}}, LADDER_BEFORE[5][5][1] = {{{0}}};
-#include "ladder_tables.h"
+struct predictor_tables_of { const real *alone, *last, *before; };
+static const real PREDICTOR_ALONE[5][1] = {{0}}, PREDICTOR_LAST[5][5][1] = {{{0}}}, PREDICTOR_BEFORE[5][5][1] = {{{0}}};
+#include "predictor_tables.h"
 int main(void)
 {
   for (int guess = 1; guess <= 2; guess++)
     for (int before = -6; before <= 6; before++)
       for (int change = -6; change <= 6; change++) {
         const run_memory run = {guess, change, before};
-        struct guess_tables found = {NULL, NULL, NULL};
+        struct predictor_tables_of found = {NULL, NULL, NULL};
         printf("%d %d %d %d", guess, before, change, choose_tables(&run, &found));
-        printf(" %td", found.alone ? found.alone - LADDER_ALONE[0] : -1);
-        printf(" %td", found.last ? found.last - LADDER_LAST[0][0] : -1);
-        printf(" %td\\n", found.before ? found.before - LADDER_BEFORE[0][0] : -1);
+        printf(" %td", found.alone ? found.alone - PREDICTOR_ALONE[0] : -1);
+        printf(" %td", found.last ? found.last - PREDICTOR_LAST[0][0] : -1);
+        printf(" %td\\n", found.before ? found.before - PREDICTOR_BEFORE[0][0] : -1);
       }
   return 0;
 }
@@ -97,7 +97,7 @@ int main(void)
     for (int k = 0; k < 2; k++) {{
       double extrema[EVENT_DEGREE];
       int count;
-      printf("%.6f ", doubtful_place(all[i], doubts[i][k], extrema, &count));
+      printf("%.6f ", uncertain_abscissa(all[i], doubts[i][k], extrema, &count));
     }}
   return 0;
 }}
@@ -129,7 +129,7 @@ def test_an_unknown_momentum_counts_in_how_far_newtons_iteration_has_come():
 DERIVATIVES = """
 int main(void)
 {{
-  enum {{ m = COORDINATES, given = GIVEN, count = 3, steps = 2 }};
+  enum {{ m = COORDINATES, given = STEP_INPUTS, count = 3, steps = 2 }};
   double *workspace = malloc(sizeof(double) * LINEARISED_WORKSPACE), t[steps] = {{0.0, 0.1}}, h[steps] = {{0.1, 0.1}};
   double q[steps * m], p[steps * m], *vectors = calloc((steps + 1) * count * given, sizeof(double));
   const double parameters[] = {{{defaults}}};

@@ -13,11 +13,11 @@ import sympy
 
 import scvi_codegen as sc
 from scvi_codegen import compiler
-from scvi_codegen.formulas.parts import key_of
+from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building, fingerprint
-from scvi_codegen.rendering import text_cache
+from scvi_codegen.rendering import source_cache
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def keys(change: dict, **options) -> tuple[str, ...]:
         "inputs": ["u", "w"],
     }
     system = sc.LagrangianSystem.from_text(**{**given, **change})
-    found = compiler._Texts(
+    found = compiler._Sources(
         system, **{"method": sc.SVI(2), "solver": "auto", "prefix": None, "symmetries": (), "monitor": None, **options}
     )
     return found.key
@@ -137,21 +137,21 @@ def test_every_file_of_the_generator_has_a_part_in_the_name(tmp_path, monkeypatc
     for path in files:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("one")
-    monkeypatch.setattr(text_cache, "PACKAGE", package)
-    monkeypatch.setattr(text_cache, "template_folder", lambda: templates)
-    found = [text_cache._generator.__wrapped__()]
+    monkeypatch.setattr(source_cache, "PACKAGE", package)
+    monkeypatch.setattr(source_cache, "template_folder", lambda: templates)
+    found = [source_cache._generator.__wrapped__()]
     for k, path in enumerate(files):
         path.write_text("two")  # as long as before
         os.utime(path, ns=(k, 10**9 + k))
-        found.append(text_cache._generator.__wrapped__())
-    monkeypatch.setattr(text_cache.sympy, "__version__", "0.0")
-    found.append(text_cache._generator.__wrapped__())
+        found.append(source_cache._generator.__wrapped__())
+    monkeypatch.setattr(source_cache.sympy, "__version__", "0.0")
+    found.append(source_cache._generator.__wrapped__())
     assert len(set(found)) == len(found)
 
 
 def test_another_generator_makes_it_anew(made, monkeypatch):
     sc.compile_stepper(spring(), sc.SVI(2))
-    monkeypatch.setattr(text_cache, "_generator", lambda: "the next version")
+    monkeypatch.setattr(source_cache, "_generator", lambda: "the next version")
     sc.compile_stepper(spring(), sc.SVI(2))
     assert len(made) == 2
 

@@ -21,7 +21,7 @@ from scvi_codegen.reproduce.kepler import figures_23_to_30 as kepler_shooting
 from scvi_codegen.reproduce.kepler.forms import PRINTED, STEP, VARIATIONAL, orbit_of, shooting
 from scvi_codegen.reproduce.kepler.many_points import SPAN
 from scvi_codegen.reproduce.kepler.motion import SYSTEM, exact_flow, off_ellipse, perihelion, revolutions
-from scvi_codegen.reproduce.kepler.one_step import one_step, slopes
+from scvi_codegen.reproduce.kepler.one_step import one_step, orders
 from scvi_codegen.reproduce.kepler.step import STATE
 from scvi_codegen.reproduce.laboratory.experiment import Verdict
 from scvi_codegen.reproduce.laboratory.running import stepper_of
@@ -94,7 +94,7 @@ CIRCLE_SLOPES = {
     + [(*key, 0.0, value) for key, value in CIRCLE_SLOPES.items()],
 )
 def test_slopes_of_the_error_of_a_step(scheme, degree, e, expected):
-    found = slopes(scheme, degree, e)
+    found = orders(scheme, degree, e)
     assert [slope is None for slope in found] == [power is None for power in expected]
     pairs = [(slope, power) for slope, power in zip(found, expected, strict=True) if power]
     assert all(abs(slope - power) < 0.1 for slope, power in pairs)

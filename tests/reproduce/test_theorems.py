@@ -24,10 +24,10 @@ from scvi_codegen.reproduce.theorems.convergence import (
     PRINTED,
     errors,
     exact_steps,
+    fitted_order,
     quadrature_error,
     quick_stepper,
     rate,
-    slope,
 )
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.tableau import collocation_tableau, radau_ia
@@ -49,7 +49,7 @@ def results():
 
 def orders(method):
     found = [errors("kepler", method, h) for h in KEPLER]
-    return [slope(KEPLER, [getattr(error, key) for error in found]) - 1 for key in ("action", "legendre", "map")]
+    return [fitted_order(KEPLER, [getattr(error, key) for error in found]) - 1 for key in ("action", "legendre", "map")]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -144,9 +144,9 @@ def test_the_action_is_bounded_by_collocation_and_quadrature(label):
 
 def test_slopes_and_rates_leave_round_off_out():
     steps = [2.0**-k for k in range(12)]
-    assert slope(steps, [h**5 + 1e-16 for h in steps]) == pytest.approx(5, abs=1e-3)
+    assert fitted_order(steps, [h**5 + 1e-16 for h in steps]) == pytest.approx(5, abs=1e-3)
     assert rate([2, 4, 6, 8], [1e-4, 1e-8, 1e-12, 1e-16])[1] == pytest.approx(0.01)
-    assert np.isnan(slope(steps[:2], [1.0, 0.5]))
+    assert np.isnan(fitted_order(steps[:2], [1.0, 0.5]))
     assert np.isnan(rate([1, 2], [1.0, 0.5])[1])
 
 

@@ -12,7 +12,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.runtime import memory
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
@@ -40,7 +40,7 @@ def standing(run):
 def test_steps_without_states_are_those_with_them(pushed, monkeypatch, portion):
     """In however many calls of C they are done."""
     kept = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
-    monkeypatch.setattr(memory, "UNHEARD_STEPS", portion)
+    monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
     run = pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2})
     run.advance(100)
     assert run.steps == 100
@@ -49,11 +49,11 @@ def test_steps_without_states_are_those_with_them(pushed, monkeypatch, portion):
 
 @pytest.mark.parametrize("portion", [3, 10**5])
 def test_at_its_goal_a_run_goes_no_farther(pushed, monkeypatch, portion):
-    goal = {"t_end": 3.0, "tolerance": 1e-9}
-    kept = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **goal)
-    monkeypatch.setattr(memory, "UNHEARD_STEPS", portion)
+    plan = {"t_end": 3.0, "tolerance": 1e-9}
+    kept = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
+    monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
     for steps in ([10**6], [1] * (kept.steps - 1) + [10, 10]):
-        run = pushed.start([0.3], [0.1], parameters={"u_0": 0.2}, **goal)
+        run = pushed.start([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
         for each in steps:
             run.advance(each)
         assert run.arrived
@@ -88,7 +88,7 @@ def test_goals_and_parameters_are_changed_on_the_way(pushed):
     """By what is heard of in the next call, whatever was given to the last."""
     run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
     run.advance(10**6)
-    run.update(parameters={"k": 2.0, "u_0": -0.1}, goal=Goal(t_end=2.0, tolerance=1e-9))
+    run.update(parameters={"k": 2.0, "u_0": -0.1}, plan=StepPlan(t_end=2.0, tolerance=1e-9))
     run.advance(10**6)
     first = pushed.integrate([0.3], [0.1], t_end=1.0, tolerance=1e-12, parameters={"u_0": 0.2})
     then = {"k": 2.0, "u_0": -0.1}

@@ -15,7 +15,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.recording import record_run, resume_run
-from scvi_codegen.runtime.goal import Goal
+from scvi_codegen.runtime.step_plan import StepPlan
 
 KEPLER = problem("kepler").system
 E = 0.8
@@ -116,7 +116,7 @@ def test_a_run_that_turns_goes_back_on_its_own_steps(system):
     stepper = compile_stepper(system, SVI(4), monitor="frequency", flags=QUICK_FLAGS)
     run = stepper.start(*START, h=0.1, t_end=100.0)
     there = run.record(300)
-    run.goal = Goal(t_end=-100.0, tau=0.1)
+    run.plan = StepPlan(t_end=-100.0, tau=0.1)
     back = run.record(300)
     assert np.abs(back.t[::-1] - there.t).max() < 1e-11
     assert np.abs(back.q[::-1] - there.q).max() < 1e-11
@@ -145,7 +145,7 @@ def test_steps_that_end_at_a_time_take_the_density_on_by_their_part():
         assert max(map(off_the_monitor, run.pieces)) < 2e-3
     run = stepper.start(**start, t_end=3.0, parameters={"u_0": 0.0})
     for t_end in (3.0, -3.0) * 20:
-        run.goal = Goal(t_end=t_end, tau=0.1)
+        run.plan = StepPlan(t_end=t_end, tau=0.1)
         piece = run.record()
     assert off_the_monitor(piece) < 2e-3
 

@@ -21,9 +21,9 @@ from scvi_codegen import (
     compile_stepper,
     problem,
 )
-from scvi_codegen.runtime.changes_in_lanes import MOTIONS
 from scvi_codegen.runtime.growth import SERIES
-from scvi_codegen.runtime.spreading import Changes
+from scvi_codegen.runtime.tangent_lanes import TRAJECTORIES_TOGETHER
+from scvi_codegen.runtime.tangent_propagation import InitialTangents
 
 REGULAR, CHAOTIC = ((0.0, 0.0), (0.5, 0.0)), ((0.0, -0.25), (0.42, 0.0))
 """Of Henon and Heiles near the energy 1/8: Skokos, Bountis & Antonopoulos, Physica D 231 (2007) 30, section 3."""
@@ -96,7 +96,7 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     """Changes, the integrals of MEGNO and volumes of a chaotic orbit by DOP853."""
     run = compile_stepper(problem("henon-heiles").system, SVI(6)).integrate(*CHAOTIC, h=0.02, steps=2500)
     found = run.chaos_indicators(3)
-    changes = Changes.checked(run.stepper, 3, None).at(run.q[0], run.p[0], 0.02, 0.0, run.parameters, None)
+    changes = InitialTangents.checked(run.stepper, 3, None).at(run.q[0], run.p[0], 0.02, 0.0, run.parameters, None)
     assert_allclose(changes.T @ changes, np.eye(3), atol=1e-14)
 
     def motion(t, z):
@@ -307,11 +307,11 @@ def test_steps_that_are_no_motion_are_refused_as_by_runs():
 
 def test_more_motions_than_go_along_together_are_told_apart(galaxy):
     """Those of a row of a map, and each of them alone, whatever the number of threads."""
-    y = np.linspace(-0.2, 0.3, MOTIONS + 5)
+    y = np.linspace(-0.2, 0.3, TRAJECTORIES_TOGETHER + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
     both = [galaxy.chaos_indicators_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
     assert_array_equal(both[0].lengths, both[1].lengths)
-    for j in (0, MOTIONS - 1, MOTIONS, MOTIONS + 4):
+    for j in (0, TRAJECTORIES_TOGETHER - 1, TRAJECTORIES_TOGETHER, TRAJECTORIES_TOGETHER + 4):
         alone = galaxy.integrate(start[0][j], start[1][j], h=0.2, steps=40).chaos_indicators(1)
         assert_allclose(both[0].lengths[-1, j], alone.lengths[-1], atol=1e-13)
 
@@ -321,7 +321,7 @@ def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):
     run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=Event("y", terminal=True, direction=1))
     assert run.ended_by is not None
     assert run.t[-1] % 0.2 > 1e-6
-    moved = run.tangent()[-1] @ Changes.checked(galaxy, 1, None).at(
+    moved = run.tangent()[-1] @ InitialTangents.checked(galaxy, 1, None).at(
         *map(np.array, CHAOTIC), 0.2, 0.0, run.parameters, None
     )
     assert run.chaos_indicators(1).lengths[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)

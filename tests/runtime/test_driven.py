@@ -28,7 +28,7 @@ from scvi_codegen import (
     problem,
     reparametrise,
 )
-from scvi_codegen.runtime.longest_step import longest_step
+from scvi_codegen.runtime.largest_step import largest_step
 
 KNOTS = np.array([0.0, 0.37, 0.9, 1.41, 2.05, 2.6])
 VALUES = np.array([0.0, 1.2, -0.7, 0.4, 1.9, -1.0])
@@ -305,12 +305,12 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
     for step in (
         lambda: stepper.step(*state, 0.1),
         lambda: stepper.jacobian(*state, 0.1),
-        lambda: stepper.exchanged(*state, 0.1),
+        lambda: stepper.work_and_impulses(*state, 0.1),
         lambda: stepper.integrate(*state, h=0.1, steps=2, parameters={"u_0": 1.0}),
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
         lambda: periodic_orbit(stepper, *state, period=6.0, steps=20),
-        lambda: longest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
+        lambda: largest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
     ):
         with pytest.raises(StateError, match=r"the input '[uw]' is not set"):

@@ -79,9 +79,9 @@ def test_an_interruption_keeps_what_was_done(kepler):
     class Enough(Exception):  # noqa: N818
         pass
 
-    from scvi_codegen.runtime.ensemble_to_ends import EnsembleToEnds
+    from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
 
-    work = EnsembleToEnds(kepler, Q, P, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=TOLERANCE)
+    work = AdaptiveEnsemble(kepler, Q, P, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=TOLERANCE)
 
     def stop(done: int) -> None:
         if done:
@@ -154,5 +154,5 @@ def test_the_command_line_runs_a_grid(tmp_path, monkeypatch):
 def test_the_result_names_its_goals(kepler):
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE)
     assert isinstance(runs, EnsembleTrajectory)
-    assert [goal.t_end for goal in runs.goals] == ENDS
+    assert [plan.t_end for plan in runs.plans] == ENDS
     assert runs.h == 0.0

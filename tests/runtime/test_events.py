@@ -504,7 +504,7 @@ def test_the_same_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> Non
     first = stepper.with_events("q - 1")
     assert stepper.with_events(["q - 1"]) is first
     assert stepper.with_events(Event("q - 1", terminal=True)) is not first
-    monkeypatch.setattr(compiled_method, "_watching", lambda source, *_: source)
+    monkeypatch.setattr(compiled_method, "_event_variant", lambda source, *_: source)
     for k in range(40):
         stepper.with_events(f"q - {k}")
-    assert len(stepper._watching) == compiled_method.MOST_WATCHING
+    assert len(stepper._event_variants) == compiled_method.MOST_EVENT_SETS

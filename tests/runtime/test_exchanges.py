@@ -107,5 +107,5 @@ def test_who_keeps_no_account(thrown):
 def test_without_newtons_iteration_there_is_an_error_and_not_a_missing_function(thrown):
     stepper = compile_stepper(thrown, SVI(3), solver="fixed-point")
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)
-    with pytest.raises(MethodError, match="exchanges needs Newton's iteration"):
+    with pytest.raises(MethodError, match="requires Newton's method"):
         run.work()

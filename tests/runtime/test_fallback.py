@@ -158,7 +158,7 @@ def test_prepare_compiles_all_that_later_calls_need(tmp_path, monkeypatch):
     for events in (None, ["q", "q_dot"]):
         stepper.integrate(*state, h=0.1, steps=3, events=events)
         stepper.integrate(*state, t_end=0.3, tolerance=1e-6, events=events)
-    stepper.binding.borrow_fallback()
+    stepper.binding.set_fallback()
     stepper.jacobian(*state, h=0.1)
     assert stepper._second_derivatives
     stepper.integrate_ensemble([[1.0], [0.5]], [[0.0], [0.0]], h=0.1, steps=3)

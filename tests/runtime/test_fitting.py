@@ -23,7 +23,7 @@ from scvi_codegen import (
     compile_stepper,
     fit,
 )
-from scvi_codegen.runtime.segments import _constrained, _within
+from scvi_codegen.runtime.segments import _bounded_update, _equality_constrained_update
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01
@@ -373,7 +373,7 @@ def test_least_squares_with_equations_and_bounds():
         slopes, found, rows = rng.normal(size=(9, 5)), rng.normal(size=9), 7
         low, high = np.full(5, -np.inf), np.full(5, np.inf)
         low[:3], high[:3] = -rng.uniform(0.01, 0.2, 3), rng.uniform(0.01, 0.2, 3)
-        update, _, held = _within(slopes, found, rows, (low, high))
+        update, _, held = _bounded_update(slopes, found, rows, (low, high))
         assert np.abs(slopes[rows:] @ update + found[rows:]).max() < 1e-12
         assert (low <= update).all()
         assert (update <= high).all()
@@ -384,7 +384,7 @@ def test_least_squares_with_equations_and_bounds():
             other = np.zeros(5)
             other[fixed] = [choice[k][k] for k in fixed]
             free = np.setdiff1d(np.arange(5), fixed)
-            other[free] = _constrained(slopes[:, free], found + slopes @ other, rows)[0]
+            other[free] = _equality_constrained_update(slopes[:, free], found + slopes @ other, rows)[0]
             if (low <= other + 1e-12).all() and (other <= high + 1e-12).all():
                 best = min(best, float(np.linalg.norm(slopes[:rows] @ other + found[:rows])))
         assert np.linalg.norm(slopes[:rows] @ update + found[:rows]) == pytest.approx(best, rel=1e-10)

@@ -569,7 +569,7 @@ class TestCommandLine:
             ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
             ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
             ("error = 2.0", [], "between 0 and 1"),
-            ("error = 1e-9", ["--monitor", "frequency"], "needs adaptive steps"),
+            ("error = 1e-9", ["--monitor", "frequency"], "requires adaptive steps"),
         ],
     )
     def test_files_that_are_refused(self, tmp_path, run, words, message):

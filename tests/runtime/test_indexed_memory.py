@@ -14,7 +14,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen.errors import StateError
 from scvi_codegen.runtime import indexed_saving
-from scvi_codegen.runtime.indexed_memory import MOMENTS
+from scvi_codegen.runtime.indexed_memory import RUN_FIELDS
 
 BONDS = [[0, 1], [1, 2]]
 Q = [1.0, 2.5, 3.0]
@@ -100,7 +100,7 @@ class TestPickles:
         run = start(chain, **given, options=sc.SolverOptions(max_iterations=40), threads=2)
         run.advance(3)
         other = copied(run)
-        for name in ("t", "h", "goal", "options", "steps", "iterations", "threads"):
+        for name in ("t", "h", "plan", "options", "steps", "iterations", "threads"):
             assert getattr(other, name) == getattr(run, name), name
         for each in (run, other):
             each.advance(5)
@@ -164,7 +164,7 @@ class TestDamage:
         run = start(chain, h=None, t_end=2.0)
         run.advance(3)
         found = parts(run.checkpoint())
-        found["moments"][MOMENTS.index(name)] = value
+        found["moments"][RUN_FIELDS.index(name)] = value
         least, most = indexed_saving.RANGES[name]
         if least <= value <= most and value == int(value):
             chain.from_checkpoint(put_together(found), t_end=2.0).advance(3)
@@ -219,7 +219,7 @@ def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
     stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
     run = stepper.start([1.0], [0.0], t_end=5.0, tolerance=1e-6)
     run.advance(3)
-    for name in ("rung", "change", "change_before", "direction"):
+    for name in ("grid_level", "change", "change_before", "direction"):
         for value in (-(2**63), 2**63 - 1, 2**20):
             before = getattr(run._memory, name)
             setattr(run._memory, name, value)

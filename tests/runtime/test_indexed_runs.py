@@ -107,10 +107,10 @@ class TestControlledSteps:
 
     def test_runs_are_saved_and_steppers_pickled(self, steppers):
         stepper = pickle.loads(pickle.dumps(steppers[0]))
-        goal = {"t_end": 4.0, "tolerance": 1e-8}
-        run = stepper.start(Q, velocity=V, **goal)
+        plan = {"t_end": 4.0, "tolerance": 1e-8}
+        run = stepper.start(Q, velocity=V, **plan)
         run.advance(3)
-        again = stepper.from_checkpoint(run.checkpoint(), **goal)
+        again = stepper.from_checkpoint(run.checkpoint(), **plan)
         for each in (run, again):
             each.advance(1000)
         assert run.t == again.t == 4.0

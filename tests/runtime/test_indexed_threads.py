@@ -21,7 +21,7 @@ from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.sharing import Sharing, sharing_of
+from scvi_codegen.rendering.thread_sharing import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)
 THREADS = (1, 2, 3, 5)
@@ -224,7 +224,7 @@ def test_a_run_goes_on_by_other_threads() -> None:
     parts = stepper.from_checkpoint(parts.checkpoint(), threads=2)
     parts.advance(3)
     assert bits(parts) == bits(whole)
-    assert parts.apart(0.01).threads == 2
+    assert parts.copy_with_step(0.01).threads == 2
 
 
 def test_ctrl_c_ends_a_run_between_steps() -> None:
@@ -294,10 +294,10 @@ int main(void)
 {
   static const long long sizes[] = {1, 63, 64, 100, 191, 192, 800, 3500, 5000, 70000, 1000003};
   for (int k = 0; k < 11; k++) {
-    tell("turn", sizes[k], in_turn(3, 3 + sizes[k], 5, 1));
-    tell("wide", sizes[k], in_turn(3, 3 + sizes[k], 5, 2000));
+    tell("turn", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 1));
+    tell("wide", sizes[k], alternating_blocks(3, 3 + sizes[k], 5, 2000));
     if (sizes[k] < 10000)
-      tell("tiles", sizes[k], in_tiles(sizes[k]));
+      tell("tiles", sizes[k], pairs_of_blocks(sizes[k]));
   }
   return 0;
 }

@@ -10,7 +10,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.runtime.longest_step import ALLOWED, RUNGS, longest_step, too_wrong
+from scvi_codegen.runtime.largest_step import ALLOWED, REFINEMENTS, accuracy_message, largest_step
 
 KEPLER = sc.problem("kepler").system
 START: Any = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
@@ -24,15 +24,15 @@ def stepper() -> sc.Stepper:
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-12, 1e-8])
 def test_it_keeps_the_tolerance_and_a_longer_one_does_not(tolerance: float) -> None:
-    h = longest_step(stepper(), *START, 20.0, tolerance)
-    errors = [stepper().integrate(*START, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / RUNGS))]
+    h = largest_step(stepper(), *START, 20.0, tolerance)
+    errors = [stepper().integrate(*START, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
     assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
-    assert longest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
+    assert largest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
 
 
 def test_steps_of_it_are_right_to_round_off_after_many_orbits() -> None:
     """Beside Kepler's ellipse, which closes."""
-    h = longest_step(stepper(), *START, 100.0)
+    h = largest_step(stepper(), *START, 100.0)
     run = stepper().integrate(*START, h=h, t_end=40 * np.pi)
     assert len(run) < 20 * 30
     assert np.abs(run.q[-1] - START[0]).max() < 2e-11
@@ -63,9 +63,9 @@ def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
 
 
 def test_what_is_said_of_a_too_wrong() -> None:
-    assert too_wrong(9e-16, 1.0, 0.0) is None
-    assert too_wrong(float("nan"), 1.0, 0.0) is not None
-    said = too_wrong(1e-3, 1.5, 1e-9)
+    assert accuracy_message(9e-16, 1.0, 0.0) is None
+    assert accuracy_message(float("nan"), 1.0, 0.0) is not None
+    said = accuracy_message(1e-3, 1.5, 1e-9)
     assert said is not None
     assert "t = 1.5" in said
     assert "1.0e-03, but 1.0e-09 was requested" in said
@@ -74,8 +74,8 @@ def test_what_is_said_of_a_too_wrong() -> None:
 def test_what_has_no_longest_step_is_refused() -> None:
     for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
         with pytest.raises(StateError, match=r"span = \S+ must not be 0, and tolerance"):
-            longest_step(stepper(), *START, span, tolerance)
+            largest_step(stepper(), *START, span, tolerance)
     verlet = sc.compile_stepper(sc.reparametrise(KEPLER, "frequency"), sc.StoermerVerlet())
     if np.isnan(verlet.integrate(*START, h=0.1, steps=3).step_error):
         with pytest.raises(MethodError, match="no error estimate: give h"):
-            longest_step(verlet, *START, 1.0, 1e-3)
+            largest_step(verlet, *START, 1.0, 1e-3)

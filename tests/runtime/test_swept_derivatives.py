@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from samples import sweep, tangle
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
-from scvi_codegen.lowering import swept_slopes
+from scvi_codegen.lowering import point_derivatives
 
 WHIRL = LagrangianSystem.from_text(
     name="whirl in a moving trap",
@@ -45,8 +45,8 @@ def test_sweeps_carry_what_factors_do(name):
     """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
     system, method, h = CASES[name]
     swept, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
-    assert "by_sweeps.h" in swept.derivatives.code
-    assert "by_sweeps.h" not in factored.derivatives.code
+    assert "vectors_by_iteration.h" in swept.derivatives.code
+    assert "vectors_by_iteration.h" not in factored.derivatives.code
     random, m = np.random.default_rng(20261122), swept.dimension
     q = np.array([0.9, -0.4, 0.1, 0.6, -0.8, 0.2, 0.5, -0.3, 0.4, 0.7])[:m]
     p = swept.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
@@ -86,10 +86,10 @@ def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
 def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch):
     system = problem("kepler").system
     found = sweep(system, SVI(2))
-    slopes = swept_slopes.swept_slopes(system, found)
+    slopes = point_derivatives.point_derivatives_of(system, found)
     assert slopes is not None
-    monkeypatch.setattr(swept_slopes, "MOST_SLOPES", slopes.count + len(slopes.given.entries) - 1)
-    assert swept_slopes.swept_slopes(system, found) is None
+    monkeypatch.setattr(point_derivatives, "MOST_DERIVATIVES", slopes.count + len(slopes.given.entries) - 1)
+    assert point_derivatives.point_derivatives_of(system, found) is None
 
 
 def test_units_of_coordinates_do_not_tell_when_sweeps_end():

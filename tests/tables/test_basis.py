@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.tables.basis import (
+    cardinal_derivatives,
     cardinal_integrals,
-    cardinal_slopes,
     cardinal_values,
     continuation,
     differentiation_matrix,
@@ -60,7 +60,7 @@ def test_tables_reproduce_polynomials_on_any_points(
     values = tuple(number(polynomial(coefficients, x)) for x in points)
     for table, exact in [
         (cardinal_values(points, at), [polynomial(coefficients, t) for t in at]),
-        (cardinal_slopes(points, at), [slope(coefficients, t) for t in at]),
+        (cardinal_derivatives(points, at), [slope(coefficients, t) for t in at]),
         (cardinal_integrals(points, at, start), [integral(coefficients, start, t) for t in at]),
         (differentiation_matrix(points), [slope(coefficients, x) for x in points]),
         (extrapolation(points, start), [polynomial(coefficients, x + start) for x in points]),
@@ -112,7 +112,7 @@ def test_the_differentiation_matrix_is_equation_11_on_descending_points(N: int) 
 def test_degree_thirty_keeps_fifty_digits(nodes: object) -> None:
     points = nodes.points
     at = gauss_legendre(31).points
-    values, slopes = cardinal_values(points, at), cardinal_slopes(points, at)
+    values, slopes = cardinal_values(points, at), cardinal_derivatives(points, at)
     for power in (0, 1, 17, 30):
         f = tuple(x**power for x in points)
         scale = max(abs(entry) for row in slopes for entry in row)
@@ -142,7 +142,9 @@ def test_slopes_agree_with_numerical_differentiation() -> None:
     points = (0, Fraction(1, 3), Fraction(4, 5), 2)
     at = mp.mpf("0.37")
     numerical = [mp.diff(lambda t, j=j: cardinal_values(points, (t,))[0][j], at, h=mp.mpf("1e-20")) for j in range(4)]
-    assert all(abs(a - b) < mp.mpf("1e-30") for a, b in zip(cardinal_slopes(points, (at,))[0], numerical, strict=True))
+    assert all(
+        abs(a - b) < mp.mpf("1e-30") for a, b in zip(cardinal_derivatives(points, (at,))[0], numerical, strict=True)
+    )
 
 
 def test_products_and_transposes() -> None:

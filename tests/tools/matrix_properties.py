@@ -28,7 +28,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime import gradients, memory, portions
+from scvi_codegen.runtime import gradients, memory, run_loop
 
 __all__ = ["PROPERTIES", "SITUATIONS", "Case"]
 
@@ -152,16 +152,16 @@ class Case:
 
     def start(self, **more: Any) -> Any:
         """A run to be advanced."""
-        goal = {"t_end": self.given.t + self.span} if self.kind == "monitored" else {}
-        return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(h=self.h, **goal, **more))
+        plan = {"t_end": self.given.t + self.span} if self.kind == "monitored" else {}
+        return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(h=self.h, **plan, **more))
 
     def from_checkpoint(self, run: Any, saved: bytes) -> Any:
         """The run again, in a stepper that was pickled."""
         stepper = pickle.loads(pickle.dumps(self.stepper))
         if self.kind == "array":
             return stepper.from_checkpoint(saved, options=self.options)
-        goal = {"t_end": self.given.t + self.span, "h": self.h} if self.kind == "monitored" else {}
-        return stepper.from_checkpoint(saved, parameters=run.parameters, options=self.options, **goal)
+        plan = {"t_end": self.given.t + self.span, "h": self.h} if self.kind == "monitored" else {}
+        return stepper.from_checkpoint(saved, parameters=run.parameters, options=self.options, **plan)
 
 
 def as_rows(found: Any) -> SimpleNamespace:
@@ -204,7 +204,7 @@ def states(case: Case) -> None:
             float(Fraction(given.t) + k * given.save_every * Fraction(case.h)) for k in range(count)
         ]
         if case.problem.falls_back:
-            assert not case.stepper.binding._lacks_fallback, "fixed-point iterations should have failed"
+            assert not case.stepper.binding._fallback_missing, "fixed-point iterations should have failed"
     elif case.kind == "slowed":
         q = case.truth.q(np.linspace(given.t, run.t[-1], 4001))
         tau = np.trapezoid(1.0 / np.linalg.norm(q, axis=1), dx=(run.t[-1] - given.t) / 4000)
@@ -228,10 +228,10 @@ def formulas(case: Case) -> None:
     near(case.stepper.momentum(q, run.velocity[-1], at, values), p, 1e-12)
 
 
-def exchanged(case: Case) -> None:
+def work_and_impulses(case: Case) -> None:
     """Work and impulses of the forces."""
     run = case.run
-    wanted = case.truth.exchanged(run.t)
+    wanted = case.truth.work_and_impulses(run.t)
     near(run.work(), wanted[:, 0], 1e-6)
     near(run.impulses(), wanted[:, 1:], 1e-6)
     for xi, impulse in zip(case.problem.impulses, run.impulses().T, strict=True):
@@ -254,8 +254,8 @@ def between(case: Case) -> None:
     if case.kind in ("array", "driven"):
         return
     times = np.sort(times)[:: -1 if case.given.back else 1]
-    goal = {"t_end": float(run.t[-1])} if case.kind in ("slowed", "monitored") else {}
-    kept = case.integrate(t_eval=times, **goal)
+    plan = {"t_end": float(run.t[-1])} if case.kind in ("slowed", "monitored") else {}
+    kept = case.integrate(t_eval=times, **plan)
     assert kept.t.tolist() == times.tolist()
     near(kept.q, case.truth.q(times), case.error)
     near(kept.energy(), case.truth.energy(times), 10 * case.error)
@@ -272,7 +272,7 @@ def events(case: Case) -> None:
     """Times and states of crossings; a terminal event, and where a run stands behind it."""
     far = 3 if case.given.back else 10  # back in time friction makes motions grow
     steps, end = far * STEPS, case.given.t + far * case.span
-    goal = {"t_end": end} if case.kind == "monitored" else {"steps": steps, "h": case.h}
+    plan = {"t_end": end} if case.kind == "monitored" else {"steps": steps, "h": case.h}
     motion = truth_of(case.problem).motion(case.given.t, end, case.problem.q, case.problem.x, case.values)
     grid = np.linspace(case.given.t, end, (16 if case.problem.falls_back else 4) * steps)
     g = motion.event(grid)
@@ -280,16 +280,16 @@ def events(case: Case) -> None:
     wanted = np.array([brentq(lambda s: motion.event(s)[0], grid[k], grid[k + 1], xtol=1e-14) for k in crossed])
     assert len(wanted) >= 1, "this event should happen"
     text, error = _as_array(case, case.problem.event), 30 * case.error
-    run = case.integrate(events=text, **goal)
+    run = case.integrate(events=text, **plan)
     (found,) = run.events
     near(found.t, wanted, error)
     near(found.q, motion.q(wanted), error)
     near(found.p, motion.p(wanted), error)
     for number in range(1, min(len(wanted), 3) + 1):
-        ended = case.integrate(events=sc.Event(text, terminal=number), **goal)
+        ended = case.integrate(events=sc.Event(text, terminal=number), **plan)
         assert ended.t[-1] == ended.events[0].t[-1] == found.t[number - 1]
         assert np.array_equal(ended.q[-1], found.q[number - 1])
-    rising = case.integrate(events=sc.Event(text, direction=1), **goal).events[0]
+    rising = case.integrate(events=sc.Event(text, direction=1), **plan).events[0]
     assert rising.t.tolist() == [t for t, k in zip(found.t, crossed, strict=True) if g[k + 1] > g[k]]
 
 
@@ -340,10 +340,10 @@ def _others(case: Case, count: int) -> list[dict[str, float]]:
 def ensembles(case: Case) -> None:
     """States, energies and maps of trajectories of several parameters and starts, by common steps and by their own."""
     others = _others(case, 10)
-    goals = case.given.t + case.span * (1.0 + 0.02 * np.arange(10))
+    plans = case.given.t + case.span * (1.0 + 0.02 * np.arange(10))
     ways: list[dict[str, Any]] = [{"h": case.h, "steps": STEPS}]
     if case.kind in ("plain", "driven") and _tells_errors(case):
-        ways.append({"t_end": goals, "tolerance": 1e-11})
+        ways.append({"t_end": plans, "tolerance": 1e-11})
     for way in ways:
         found = ensemble_of(case, others, save_every=case.given.save_every, **way)
         assert found.ok.all()
@@ -391,7 +391,7 @@ def recording(case: Case) -> None:
 def restarts(case: Case) -> None:
     """A run saved in the middle, in pieces of several calls of C, is bit for bit the one that had none."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "UNHEARD_STEPS", 3)
+        patch.setattr(memory, "STEPS_PER_CALL", 3)
         whole, first = case.start(), case.start()
         whole.advance(20)
         for steps in (1, 7, 3):
@@ -449,7 +449,7 @@ def controlled(case: Case) -> None:
     """Steps that choose their length: where they end, between them, and what is said of the worst."""
     end = case.given.t + case.span
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(portions, "SLICE_SECONDS", 1e-9)
+        patch.setattr(run_loop, "CALL_SECONDS", 1e-9)
         run = case.integrate(t_end=end, tolerance=1e-11)
     assert run.t[-1] == end
     near(run.q, case.truth.q(run.t), 1e-8)
@@ -583,8 +583,8 @@ Property = Callable[[Case], None]
 PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "states": (states, lambda case: True),
     "formulas": (formulas, lambda case: True),
-    "exchanged": (
-        exchanged,
+    "work_and_impulses": (
+        work_and_impulses,
         lambda case: (
             case.problem.work and _keeps_account(case) and (case.kind != "monitored" or case.given.save_every == 1)
         ),

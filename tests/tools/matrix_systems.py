@@ -200,7 +200,7 @@ class Motion:
     def maps(self, t: Any) -> np.ndarray:
         return np.array([self._each(each, t).ravel() for each in self.truth._maps]).reshape(-1, np.size(t)).T
 
-    def exchanged(self, t: Any) -> np.ndarray:
+    def work_and_impulses(self, t: Any) -> np.ndarray:
         """(n, 1 + k) the work of the forces, and their impulses."""
         return np.array([self._solution(s)[2 * self.truth.m :] for s in np.ravel(t)])
 

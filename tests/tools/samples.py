@@ -11,10 +11,10 @@ import numpy as np
 from oracle import Mechanics, numbers, oracle_step
 
 from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweep import Sweep
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.choice import sweep_of
+from scvi_codegen.lowering.solvers.choice import iteration_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -30,9 +30,9 @@ def lowered(system: MechanicalSystem, method: Method) -> Program:
     return lower(system, method, discretise(system, method), prefix="p")
 
 
-def sweep(system: MechanicalSystem, method: Method) -> Sweep | None:
+def sweep(system: MechanicalSystem, method: Method) -> FixedPointIteration | None:
     """The fixed-point iteration, if there is one."""
-    return sweep_of(system, discretise(system, method))
+    return iteration_of(system, discretise(system, method))
 
 
 def oscillator() -> LagrangianSystem:

@@ -31,10 +31,10 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import save_model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
-from scvi_codegen.native import waiting
+from scvi_codegen.native import announcements
 from scvi_codegen.tables.precision import mp
-from scvi_codegen.verification import subject
-from scvi_codegen.verification.certificate import BrokenError, Check, Finding, Outcome, checked
+from scvi_codegen.verification import system_under_test
+from scvi_codegen.verification.certificate import Check, Finding, Outcome, ViolationError, checked
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
 
@@ -51,7 +51,7 @@ QUICK = (
 
 
 def caught(mutation: Mutation) -> tuple[Check, ...]:
-    return certified(mutation.case, mutation.apply, edits_text=mutation.edits_text).broken
+    return certified(mutation.case, mutation.apply, edits_text=mutation.edits_text).violated
 
 
 @pytest.mark.parametrize("mutation", [one for one in MUTATIONS if one.name in QUICK], ids=lambda one: one.name)
@@ -86,7 +86,7 @@ def test_nothing_of_a_fault_is_left_in_the_process() -> None:
 def test_what_is_sabotaged_passes_whole(name: str) -> None:
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
-    assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
+    assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_constrained_motions_are_certified(name: str) -> None:
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
     assert not certificate.not_measured
-    kept = {check.name for check in certificate.checks if check.outcome is Outcome.KEPT}
+    kept = {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
     assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= kept
     assert ("symplecticity" in kept) == name.startswith("wire")
 
@@ -160,29 +160,29 @@ def test_constraints_are_certified_under_inputs_that_stay_what_they_are() -> Non
     ).with_parameters(w_0=1.0)
     method = SVI(2, "gauss-lobatto:3")
     stepper = compile_stepper(pushed, method, flags=QUICK_FLAGS)
-    given = subject.State(np.array([0.6, -0.8]), np.array([0.4, 0.3]), 0.0, 0.05)
-    checks = structure_checks(subject.Subject(pushed, method, stepper, None, given))
-    assert {check.name: check.outcome for check in checks}["constraints"] is Outcome.KEPT
+    given = system_under_test.State(np.array([0.6, -0.8]), np.array([0.4, 0.3]), 0.0, 0.05)
+    checks = structure_checks(system_under_test.SystemUnderTest(pushed, method, stepper, None, given))
+    assert {check.name: check.outcome for check in checks}["constraints"] is Outcome.SATISFIED
 
 
 def test_another_integrator_than_the_one_promised_is_not_certified() -> None:
     system = problem("planar-pendulum").system
     other = compile_stepper(system, SpectralCollocation(2), flags=QUICK_FLAGS)
-    names = {check.name for check in pendulum_certificate(stepper=other).broken}
+    names = {check.name for check in pendulum_certificate(stepper=other).violated}
     assert {"stage equations", "symplecticity", "reversal"} <= names
 
 
 @pytest.mark.parametrize(
     ("measure", "outcome"),
     [
-        (lambda: Finding(1.0, 2.0), Outcome.KEPT),
-        (lambda: Finding(3.0, 2.0), Outcome.BROKEN),
-        (lambda: Finding(3.0, 2.0, at_least=True), Outcome.KEPT),
-        (lambda: Finding(float("nan"), 2.0), Outcome.BROKEN),
-        (lambda: Finding(float("nan"), 2.0, at_least=True), Outcome.BROKEN),
-        (lambda: broken(BrokenError("it fails")), Outcome.BROKEN),
-        (lambda: broken(StateError("it is singular")), Outcome.NOT_MEASURED),
-        (lambda: broken(ZeroDivisionError("by zero")), Outcome.NOT_MEASURED),
+        (lambda: Finding(1.0, 2.0), Outcome.SATISFIED),
+        (lambda: Finding(3.0, 2.0), Outcome.VIOLATED),
+        (lambda: Finding(3.0, 2.0, at_least=True), Outcome.SATISFIED),
+        (lambda: Finding(float("nan"), 2.0), Outcome.VIOLATED),
+        (lambda: Finding(float("nan"), 2.0, at_least=True), Outcome.VIOLATED),
+        (lambda: violated(ViolationError("it fails")), Outcome.VIOLATED),
+        (lambda: violated(StateError("it is singular")), Outcome.NOT_MEASURED),
+        (lambda: violated(ZeroDivisionError("by zero")), Outcome.NOT_MEASURED),
     ],
 )
 def test_what_cannot_be_measured_is_never_called_kept(measure, outcome) -> None:
@@ -191,7 +191,7 @@ def test_what_cannot_be_measured_is_never_called_kept(measure, outcome) -> None:
     assert check.outcome is not Outcome.NOT_MEASURED or check.remark
 
 
-def broken(error: Exception) -> Finding:
+def violated(error: Exception) -> Finding:
     raise error
 
 
@@ -259,14 +259,14 @@ def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> N
 def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monkeypatch, capsys):
     entry = problem("harmonic-oscillator")
     said: list[str] = []
-    monkeypatch.setattr(waiting, "PATIENCE_SECONDS", 0.0)
-    monkeypatch.setattr(subject, "LONG_SECONDS", 0.0)
+    monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.0)
+    monkeypatch.setattr(system_under_test, "ANNOUNCED_SECONDS", 0.0)
     stepper = quickly_compiled(entry.system, SVI(1))
-    given = subject.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
-    with waiting.told_to(said.append):
-        next(step_checks(subject.Subject(entry.system, SVI(1), stepper, None, given)))
+    given = system_under_test.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
+    with announcements.announce_to(said.append):
+        next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
     assert capsys.readouterr().err == ""
-    next(step_checks(subject.Subject(entry.system, SVI(1), stepper, None, given)))
+    next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
     assert "which takes about" in capsys.readouterr().err  # which is no terminal
     assert "measuring stage equations" in said
     assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in said)

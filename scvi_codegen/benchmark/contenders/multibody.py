@@ -91,9 +91,9 @@ def by_lambdify(n: int) -> Solve:
     """Return a solver by SymPy's equations, after one call."""
     method, values = pendulum(n)
     method.kanes_equations()
-    given = {symbol: values[symbol.name] for symbol in _constants(method, values)}
+    arguments = {symbol: values[symbol.name] for symbol in _constants(method, values)}
     state = {function: sympy.Dummy() for function in (*method.q, *method.u)}
-    both = [part.xreplace(given).xreplace(state) for part in (method.mass_matrix, method.forcing)]
+    both = [part.xreplace(arguments).xreplace(state) for part in (method.mass_matrix, method.forcing)]
     equations = sympy.lambdify([list(state.values())], both, cse=True)
 
     def rates(t: float, x: Array) -> Array:
@@ -135,8 +135,8 @@ def _dop853(rates: Callable[[float, Array], Array], n: int) -> Solve:
     rates(0.0, begin)
 
     def solve(tolerance: float) -> Array:
-        found = solve_ivp(rates, (0.0, 1.0), begin, method="DOP853", rtol=tolerance, atol=tolerance)
-        final: Array = found.y[: n + 1, -1]
+        result = solve_ivp(rates, (0.0, 1.0), begin, method="DOP853", rtol=tolerance, atol=tolerance)
+        final: Array = result.y[: n + 1, -1]
         return final
 
     return solve

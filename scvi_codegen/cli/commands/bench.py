@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from scvi_codegen.benchmark import PEERS, Plan, benchmark
-from scvi_codegen.cli.frame import INTERRUPTED, CommandFailure, check_writable, note, reporting, tell
+from scvi_codegen.cli.command_group import INTERRUPTED, CommandFailure, check_writable, note, reporting, tell
 
 __all__ = ["bench"]
 
@@ -70,7 +70,7 @@ def bench(
             check_writable(Path(path), hint)
     names = tuple(PEERS) if peers is None else tuple(filter(None, peers.split(",")))
     plan = Plan(peers=names, repeats=repeats, quick=quick)
-    report = benchmark(sections, plan, json_path=output, plot_path=plot, resume=resume, say=note, show=tell)
+    report = benchmark(sections, plan, json_path=output, plot_path=plot, resume=resume, report_activity=note, show=tell)
     tell(**report.data())
     if report.interrupted:
         raise CommandFailure(

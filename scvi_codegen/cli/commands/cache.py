@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import click
 
-from scvi_codegen.cli.frame import reporting, tell
+from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.files.cache import cache_folder, cache_info, clear_cache
 
 __all__ = ["cache"]

@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.choices import Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import check_writable, emit, reporting
-from scvi_codegen.cli.sums import refuse
+from scvi_codegen.cli.choices import ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.command_group import check_writable, emit, reporting
+from scvi_codegen.cli.sums import reject_options
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
@@ -45,10 +45,10 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         if latex or radicals or output is not None:
             raise click.UsageError("--html excludes --latex, --radicals and -o")
         check_writable(Path(html), "'--html'")
-    model = read_model(model_name, Choices(**choices))
+    model = read_model(model_name, ModelOptions(**choices))
     about = {"system": model.system.name, "method": model.method.name}
     if isinstance(model, IndexedModel):
-        refuse({"html": html, "radicals": radicals})
+        reject_options({"html": html, "radicals": radicals})
         text = derive_sums(model.system, model.method, as_latex=latex)
         emit(text, output, **about, text=text)
         return

@@ -6,8 +6,8 @@ from dataclasses import asdict
 
 import click
 
-from scvi_codegen.cli.checkup import FAILS, Equipment, examine
-from scvi_codegen.cli.frame import FAILURE, CommandFailure, reporting, tell
+from scvi_codegen.cli.command_group import FAILURE, CommandFailure, reporting, tell
+from scvi_codegen.cli.equipment import FAILED, CheckResult, run_checks
 
 __all__ = ["doctor"]
 
@@ -28,16 +28,16 @@ def doctor() -> None:
       CC=clang scvi-codegen doctor --json
     """
     findings = []
-    for finding in examine():
+    for finding in run_checks():
         findings.append(finding)
         tell(_lines(finding))
-    failing = [finding.name for finding in findings if finding.status == FAILS]
+    failing = [finding.name for finding in findings if finding.status == FAILED]
     tell(ok=not failing, findings=[asdict(finding) for finding in findings])
     if failing:
         raise CommandFailure(f"integrators cannot be compiled and run on this machine: {', '.join(failing)}", FAILURE)
 
 
-def _lines(finding: Equipment) -> str:
+def _lines(finding: CheckResult) -> str:
     """Return a line with status, name and description of a check, and indented lines with the remedy."""
     indent = " " * (STATUS_WIDTH + NAME_WIDTH + 2)
     first = f"{finding.status:{STATUS_WIDTH}} {finding.name:{NAME_WIDTH}} {finding.found}"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from scvi_codegen.cli.frame import check_writable, reporting, tell
+from scvi_codegen.cli.command_group import check_writable, reporting, tell
 from scvi_codegen.cli.numbers import recorded_numbers
-from scvi_codegen.cli.recording import check_format, standing
+from scvi_codegen.cli.recording import check_format, describe_progress
 from scvi_codegen.results.recording import load_run
 
 __all__ = ["export"]
@@ -32,7 +32,7 @@ def export(folder: str, output: str | None) -> None:
         check_format(output, ensemble=False)
         check_writable(Path(output), "'-o'")
     recorded = load_run(folder)
-    tell(standing(recorded), **recorded_numbers(recorded))
+    tell(describe_progress(recorded), **recorded_numbers(recorded))
     if output is not None:
         recorded.save(output)
         tell(f"wrote {output}", written=[output])

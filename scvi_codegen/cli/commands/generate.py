@@ -6,15 +6,15 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import reporting, tell
-from scvi_codegen.cli.sums import refuse, solved_by
+from scvi_codegen.cli.choices import SOLVER_OPTION, ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.command_group import reporting, tell
+from scvi_codegen.cli.sums import reject_options, with_solver
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import generate_sums
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.cross import TARGETS
-from scvi_codegen.rendering.text import Embedded
+from scvi_codegen.rendering.program_source import Embedded
 
 __all__ = ["generate"]
 
@@ -73,14 +73,14 @@ def generate(
       make -C pendulum_svi run
       python -c "import pendulum_svi; print(pendulum_svi.stepper.step([0.5], [0.0], 0.1))"
     """
-    model = read_model(model_name, Choices(**choices))
+    model = read_model(model_name, ModelOptions(**choices))
     if fmu and (embedded or single_file):
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
     if isinstance(model, IndexedModel):
-        refuse({"embedded": embedded, "single_file": single_file, "fmu": fmu})
-        folder, python = generate_sums(solved_by(solver, model), output, force=force), ""
+        reject_options({"embedded": embedded, "single_file": single_file, "fmu": fmu})
+        folder, python = generate_sums(with_solver(solver, model), output, force=force), ""
     elif fmu:
         folder, python = generate_fmu(model, output, solver=solver, platforms=platforms, force=force), ""
     else:

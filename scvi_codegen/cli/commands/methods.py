@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.frame import reporting, tell
-from scvi_codegen.cli.wording import table
+from scvi_codegen.cli.command_group import reporting, tell
+from scvi_codegen.cli.formatting import table
 from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification, size_of
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.nodes import Expressions
@@ -42,9 +42,9 @@ def methods(tableau: str | None) -> None:
         entries = [entry for name in METHODS for entry in _entries_of(name)]
         tell(methods_table(entries), methods=entries)
     else:
-        found = tableau_by_name(tableau)
-        numbers: dict[str, Any] = {name: [_decimals(row) for row in getattr(found, name)] for name in "Abc"}
-        tell(tableau_text(tableau), name=found.name, order=found.order, **numbers)
+        result = tableau_by_name(tableau)
+        numbers: dict[str, Any] = {name: [_decimals(row) for row in getattr(result, name)] for name in "Abc"}
+        tell(tableau_text(tableau), name=result.name, order=result.order, **numbers)
 
 
 def _entries_of(name: str) -> Iterator[dict[str, Any]]:

@@ -11,8 +11,16 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable, is_quiet, reporting, tell
-from scvi_codegen.cli.wording import counted
+from scvi_codegen.cli.command_group import (
+    FAILURE,
+    INTERRUPTED,
+    CommandFailure,
+    check_writable,
+    is_quiet,
+    reporting,
+    tell,
+)
+from scvi_codegen.cli.formatting import counted
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result

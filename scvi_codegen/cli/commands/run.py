@@ -8,16 +8,16 @@ from typing import Any
 
 import click
 
-from scvi_codegen.advice.promise import broken_promise
-from scvi_codegen.cli.advising import advised_model, confirmed_model, controlled_model
-from scvi_codegen.cli.choices import SOLVER_OPTION, Choices, model_arguments, read_model
+from scvi_codegen.advice.tolerance_check import missed_tolerance
+from scvi_codegen.cli.choices import SOLVER_OPTION, ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.cli.conservation import energy_balance
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
-from scvi_codegen.cli.frame import FAILURE, INTERRUPTED, CommandFailure, check_writable, reporting, tell
 from scvi_codegen.cli.numbers import ensemble_numbers, failure_text, recorded_numbers, run_numbers
-from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_folder
+from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
-from scvi_codegen.cli.sums import refuse, run_sums, solved_by
+from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
+from scvi_codegen.cli.sums import reject_options, run_indexed, with_solver
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
@@ -158,19 +158,19 @@ def run(
         return
     if model_name is None:
         raise click.UsageError("Missing argument 'MODEL', or --resume FOLDER.")
-    recorded = output is not None and is_folder(output)
+    recorded = output is not None and is_run_folder(output)
     recording.check(recorded)
     _check_outputs(output, plot, ensemble)
     wanted = {"tolerance": tolerance, "error": error, "advise": advise}
     _check_combination(choices, plot=plot, ensemble=ensemble, wanted=wanted, folder=output if recorded else None)
-    model = read_model(model_name, Choices(**choices))
-    given = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
-    chosen: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    model = read_model(model_name, ModelOptions(**choices))
+    arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
+    chosen: dict[str, Any] = {key: value for key, value in arguments.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
     if isinstance(model, IndexedModel):
-        refuse({"ensemble": ensemble, "advise": advise})
-        arrays, confirmed = _sums_with_steps(solved_by(solver, model), wanted, options, threads)
-        run_sums(arrays, output, plot, options, threads)
+        reject_options({"ensemble": ensemble, "advise": advise})
+        arrays, confirmed = _indexed_with_steps(with_solver(solver, model), wanted, options, threads)
+        run_indexed(arrays, output, plot, options, threads)
         _check_confirmed(confirmed)
         return
     if threads is not None:
@@ -184,7 +184,7 @@ def run(
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, solver=solver, options=options))
     else:
-        _run_one(model, output, plot, solver, options, promised=advise)
+        _run_one(model, output, plot, solver, options, advised=advise)
     _check_confirmed(found)
 
 
@@ -204,29 +204,29 @@ def _with_steps(
     """Return the model with the steps that one of the requested errors determines, and the estimated global error."""
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
-        return controlled_model(model, tolerance), None
+        return model_with_adaptive_steps(model, tolerance), None
     if advise is not None:
-        return advised_model(model, advise, solver=solver, options=options), None
+        return model_with_advised_step(model, advise, solver=solver, options=options), None
     if (bound := model.error if error is None else error) is not None:
-        return confirmed_model(model, bound, solver=solver, options=options)
+        return model_with_global_error(model, bound, solver=solver, options=options)
     return model, None
 
 
-def _sums_with_steps(
+def _indexed_with_steps(
     model: IndexedModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
 ) -> tuple[IndexedModel, GlobalError | None]:
     """Return the same as :func:`_with_steps` for indexed systems."""
     if wanted["tolerance"] is not None:
-        return controlled_model(model, wanted["tolerance"]), None
+        return model_with_adaptive_steps(model, wanted["tolerance"]), None
     bound = model.error if wanted["error"] is None else wanted["error"]
     if bound is None:
         return model, None
-    return confirmed_model(model, bound, options=options, threads=threads)
+    return model_with_global_error(model, bound, options=options, threads=threads)
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
     """Check before a long run that its files can be written."""
-    if output is not None and not (ensemble is None and is_folder(output)):
+    if output is not None and not (ensemble is None and is_run_folder(output)):
         check_format(output, ensemble=ensemble is not None)
         check_writable(Path(output), "'-o'")
     if plot is not None:
@@ -245,14 +245,14 @@ def _check_combination(
 ) -> None:
     if folder is not None and plot is not None:
         raise click.UsageError("--plot is not available for a run recorded in a folder: it needs the states in memory")
-    given = [name for name, value in wanted.items() if value is not None]
-    if len(given) > 1:
+    arguments = [name for name, value in wanted.items() if value is not None]
+    if len(arguments) > 1:
         raise click.UsageError(
-            f"--{given[0]} and --{given[1]} exclude each other: each determines the step size; give one"
+            f"--{arguments[0]} and --{arguments[1]} exclude each other: each determines the step size; give one"
         )
-    for name in ("step", "steps") if given else ():
+    for name in ("step", "steps") if arguments else ():
         if choices[name] is not None:
-            raise click.UsageError(f"--{given[0]} determines the step size: omit --{name} (--span is the duration)")
+            raise click.UsageError(f"--{arguments[0]} determines the step size: omit --{name} (--span is the duration)")
     for name, value in (("plot", plot), *wanted.items()):
         if ensemble is not None and value is not None:
             raise click.UsageError(f"--{name} is not available with --ensemble")
@@ -272,7 +272,7 @@ def _run_one(
     solver: str,
     options: SolverOptions | None,
     *,
-    promised: float | None,
+    advised: float | None,
 ) -> None:
     outcome = integrate_model(model, solver=solver, options=options)
     known = known_at_end(model, outcome)
@@ -289,7 +289,7 @@ def _run_one(
         raise CommandFailure(f"{outcome.missed}\n{_kept(outcome, written)}", FAILURE)
     for path in written:
         tell(f"wrote {path}")
-    missed = "" if promised is None else broken_promise(model.system, outcome.trajectory, promised, known)
+    missed = "" if advised is None else missed_tolerance(model.system, outcome.trajectory, advised, known)
     tell(missed=missed or None)
     if missed:
         raise CommandFailure(missed, FAILURE)
@@ -299,31 +299,31 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     """Print the summary of a run in a folder, and how to continue it."""
     tell(outcome.summary(), **recorded_numbers(outcome.recorded), failure=failure_text(outcome))
     if outcome.failure is not None:
-        raise CommandFailure(f"{outcome.failure}\n{outcome.kept()}", FAILURE)
+        raise CommandFailure(f"{outcome.failure}\n{outcome.continuation()}", FAILURE)
     if outcome.interrupted:
-        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.kept()}", INTERRUPTED)
+        raise CommandFailure(f"interrupted at t = {outcome.run.t:g}\n{outcome.continuation()}", INTERRUPTED)
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
 def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
     if model.error is not None:
         raise click.UsageError(f"[run] error = {model.error:g} is not available with --ensemble: set tolerance instead")
-    if model.paced:
+    if model.has_time_transformation:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
     outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
     tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
-    kept = "the computed states were not written to a file (-o)"
+    continuation = "the computed states were not written to a file (-o)"
     if output is not None:
         outcome.result.save(output)
-        kept = f"the computed states were written: {output}"
+        continuation = f"the computed states were written: {output}"
     if outcome.interrupted:
         raise CommandFailure(
-            f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{kept}", INTERRUPTED
+            f"interrupted after {outcome.result.steps.mean():.0f} steps on average\n{continuation}", INTERRUPTED
         )
     if not outcome.result.ok.any():
-        raise CommandFailure(f"every trajectory failed\n{kept}", FAILURE)
+        raise CommandFailure(f"every trajectory failed\n{continuation}", FAILURE)
     if output is not None:
         tell(f"wrote {output}", written=[output])
 

@@ -9,9 +9,9 @@ from typing import Any
 import click
 
 from scvi_codegen import verification
-from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, Choices, model_arguments, read_model
-from scvi_codegen.cli.frame import FAILURE, CommandFailure, check_writable, note, reporting, tell
-from scvi_codegen.cli.sums import solved_by
+from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
+from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import load_sums
@@ -53,16 +53,16 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     path = _certificate_path(model_name) if output is None else Path(output)
     if path is not None:
         check_writable(path, "'-o'")
-    certificate = _verified(model_name, Choices(**choices), solver=solver)
+    certificate = _verified(model_name, ModelOptions(**choices), solver=solver)
     tell(certificate.to_text(), nl=False, **json.loads(certificate.to_json()))
     if path is not None:
         certificate.save(path)
         note(f"wrote {path}")
     if not certificate.passed:
-        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.broken)}", FAILURE)
+        raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}", FAILURE)
 
 
-def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
+def _verified(name: str, choices: ModelOptions, *, solver: str) -> Certificate:
     """Return the certificate of a model file, a system of the catalogue or a generated folder.
 
     Raises:
@@ -73,8 +73,8 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
     if not folder.is_dir():
         model = read_model(name, choices)
         if isinstance(model, IndexedModel):
-            model = solved_by(solver, model)
-            return _certificate_of_sums(model, model.stepper())
+            model = with_solver(solver, model)
+            return _indexed_certificate(model, model.stepper())
         return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
@@ -84,7 +84,7 @@ def _verified(name: str, choices: Choices, *, solver: str) -> Certificate:
         )
     model = read_model_file(folder / MODEL_FILE, choices.sections())
     if isinstance(model, IndexedModel):
-        return _certificate_of_sums(model, load_sums(folder, model))
+        return _indexed_certificate(model, load_sums(folder, model))
     return _certificate(model, load_package(folder), "auto")
 
 
@@ -103,7 +103,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     )
 
 
-def _certificate_of_sums(model: IndexedModel, stepper: IndexedStepper) -> Certificate:
+def _indexed_certificate(model: IndexedModel, stepper: IndexedStepper) -> Certificate:
     return verify_indexed(
         model.system,
         model.method,

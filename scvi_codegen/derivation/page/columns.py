@@ -66,30 +66,30 @@ def column_of(table: Table, number: int) -> Column:
     if len(found) == 1:
         prefix, index, divisor = found.pop()
         return Column("named", points, sympy.Rational(1, divisor), prefix, index, transposed and index is not None)
-    places = [place for place, value in enumerate(values) if value != 0]
-    if not places:
+    indices = [point for point, value in enumerate(values) if value != 0]
+    if not indices:
         return Column("zero", points)
-    if found or len({values[place] for place in places}) > 1:
+    if found or len({values[point] for point in indices}) > 1:
         return Column("other", points, prefix="G", index=number)
-    factor = sympy.Integer(int(values[places[0]]))
-    if len(places) == points:
+    factor = sympy.Integer(int(values[indices[0]]))
+    if len(indices) == points:
         return Column("constant", points, factor)
-    if len(places) == 1:
-        return Column("single", points, factor, index=places[0] + 1)
-    leading = places == list(range(len(places)))
-    return Column("leading" if leading else "other", points, factor, "" if leading else "G", len(places))
+    if len(indices) == 1:
+        return Column("single", points, factor, index=indices[0] + 1)
+    leading = indices == list(range(len(indices)))
+    return Column("leading" if leading else "other", points, factor, "" if leading else "G", len(indices))
 
 
 def _is_transposed(table: Table) -> bool:
     """Return whether the second index in the names is that of the point, and the first is not."""
     pairs = [
-        (place, [int(index) for index in name.partition("/")[0].split("_")[1:]])
-        for place, line in enumerate(table.names, 1)
+        (point, [int(index) for index in name.partition("/")[0].split("_")[1:]])
+        for point, line in enumerate(table.names, 1)
         for name in line
         if name.count("_") == 2
     ]
-    second = all(indices[1] == place for place, indices in pairs)
-    return len(table.names) > 1 and bool(pairs) and second and any(indices[0] != place for place, indices in pairs)
+    second = all(indices[1] == point for point, indices in pairs)
+    return len(table.names) > 1 and bool(pairs) and second and any(indices[0] != point for point, indices in pairs)
 
 
 def _parts(name: str, points: int, *, transposed: bool) -> tuple[str, int | None, int]:

@@ -12,10 +12,10 @@ from scvi_codegen.derivation.page.jacobian import Start, jacobian_section
 from scvi_codegen.derivation.page.kernels import kernels_section, operations_section
 from scvi_codegen.derivation.page.motion import motion_section, system_section
 from scvi_codegen.derivation.page.stage_equations import (
+    component_equations,
+    component_equations_section,
     idel_section,
     stage_section,
-    written_out,
-    written_out_section,
 )
 from scvi_codegen.display.page.blocks import Section
 from scvi_codegen.display.page.environment import page_template, style_sheet
@@ -23,7 +23,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.rendering.outline import functions_of
-from scvi_codegen.rendering.text import render
+from scvi_codegen.rendering.program_source import render
 from scvi_codegen.version import __version__
 
 __all__ = ["derivation_html"]
@@ -59,14 +59,14 @@ def _sections(system: MechanicalSystem, method: Method, solver: str, start: Star
     program = program_of(system, method, solver=solver, prefix=c_identifier(system.name))
     functions = functions_of(render(program).amalgamated().code)
     stages = paper_equations(system, method)
-    derived = written_out(system, method, stages)
+    derived = component_equations(system, method, stages)
     yield system_section(system)
     yield motion_section(system)
     yield curve_section(method)
     yield tables_section(method, table_entries(stages, method))
     yield stage_section(system, stages)
     yield idel_section(system, stages)
-    yield written_out_section(derived)
+    yield component_equations_section(derived)
     yield jacobian_section(system, stages, derived, program, start)
     yield operations_section(program)
     yield kernels_section(system, program, functions)

@@ -27,7 +27,7 @@ def operations(expression: sympy.Basic) -> int:
     return int(sympy.count_ops(expression))
 
 
-def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
+def formulas(all_formulas: Sequence[Formula], what: str, *, together: int = MOST_TOGETHER) -> Iterator[Content]:
     """Yield the first formulas, and the number of the others.
 
     Args:
@@ -36,7 +36,7 @@ def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETH
         together: operations of those shown.
     """
     shown, large, total = 0, [], 0
-    for formula in given[:MOST_FORMULAS]:
+    for formula in all_formulas[:MOST_FORMULAS]:
         size = operations(formula.right)
         total += min(size, MOST_OPERATIONS)
         if shown and total > together:
@@ -49,17 +49,17 @@ def formulas(given: Sequence[Formula], what: str, *, together: int = MOST_TOGETH
     if large:
         count = _counted(len(large), what)
         yield Paragraph(f"{count} of more than {MOST_OPERATIONS} operations left out, the longest of {max(large)}.")
-    if shown < len(given):
-        yield Paragraph(f"The first {shown} of {_counted(len(given), what)}.")
+    if shown < len(all_formulas):
+        yield Paragraph(f"The first {shown} of {_counted(len(all_formulas), what)}.")
 
 
 def lines(text: str) -> Code:
     """Return C source, truncated if it is long."""
-    given = text.splitlines()
-    if len(given) <= MOST_LINES:
+    all_formulas = text.splitlines()
+    if len(all_formulas) <= MOST_LINES:
         return Code(text)
-    kept = "\n".join(given[:MOST_LINES])
-    return Code(f"{kept}\n/* .. {len(given) - MOST_LINES} more lines */")
+    kept = "\n".join(all_formulas[:MOST_LINES])
+    return Code(f"{kept}\n/* .. {len(all_formulas) - MOST_LINES} more lines */")
 
 
 def _counted(count: int, what: str) -> str:

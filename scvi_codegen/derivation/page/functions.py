@@ -11,13 +11,13 @@ from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import lines
 from scvi_codegen.derivation.page.kernels import kernels_of
-from scvi_codegen.derivation.page.stage_equations import families_contents
+from scvi_codegen.derivation.page.stage_equations import stage_group_contents
 from scvi_codegen.derivation.page.sums import end_formulas, row_formulas
-from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section
-from scvi_codegen.ir.curve_sweeps import CollocationSweep, ShootingSweep
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, SideBySide
+from scvi_codegen.ir.curve_iterations import CollocationIteration, ShootingIteration
+from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.iterations import CoupledIteration, HamiltonianIteration, SeparableIteration
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.sweep import Sweep
-from scvi_codegen.ir.sweeps import CoupledSweep, HamiltonianSweep, SeparableSweep
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
@@ -54,11 +54,11 @@ def functions_section(
     return Section(name="functions", title="The step: what the C does", contents=(Paragraph(text), *pairs))
 
 
-def _pair(function: Function, start: str, given: Iterator[Content]) -> Beside:
+def _pair(function: Function, start: str, all_formulas: Iterator[Content]) -> SideBySide:
     words = function.comment or "The loop over the steps, with compensated sums."
-    return Beside(
+    return SideBySide(
         title=f"{function.name}({', '.join(function.arguments)})",
-        left=(Paragraph(words if words.endswith(".") else f"{words}."), *given),
+        left=(Paragraph(words if words.endswith(".") else f"{words}."), *all_formulas),
         right=(lines(function.text),),
         folded=not OPENED.fullmatch(function.name) and function.name != start,
     )
@@ -81,7 +81,7 @@ def _compiled(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content
         "The stage equations as they are compiled: unknowns are velocities or accelerations times h in place of "
         "positions, whose differences would lose digits."
     )
-    yield from families_contents(system, stages)
+    yield from stage_group_contents(system, stages)
     for _, formula in row_formulas(system, stages):
         yield formula
     yield from end_formulas(system, stages)
@@ -99,14 +99,14 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
     return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
 
 
-SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
-    SeparableSweep: (
+SWEEPS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
+    SeparableIteration: (
         Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; iterated to convergence:"),
         Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),
         Formula(q + h * v0 + h**2 * _sum("beta_j", inverse_mass * Symbol("F_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("b_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    CoupledSweep: (
+    CoupledIteration: (
         Paragraph("Velocities V_n at the points, corrected to convergence; M = L_vv there:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(p + h * _sum("A_n_j", Symbol("L_q_j")), Symbol("P_n")),
@@ -118,7 +118,7 @@ SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("L_q_j")), Symbol("p_k+1")),
     ),
-    HamiltonianSweep: (
+    HamiltonianIteration: (
         Paragraph("Positions, forces, momenta and velocities V_n = H_p at the points, in turn to convergence:"),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(-Applied("H_q")(Symbol("q_n"), Symbol("P_n")), Symbol("F_n")),
@@ -127,7 +127,7 @@ SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
         Formula(q + h * _sum("b_j", Symbol("V_j")), Symbol("q_k+1")),
         Formula(p + h * _sum("B_j", Symbol("F_j")), Symbol("p_k+1")),
     ),
-    ShootingSweep: (
+    ShootingIteration: (
         Paragraph(
             "Scaled accelerations z_n at the nodes, corrected by the Euler-Lagrange residuals E; then p_(k+1), the "
             "velocity v_0 at the start and the multipliers, in turn to convergence:"
@@ -136,7 +136,7 @@ SWEEPS: dict[type[Sweep], tuple[Content, ...]] = {
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),
         Formula(Symbol("z_n") - h * inverse_mass * Symbol("E_n"), Symbol("z_n_new")),
     ),
-    CollocationSweep: (
+    CollocationIteration: (
         Paragraph("Scaled accelerations z_n at the nodes, F = L_q - L_vq v - L_vt, M = L_vv; iterated to convergence:"),
         Formula(v0 + _sum("a_n_j", Symbol("z_j")), Symbol("V_n")),
         Formula(q + h * _sum("a_n_j", Symbol("V_j")), Symbol("q_n")),

@@ -94,8 +94,8 @@ def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int],
     named = {symbol.name: value for symbol, value in values.items()}
     for unknown, guess in derived.initial_guess.items():
         values[unknown] = guess.xreplace({s: named[s.name] for s in guess.free_symbols if s.name in named})
-    found = {place: entry.xreplace(values).evalf() for place, entry in derived.jacobian.todok().items()}
-    return {place: float(value) for place, value in found.items() if value.is_Float}
+    found = {index: entry.xreplace(values).evalf() for index, entry in derived.jacobian.todok().items()}
+    return {index: float(value) for index, value in found.items() if value.is_Float}
 
 
 def _titles(

@@ -10,7 +10,7 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines, operations
-from scvi_codegen.display.page.blocks import Beside, Content, Formula, Paragraph, Section, TableBlock
+from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, SideBySide, TableBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
@@ -89,14 +89,17 @@ def kernel_text(functions: Mapping[str, Function], name: str) -> str:
 
 def _pair(
     program: Program, kernel: Kernel, functions: Mapping[str, Function], names: Mapping[Symbol, Symbol]
-) -> Beside:
+) -> SideBySide:
     function = functions[kernel.name]
     values, slopes = (
         [
             Formula(formula.xreplace(names) if k < MOST_FORMULAS else formula, Symbol(f"{name}_{k}"))
-            for k, formula in enumerate(given)
+            for k, formula in enumerate(all_formulas)
         ]
-        for name, given in (("value", kernel.formulas[: kernel.values]), ("slope", kernel.formulas[kernel.values :]))
+        for name, all_formulas in (
+            ("value", kernel.formulas[: kernel.values]),
+            ("slope", kernel.formulas[kernel.values :]),
+        )
     )
     left: list[Content] = [Paragraph(COUNTS.sub("", function.comment))] if function.comment else []
     if kernel.uses_arguments:
@@ -105,4 +108,4 @@ def _pair(
         left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
     left += [*formulas(values, "value"), *formulas(slopes, "slope")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
-    return Beside(title=title, left=tuple(left), right=(lines(kernel_text(functions, kernel.name)),))
+    return SideBySide(title=title, left=tuple(left), right=(lines(kernel_text(functions, kernel.name)),))

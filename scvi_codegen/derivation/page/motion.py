@@ -10,7 +10,7 @@ from sympy import Symbol
 from scvi_codegen.derivation.page.elision import formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.mechanics.constraints import with_reactions
+from scvi_codegen.mechanics.constraints import with_constraint_forces
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -73,7 +73,7 @@ def _euler_lagrange(system: MechanicalSystem) -> Iterator[Content]:
         "The Euler-Lagrange equations (2), d/dt dL/dv - dL/dq = 0, by the chain rule. They are linear in the "
         "accelerations; neither the derivation nor the C solves for these."
     )
-    motion = [-f for f in with_reactions(system, [-residual for residual in forms_of(system).euler_lagrange])]
+    motion = [-f for f in with_constraint_forces(system, [-residual for residual in forms_of(system).euler_lagrange])]
     yield from formulas([Formula(value, sympy.S.Zero, "2") for value in motion], "equation")
 
 
@@ -82,7 +82,7 @@ def _hamilton(system: MechanicalSystem) -> Iterator[Content]:
     rates = [Formula(by_momenta.get(i, sympy.S.Zero), velocity, "19a") for i, velocity in enumerate(system.velocities)]
     kicks = [
         Formula(force, Symbol(f"{p.name}_dot"), "19b")
-        for p, force in zip(system.auxiliaries, forms_of(system).thrust, strict=True)
+        for p, force in zip(system.auxiliaries, forms_of(system).momentum_rate, strict=True)
     ]
     yield Paragraph("Hamilton's equations (19), dq/dt = dH/dp and dp/dt = -dH/dq:")
     yield from formulas(rates, "equation")

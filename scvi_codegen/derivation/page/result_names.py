@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from sympy import Symbol
 
-from scvi_codegen.lowering.families import argument_name
-from scvi_codegen.mechanics.constraints import constraint_rates, positions_held, velocities_held
+from scvi_codegen.lowering.stage_groups import argument_name
+from scvi_codegen.mechanics.constraints import constraint_rates, holonomic_expressions, nonholonomic_expressions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Gather, PointFamily, Scatter
+from scvi_codegen.methods.stage_system import Gather, Scatter, StageGroup
 
-__all__ = ["argument_symbol", "meaning", "place_name", "result_symbol", "scalar_name"]
+__all__ = ["argument_symbol", "meaning", "point_index", "result_symbol", "scalar_name"]
 
 ARGUMENTS = {"v": "q_dot", "a": "q_ddot", "j": "q_d3", "s": "q_d4"}
 """Time derivatives of the curve as they are typeset."""
@@ -29,7 +29,7 @@ MULTIPLIED_FORCES = (
 )
 
 
-def place_name(family: PointFamily, point: object = "n") -> str:
+def point_index(family: StageGroup, point: object = "n") -> str:
     """Return the index of a point of a stage group: n, or k and k + 1 at an end of the step."""
     return PLACES.get(family.name, str(point if len(family.abscissae) > 1 else 1))
 
@@ -40,11 +40,11 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
     return Symbol(f"{ARGUMENTS.get(name, name)}_{place}")
 
 
-def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatter, place: str) -> Symbol:
+def result_symbol(system: MechanicalSystem, family: StageGroup, scatter: Scatter, place: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
-    if system.constraints and scatter.results == positions_held(system):
+    if system.constraints and scatter.results == holonomic_expressions(system):
         return Symbol(f"g_{place}")
-    if system.constraints and scatter.results in (velocities_held(system), constraint_rates(system)):
+    if system.constraints and scatter.results in (nonholonomic_expressions(system), constraint_rates(system)):
         return Symbol(f"g_dot_{place}")
     if family.scalar is None:
         forms = forms_of(system)
@@ -54,14 +54,14 @@ def result_symbol(system: MechanicalSystem, family: PointFamily, scatter: Scatte
     return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")
 
 
-def scalar_name(family: PointFamily) -> str:
+def scalar_name(family: StageGroup) -> str:
     """Return L, its k-th time derivative along the curve, or S."""
     if family.name == "node":
         return "S"
     return "L" if not family.scalar_power else "L_dot" if family.scalar_power == 1 else f"L_d{family.scalar_power}"
 
 
-def meaning(family: PointFamily) -> str:
+def meaning(family: StageGroup) -> str:
     """Return the meaning of the letter of a stage group's results."""
     if family.scalar is not None:
         name = scalar_name(family)

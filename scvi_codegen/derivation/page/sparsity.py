@@ -34,20 +34,22 @@ class Pattern:
 
 def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
     """Return the pattern of the residuals with respect to the unknowns, in the order of the equations, by blocks."""
-    places = [0, *accumulate(stages.block_sizes(dimension))]
+    offsets = [0, *accumulate(stages.block_sizes(dimension))]
     lines = [0, *accumulate(stages.row_sizes(dimension))]
     found: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
     for family in stages.families:
         for scatter in family.scatters:
             for gather in family.gathers:
                 pairs = jacobian(scatter.results, gather.arguments)
-                for r, b in _met(scatter.table.entries, gather.table.entries, len(stages.rows)):
+                for r, b in _coupled_pairs(scatter.table.entries, gather.table.entries, len(stages.rows)):
                     for i, j in pairs:
-                        found[lines[r] + i].add(places[b] + j)
+                        found[lines[r] + i].add(offsets[b] + j)
     return Pattern(len(found), tuple(tuple(sorted(row)) for row in found))
 
 
-def _met(rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int) -> set[tuple[int, int]]:
+def _coupled_pairs(
+    rows: Iterable[tuple[object, ...]], blocks: Iterable[tuple[object, ...]], count: int
+) -> set[tuple[int, int]]:
     """Return the pairs of rows and blocks that have a point in common."""
     return {
         (r, b - 1)
@@ -77,13 +79,13 @@ def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | No
     svg = (
         f'<svg viewBox="-1 -1 {SIDE + 2} {SIDE + 2}" role="img" aria-label="{caption}" '
         f'style="--width: {SIDE}px; min-width: 0">'
-        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_pointed(titles or {}, cell))}'
+        f'<path d="{"".join(runs)}" fill="var(--link)"/>{"".join(_tooltips(titles or {}, cell))}'
         f'<path d="M0 0H{SIDE}V{SIDE}H0z" fill="none" stroke="currentColor" opacity="0.5"/></svg>'
     )
     return Drawing(svg, caption)
 
 
-def _pointed(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
+def _tooltips(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
     """Yield the tooltips of entries."""
     for (i, j), title in titles.items():
         place = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'

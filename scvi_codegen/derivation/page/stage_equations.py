@@ -16,14 +16,14 @@ from scvi_codegen.derivation.page.sums import end_formulas, gather_formulas, row
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.stage_system import PointFamily, StageSystem
+from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 
 __all__ = [
-    "families_contents",
+    "component_equations",
+    "component_equations_section",
     "idel_section",
+    "stage_group_contents",
     "stage_section",
-    "written_out",
-    "written_out_section",
 ]
 
 MOST_OPERATIONS = 6000
@@ -46,7 +46,7 @@ def stage_section(system: MechanicalSystem, stages: StageSystem) -> Section:
         title="Stage equations",
         contents=(
             Paragraph(_unknowns(system, stages)),
-            *families_contents(system, stages),
+            *stage_group_contents(system, stages),
             *_rows(system, stages, {"stage", "multiplier", "Legendre"}),
         ),
     )
@@ -68,7 +68,7 @@ def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
     )
 
 
-def families_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
+def stage_group_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
     """Yield the arguments of each stage group, and the names of its results."""
     meanings: dict[str, None] = {}
     for family in stages.families:
@@ -80,7 +80,7 @@ def families_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator
     yield Paragraph(f"{'; '.join(meanings)}.")
 
 
-def written_out(system: MechanicalSystem, method: Method, stages: StageSystem) -> StepEquations | None:
+def component_equations(system: MechanicalSystem, method: Method, stages: StageSystem) -> StepEquations | None:
     """Return the equations component by component, ``None`` if they would be too long."""
     points = sum(
         len(family.abscissae) * sum(1 + operations(result) for result in family.results) for family in stages.families
@@ -88,7 +88,7 @@ def written_out(system: MechanicalSystem, method: Method, stages: StageSystem) -
     return derive(system, method) if points * len(stages.rows) <= MOST_OPERATIONS else None
 
 
-def written_out_section(derived: StepEquations | None) -> Section:
+def component_equations_section(derived: StepEquations | None) -> Section:
     """Return the section with all equations component by component."""
     title, name = "Written out", "written-out"
     if derived is None:
@@ -130,7 +130,7 @@ def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
     return f"Unknown are {', '.join(names)}{each}: {size} in all. Known are q_k, p_k, t_k and h."
 
 
-def _place(family: PointFamily) -> str:
+def _place(family: StageGroup) -> str:
     first = family.name.partition("_")[0]
     named = FAMILIES.get(first, f"At the points of '{family.name}'")
     return named if len(family.abscissae) == 1 else f"{named}, {len(family.abscissae)} of them"

@@ -11,11 +11,11 @@ import sympy
 from sympy import Symbol
 
 from scvi_codegen.derivation.page.columns import Column, column_of
-from scvi_codegen.derivation.page.result_names import argument_symbol, place_name, result_symbol
+from scvi_codegen.derivation.page.result_names import argument_symbol, point_index, result_symbol
 from scvi_codegen.display.mathml.names import RAISED
 from scvi_codegen.display.page.blocks import Formula
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.stage_system import Block, PointFamily, Row, Scatter, StageSystem, Table
+from scvi_codegen.methods.stage_system import Block, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.precision import Number
 
 __all__ = ["end_formulas", "gather_formulas", "gathered", "row_formulas"]
@@ -24,10 +24,10 @@ h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)
 RUNNING_ROW = "i"
 
 
-def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: PointFamily) -> Iterator[Formula]:
+def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: StageGroup) -> Iterator[Formula]:
     """Yield the arguments of the kernel of a stage group at point n, except those that are unknowns themselves."""
     for gather in family.gathers:
-        total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, place_name(family))
+        total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, point_index(family))
         scale = sympy.Rational(str(gather.scale))
         if scale == 1:
             right = sympy.Add(*(h**gather.power * term for term in sympy.Add.make_args(total)))
@@ -109,7 +109,7 @@ class _Part:
     """Contribution of a scatter to a line: the column of the table, and the result that it multiplies."""
 
     system: MechanicalSystem
-    family: PointFamily
+    family: StageGroup
     scatter: Scatter
     column: Column
     power: int
@@ -127,7 +127,7 @@ class _Part:
 
     def product(self, index: object) -> sympy.Expr:
         """Return the entry times the result, without weight: at point n, or at the single point of the entry."""
-        place = place_name(self.family, index if self.column.kind == "single" else n)
+        place = point_index(self.family, index if self.column.kind == "single" else n)
         factor = sympy.Rational(str(self.scatter.scale)) * h**self.power
         return factor * self.column.entry(index) * result_symbol(self.system, self.family, self.scatter, place)
 

@@ -9,7 +9,6 @@ from typing import TypeAlias
 import sympy
 
 __all__ = [
-    "Beside",
     "Block",
     "Cell",
     "Code",
@@ -19,6 +18,7 @@ __all__ = [
     "Listing",
     "Paragraph",
     "Section",
+    "SideBySide",
     "TableBlock",
 ]
 
@@ -94,7 +94,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Beside:
+class SideBySide:
     """Contents side by side on a wide screen, one above the other on a narrow one.
 
     Attributes:
@@ -110,7 +110,7 @@ class Beside:
 
 
 Block: TypeAlias = Paragraph | Formula | Listing
-Content: TypeAlias = Block | TableBlock | Code | Drawing | Beside
+Content: TypeAlias = Block | TableBlock | Code | Drawing | SideBySide
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,7 +22,7 @@ KINDS = {
     "listing": blocks.Listing,
     "code": blocks.Code,
     "drawing": blocks.Drawing,
-    "beside": blocks.Beside,
+    "beside": blocks.SideBySide,
     "table": blocks.TableBlock,
 }
 """Tests of blocks in templates."""

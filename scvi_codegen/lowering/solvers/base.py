@@ -1,7 +1,8 @@
 """Common interface of the fixed-point solvers: a function from a problem to an iteration, or ``None``.
 
 A solver is a module in this folder with such a function, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of :class:`~scvi_codegen.ir.sweep.Sweep`, plain data,
+(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of
+:class:`~scvi_codegen.ir.iteration.FixedPointIteration`, plain data,
 which declares the tables and the support headers from which :mod:`scvi_codegen.rendering.lanes` renders C. Solvers
 share only the problem. They may rely on the following:
 
@@ -17,8 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from scvi_codegen.ir.sweep import Sweep
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Shape
@@ -39,7 +40,7 @@ class StepProblem:
 
         Both have the same step (35f).
         """
-        return lagrangian_twin(self.system)
+        return equivalent_lagrangian(self.system)
 
 
-Solver: TypeAlias = Callable[[StepProblem], Sweep | None]
+Solver: TypeAlias = Callable[[StepProblem], FixedPointIteration | None]

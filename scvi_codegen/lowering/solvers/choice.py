@@ -12,32 +12,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.sweep import Sweep
-from scvi_codegen.ir.sweeps import Splitting
+from scvi_codegen.ir.iteration import FixedPointIteration
+from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.lowering.solvers.base import Solver, StepProblem
-from scvi_codegen.lowering.solvers.collocation import position_sweep, printed_sweep
-from scvi_codegen.lowering.solvers.coupled import coupled_sweep
-from scvi_codegen.lowering.solvers.hamiltonian import hamiltonian_sweep
-from scvi_codegen.lowering.solvers.separable import separable_sweep
-from scvi_codegen.lowering.solvers.shooting import shooting_sweep
+from scvi_codegen.lowering.solvers.collocation import position_iteration, printed_iteration
+from scvi_codegen.lowering.solvers.coupled import coupled_iteration
+from scvi_codegen.lowering.solvers.hamiltonian import hamiltonian_iteration
+from scvi_codegen.lowering.solvers.separable import separable_iteration
+from scvi_codegen.lowering.solvers.shooting import shooting_iteration
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
 
-__all__ = ["FIXED_POINTS", "check_solver", "sweep_of"]
+__all__ = ["FIXED_POINTS", "check_solver", "iteration_of"]
 
 FIXED_POINTS: tuple[Solver, ...] = (
-    separable_sweep,
-    hamiltonian_sweep,
-    coupled_sweep,
-    position_sweep,
-    printed_sweep,
-    shooting_sweep,
+    separable_iteration,
+    hamiltonian_iteration,
+    coupled_iteration,
+    position_iteration,
+    printed_iteration,
+    shooting_iteration,
 )
 """Fixed-point solvers, the fastest first; the first that is applicable is used."""
 
 
-def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
+def iteration_of(system: MechanicalSystem, stages: StageSystem) -> FixedPointIteration | None:
     """Return the fixed-point iteration of the stage equations of a system, or ``None`` if there is none."""
     if system.constraints:
         return None
@@ -45,7 +45,9 @@ def sweep_of(system: MechanicalSystem, stages: StageSystem) -> Sweep | None:
     return next((sweep for solver in FIXED_POINTS if (sweep := solver(problem)) is not None), None)
 
 
-def check_solver(solver: str, method: Method, names: Sequence[str], *, found: Sweep | Splitting | None) -> None:
+def check_solver(
+    solver: str, method: Method, names: Sequence[str], *, found: FixedPointIteration | Splitting | None
+) -> None:
     """Raise :class:`MethodError` for an unknown solver, or one that this method and system do not have."""
     if solver not in names:
         raise MethodError(f"unknown solver {solver!r}: use one of {', '.join(names)}")

@@ -3,31 +3,31 @@
 It applies to non-variational collocation of the Euler-Lagrange equations: spectral collocation and Runge-Kutta methods
 in position form, whose momenta at both ends are those of the velocities there, and the shooting-based method as
 printed, whose momenta at both ends are quadratures. The equations, those of ``methods/collocation.py`` and
-``methods/shooting.py`` solved for the accelerations, are in :class:`scvi_codegen.ir.curve_sweeps.CollocationSweep`.
+``methods/shooting.py`` solved for accelerations, are in :class:`scvi_codegen.ir.curve_iterations.CollocationIteration`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from scvi_codegen.ir.curve_sweeps import CollocationSweep, PrintedEnds
+from scvi_codegen.ir.curve_iterations import CollocationIteration, PrintedEnds
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector, predictor_tables_of
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shapes import Accelerations, PrintedCurve
-from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values
 from scvi_codegen.tables.precision import Number
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["position_sweep", "printed_sweep"]
+__all__ = ["position_iteration", "printed_iteration"]
 
 
-def position_sweep(problem: StepProblem) -> CollocationSweep | None:
+def position_iteration(problem: StepProblem) -> CollocationIteration | None:
     """Return the fixed-point iteration of a tableau in position form; ``None`` with too many stages."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, Accelerations):
@@ -36,10 +36,10 @@ def position_sweep(problem: StepProblem) -> CollocationSweep | None:
     lanes = lane_count(len(tableau.b))
     if lanes > MOST_LANES:
         return None
-    return CollocationSweep(
+    return CollocationIteration(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
-        guess=guess_tables(tableau.c, lanes),
+        guess=predictor_tables_of(tableau.c, lanes),
         points=None,
         kernel=_node_kernel(system),
         mass_entries=tuple(forms_of(system).lower_mass),
@@ -48,7 +48,7 @@ def position_sweep(problem: StepProblem) -> CollocationSweep | None:
     )
 
 
-def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
+def printed_iteration(problem: StepProblem) -> CollocationIteration | None:
     """Return the fixed-point iteration of an SCVI as printed, of degree 2 or more; ``None`` with too many points."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, PrintedCurve):
@@ -56,10 +56,10 @@ def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
     lanes = lane_count(max(len(shape.tableau.b), len(shape.rule)))
     if lanes > MOST_LANES:
         return None
-    return CollocationSweep(
+    return CollocationIteration(
         lanes=lanes,
         nodes=node_tables(shape.tableau, lanes),
-        guess=guess_tables(shape.tableau.c, lanes),
+        guess=predictor_tables_of(shape.tableau.c, lanes),
         points=point_tables(system, shape.tableau, shape.rule, lanes),
         kernel=_node_kernel(system),
         mass_entries=tuple(forms_of(system).lower_mass),
@@ -71,7 +71,7 @@ def printed_sweep(problem: StepProblem) -> CollocationSweep | None:
 def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds:
     """Return the weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
     nodes = (0, *tableau.c)
-    values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_slopes))
+    values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_derivatives))
 
     def weighted(numbers: Iterable[Number]) -> tuple[Number, ...]:
         return pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, numbers, strict=True)), lanes)

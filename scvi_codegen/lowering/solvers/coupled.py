@@ -20,40 +20,40 @@ import sympy
 from sympy import Expr
 
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.ir.sweeps import CoupledSweep
+from scvi_codegen.ir.iterations import CoupledIteration
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector, predictor_tables_of
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, resolved_degree, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.basis import transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["coupled_sweep", "over", "weighted_tables"]
+__all__ = ["coupled_iteration", "over", "weighted_tables"]
 
 FRACTION_BITS = 51
-MOST_FOLLOWED = 8
+MOST_LINEARISED = 8
 """Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
 
 
-def coupled_sweep(problem: StepProblem) -> CoupledSweep | None:
+def coupled_iteration(problem: StepProblem) -> CoupledIteration | None:
     """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
     return _sweep(system, tables) if system and tables else None
 
 
-def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | None:
+def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration | None:
     points, blocks = len(tables.abscissae), len(tables.blocks)
     lanes = lane_count(max(points, blocks))
     if lanes > MOST_LANES:
         return None
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
-    guess = guess_tables(tables.blocks, lanes, degree=resolved_degree(tables))
+    guess = predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables))
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
-    followed = () if tables.projection else _followed(system)
-    given = "L_q, L_v, their slopes F_q, F_v and L_vq" if followed else "L_q, L_v"
-    return CoupledSweep(
+    followed = () if tables.projection else _linearised_forces(system)
+    evaluated = "L_q, L_v, their slopes F_q, F_v and L_vq" if followed else "L_q, L_v"
+    return CoupledIteration(
         points=points,
         blocks=blocks,
         lanes=lanes,
@@ -73,7 +73,7 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
             (*forms.force, *forms.momentum, *followed),
             of=of,
             slopes=forms.lower_mass.values(),
-            purpose=f"{given} and the lower triangle of L_vv at all points, u = (q, v).",
+            purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
         ),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
         mass_entries=tuple(forms.lower_mass),
@@ -83,13 +83,15 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledSweep | N
     )
 
 
-def _followed(system: LagrangianSystem) -> tuple[Expr, ...]:
+def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
     """Return F_q, F_v and L_vq by rows, with their zeros, for few coordinates with position-dependent masses.
 
     Nothing for other systems, whose iterations converge quickly.
     """
     forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
-    if m > MOST_FOLLOWED or not any(entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()):
+    if m > MOST_LINEARISED or not any(
+        entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()
+    ):
         return ()
     matrices = (
         jacobian(forms.force, system.coordinates),

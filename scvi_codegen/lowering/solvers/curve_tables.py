@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scvi_codegen.ir.curve_sweeps import NodeTables, PointTables
+from scvi_codegen.ir.curve_iterations import NodeTables, PointTables
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.padding import pad_matrix, pad_vector
 from scvi_codegen.mechanics.forms import forms_of

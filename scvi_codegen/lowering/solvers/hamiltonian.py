@@ -8,18 +8,18 @@ T(p) + V(q), and h at worst. H need not be regular. The tables are those of
 
 from __future__ import annotations
 
-from scvi_codegen.ir.sweeps import HamiltonianSweep
+from scvi_codegen.ir.iterations import HamiltonianIteration
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector, predictor_tables_of
 from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
 
-__all__ = ["hamiltonian_sweep"]
+__all__ = ["hamiltonian_iteration"]
 
 
-def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
+def hamiltonian_iteration(problem: StepProblem) -> HamiltonianIteration | None:
     """Return the fixed-point iteration of a Hamiltonian; ``None`` with too many or other points than velocities."""
     system = problem.system
     tables = velocity_tables(problem.shape) if system.auxiliaries else None
@@ -31,7 +31,7 @@ def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
     position, position_weights, momenta, momentum_weights = weighted_tables(tables)
     forms = forms_of(system)
     of = forms.legendre_arguments
-    return HamiltonianSweep(
+    return HamiltonianIteration(
         points=len(tables.abscissae),
         lanes=lanes,
         abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
@@ -41,7 +41,7 @@ def hamiltonian_sweep(problem: StepProblem) -> HamiltonianSweep | None:
         momentum_weights=pad_vector(momentum_weights, lanes),
         end_position=pad_vector(over(tables.end_position, position_weights), lanes),
         end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
-        guess=guess_tables(tables.blocks, lanes, degree=resolved_degree(tables)),
+        guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
         kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
         integrands=integrand_kernel(system, "integrand_lanes", of),

@@ -6,12 +6,12 @@ Lagrangian whenever it is, and never delay convergence.
 
 from __future__ import annotations
 
+from scvi_codegen.ir.iteration import PredictorTables
 from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
-from scvi_codegen.ir.sweep import GuessTables
 from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 
-__all__ = ["MOST_LANES", "guess_tables", "lane_count", "pad_matrix", "pad_vector"]
+__all__ = ["MOST_LANES", "lane_count", "pad_matrix", "pad_vector", "predictor_tables_of"]
 
 MOST_LANES = 32
 DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
@@ -38,9 +38,9 @@ def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Nu
     return lower_vector(_longer(entries, lanes, repeat=repeat))
 
 
-def guess_tables(
+def predictor_tables_of(
     abscissae: Vector, lanes: int, *, through: Matrix | None = None, degree: int | None = None
-) -> GuessTables:
+) -> PredictorTables:
     """Return the predictor tables from values at the points in the last one or two steps to those in the next.
 
     ``through``: a matrix to apply to the prediction; ``degree``: of the leading coefficient that the method resolves,
@@ -54,7 +54,7 @@ def guess_tables(
     if through is not None:
         tables = tuple(matrix_product(through, table) for table in tables)
     last_alone, last, before = (pad_matrix(table, lanes) for table in tables)
-    return GuessTables(
+    return PredictorTables(
         abscissae=lower_vector(abscissae),
         degree=highest,
         highest=pad_vector(legendre_functional(abscissae, highest), lanes),

@@ -19,7 +19,7 @@ from scvi_codegen.ir.constraints import Rattle
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
-from scvi_codegen.mechanics.constraints import constraint_slopes, velocities_held
+from scvi_codegen.mechanics.constraints import constraint_jacobian, nonholonomic_expressions
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
@@ -31,17 +31,17 @@ __all__ = ["rattle_of"]
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     """Return the tables of such steps; ``None`` if they are not applicable."""
     forms, tables = forms_of(system), velocity_tables(stages.shape)
-    if not system.constraints or any(velocities_held(system)) or not forms.separable or tables is None:
+    if not system.constraints or any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
         return None
-    slopes = list(constraint_slopes(system))
+    slopes = list(constraint_jacobian(system))
     at: dict[int, list[int]] = {}
     for e, (_, i) in enumerate(slopes):
         at.setdefault(i, []).append(e)
     products = tuple((e, f) for own in at.values() for e in own for f in own)
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
     return Rattle(
-        force=system_kernel(system, "held_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
-        mass=system_kernel(system, "held_mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        force=system_kernel(system, "constrained_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
+        mass=system_kernel(system, "constrained_mass", forms.mass.values(), of=(), purpose="The constant masses."),
         products=products,
         entries=tuple((slopes[e][0], slopes[f][0]) for e, f in products),
         abscissae=lower_vector(tables.abscissae),

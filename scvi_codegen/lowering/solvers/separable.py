@@ -11,15 +11,15 @@ last evaluation of the points and in the increments.
 
 from __future__ import annotations
 
-from scvi_codegen.ir.sweeps import SeparableSweep
+from scvi_codegen.ir.iterations import SeparableIteration
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.padding import (
     MOST_LANES,
-    guess_tables,
     lane_count,
     pad_matrix,
     pad_vector,
+    predictor_tables_of,
 )
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, tableau_tables, velocity_tables
 from scvi_codegen.mechanics.forms import forms_of
@@ -28,10 +28,10 @@ from scvi_codegen.methods.shapes import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["separable_sweep"]
+__all__ = ["separable_iteration"]
 
 
-def separable_sweep(problem: StepProblem, *, velocities: bool = False) -> SeparableSweep | None:
+def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> SeparableIteration | None:
     """Return the fixed-point iteration of a separable system; ``None`` for others, and with too many points.
 
     With ``velocities`` it has the table of those at the points, and predicts forces instead of positions. Systems with
@@ -48,17 +48,17 @@ def separable_sweep(problem: StepProblem, *, velocities: bool = False) -> Separa
     return _sweep(system, tables, velocities=velocities) if tables else None
 
 
-def _sweep(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableSweep | None:
+def _sweep(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableIteration | None:
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:
         return None
     product = matrix_product(tables.position, tables.momentum)
     drift = tuple(mp.fsum(line) for line in tables.position)
     highest = min(len(tables.abscissae), len(tables.blocks)) - 1
-    guess = guess_tables(tables.abscissae, lanes, through=None if velocities else product, degree=highest)
+    guess = predictor_tables_of(tables.abscissae, lanes, through=None if velocities else product, degree=highest)
     at_points = matrix_product(tables.velocity, tables.momentum) if tables.velocity else tables.momentum
     forms = forms_of(system)
-    return SeparableSweep(
+    return SeparableIteration(
         points=len(tables.abscissae),
         lanes=lanes,
         abscissae=pad_vector(tables.abscissae, lanes, repeat=True),

@@ -2,7 +2,7 @@
 
 The order of the updates in an iteration (accelerations, then the action along the new curve, then momentum, initial
 velocity and multipliers) makes it converge twice as fast as a simultaneous update. The equations, those of
-``methods/shooting.py`` in these unknowns, are in :class:`scvi_codegen.ir.curve_sweeps.ShootingSweep`.
+``methods/shooting.py`` in these unknowns, are in :class:`scvi_codegen.ir.curve_iterations.ShootingIteration`.
 """
 
 from __future__ import annotations
@@ -10,24 +10,24 @@ from __future__ import annotations
 from sympy import S
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.ir.curve_sweeps import ShootingSweep
+from scvi_codegen.ir.curve_iterations import ShootingIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, guess_tables, lane_count, pad_matrix, pad_vector
+from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector, predictor_tables_of
 from scvi_codegen.mechanics.forms import accelerations, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.shapes import ShotCurve
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values, matrix_product, transpose
 
-__all__ = ["shooting_sweep"]
+__all__ = ["shooting_iteration"]
 
 LARGEST_DIMENSION = 8
 """Largest number of coordinates; beyond, the kernels take longer to compile than they save."""
 
 
-def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
+def shooting_iteration(problem: StepProblem) -> ShootingIteration | None:
     """Return the fixed-point iteration of a variational SCVI of degree 2 or more; ``None`` if it would be too large."""
     system, shape = problem.lagrangian, problem.shape
     if system is None or not isinstance(shape, ShotCurve):
@@ -38,10 +38,10 @@ def shooting_sweep(problem: StepProblem) -> ShootingSweep | None:
         return None
     position = cardinal_integrals(tableau.c, rule.abscissae, 0)
     velocity = cardinal_values(tableau.c, rule.abscissae)
-    return ShootingSweep(
+    return ShootingIteration(
         lanes=lanes,
         nodes=node_tables(tableau, lanes),
-        guess=guess_tables(tableau.c, lanes),
+        guess=predictor_tables_of(tableau.c, lanes),
         points=point_tables(system, tableau, rule, lanes),
         collocation_transposed=pad_matrix(transpose(tableau.A), lanes),
         position_transposed=pad_matrix(transpose(position), lanes),

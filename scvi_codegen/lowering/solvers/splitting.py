@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.numbers import lower_vector
-from scvi_codegen.ir.sweeps import Splitting
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.hamiltonian import lagrangian_twin
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import kicks_and_drifts
 from scvi_codegen.methods.method import Method
@@ -19,7 +19,7 @@ def splitting_of(system: MechanicalSystem, method: Method) -> Splitting | None:
     """Return the sequence of kicks and drifts, or ``None`` if the method is implicit."""
     if not method.fractions or system.constraints:
         return None
-    twin = lagrangian_twin(system)
+    twin = equivalent_lagrangian(system)
     by_masses = twin is not None and forms_of(twin).separable
     if not by_masses and not forms_of(system).split:
         return None

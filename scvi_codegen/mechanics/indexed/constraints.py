@@ -20,7 +20,14 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access, Array
 
-__all__ = ["bend_of", "check_constraint", "constraint_text", "held_slots", "pushes_of", "slopes_of"]
+__all__ = [
+    "check_constraint",
+    "constraint_force_terms",
+    "constraint_gradient",
+    "constraint_second_rate",
+    "constraint_text",
+    "coordinate_accesses",
+]
 
 
 def constraint_text(term: IndexedTerm) -> str:
@@ -50,7 +57,7 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
             f"the constraint '{shown}' contains the velocity {name}: constraints of indexed systems "
             "must be holonomic (coordinates and time only)"
         )
-    if not held_slots(term, coordinates):
+    if not coordinate_accesses(term, coordinates):
         raise SystemDefinitionError(
             f"the constraint '{shown}' contains no coordinate: remove it, or write the condition in terms "
             "of the coordinates"
@@ -62,27 +69,31 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
         )
 
 
-def held_slots(term: IndexedTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
+def coordinate_accesses(term: IndexedTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
     """Return the coordinate accesses of a constraint, with their symbols."""
     return tuple(pair for pair in term.slots if pair[1].array in coordinates)
 
 
-def slopes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
+def constraint_gradient(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
     """Return the row of G of one element, by its coordinates, followed by g_t."""
-    variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
-    slopes = gradient(term.formula, variables)
-    return tuple(slopes.get(k, S.Zero) for k in range(len(variables)))
+    variables = [*(slot for slot, _ in coordinate_accesses(term, coordinates)), time]
+    derivatives = gradient(term.formula, variables)
+    return tuple(derivatives.get(k, S.Zero) for k in range(len(variables)))
 
 
-def pushes_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[tuple[Access, Expr], ...]:
+def constraint_force_terms(
+    term: IndexedTerm, coordinates: Sequence[Array], time: Symbol
+) -> tuple[tuple[Access, Expr], ...]:
     """Return G^T of one element: each coordinate access with its factor of the multiplier."""
-    slopes = slopes_of(term, coordinates, time)
-    return tuple((access, slopes[k]) for k, (_, access) in enumerate(held_slots(term, coordinates)))
+    derivatives = constraint_gradient(term, coordinates, time)
+    return tuple((access, derivatives[k]) for k, (_, access) in enumerate(coordinate_accesses(term, coordinates)))
 
 
-def bend_of(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]) -> Expr:
+def constraint_second_rate(
+    term: IndexedTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]
+) -> Expr:
     """Return d^2 g / dt^2 at zero acceleration: v^T g_qq v + 2 g_qt v + g_tt."""
-    variables = [*(slot for slot, _ in held_slots(term, coordinates)), time]
+    variables = [*(slot for slot, _ in coordinate_accesses(term, coordinates)), time]
     rates = [*velocities, S.One]
-    rate = Add(*(slope * rates[k] for k, slope in gradient(term.formula, variables).items()))
-    return Add(*(slope * rates[k] for k, slope in gradient(rate, variables).items()))
+    rate = Add(*(derivative * rates[k] for k, derivative in gradient(term.formula, variables).items()))
+    return Add(*(derivative * rates[k] for k, derivative in gradient(rate, variables).items()))

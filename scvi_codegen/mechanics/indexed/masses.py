@@ -13,7 +13,7 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access, Array, Loop
 
-__all__ = ["MassTerm", "check_form", "masses_of", "terms_at_rest", "velocity_slots"]
+__all__ = ["MassTerm", "check_form", "masses_of", "terms_at_rest", "velocity_symbols"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +29,7 @@ class MassTerm:
 def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
     """Return the mass contributions of a term, one per velocity."""
     known, found = dict(term.slots), []
-    for v in velocity_slots(term, velocities):
+    for v in velocity_symbols(term, velocities):
         mass = term.formula.diff(v, 2)
         slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
         access = replace(known[v], array=velocities[known[v].array.name])
@@ -37,7 +37,7 @@ def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassT
     return tuple(found)
 
 
-def velocity_slots(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
+def velocity_symbols(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
     """Return the symbols of a term that denote velocities."""
     return tuple(slot for slot, access in term.slots if access.array.name in velocities)
 
@@ -46,14 +46,14 @@ def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol)
     """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
     coordinates = set(velocities.values())
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
-    slots = velocity_slots(term, velocities)
-    slopes = gradient(term.formula, slots)
+    slots = velocity_symbols(term, velocities)
+    derivatives = gradient(term.formula, slots)
     for place, v in enumerate(slots):
-        slope = slopes.get(place, S.Zero)
-        mass = slope.diff(v)
-        if mass.free_symbols & (varies | {time}) or sympy.expand(slope - mass * v) != 0:
+        derivative = derivatives.get(place, S.Zero)
+        mass = derivative.diff(v)
+        if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
             raise SystemDefinitionError(
-                f"in '{term}' the derivative with respect to {v} is {slope}: the Lagrangian of an "
+                f"in '{term}' the derivative with respect to {v} is {derivative}: the Lagrangian of an "
                 "indexed system may contain velocities as m*v**2/2 only, with a constant mass m"
             )
 
@@ -77,7 +77,7 @@ def terms_at_rest(
     """
     found = []
     for term in terms:
-        at_rest = term.formula.xreplace(dict.fromkeys(velocity_slots(term, velocities), S.Zero))
+        at_rest = term.formula.xreplace(dict.fromkeys(velocity_symbols(term, velocities), S.Zero))
         slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
         if at_rest and moving == any(access.array in state for _, access in slots):
             found.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))

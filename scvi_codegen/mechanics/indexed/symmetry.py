@@ -18,7 +18,7 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, IndexedMap, Place
-from scvi_codegen.mechanics.indexed.constraints import pushes_of
+from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.tables.precision import mp
 
@@ -26,9 +26,9 @@ __all__ = ["momentum_maps"]
 
 SAMPLES = 4
 """Number of random points at which an identity is tested in 60 digits."""
-VANISHES = 1e-40
+RELATIVE_TOLERANCE = 1e-40
 """Largest sum that counts as 0, relative to the sum of the absolute values of its terms."""
-MOST_TURNED = 3
+MAX_ROTATED_COMPONENTS = 3
 """Largest number of components for which rotations are tested (points in space)."""
 
 
@@ -38,38 +38,38 @@ def momentum_maps(system: IndexedSystem) -> tuple[IndexedMap, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pushes:
+class _ForceTerms:
     """Contributions of one element of a sum, or of forces, to the rates of momenta (-H_p: to those of positions)."""
 
     entries: tuple[tuple[Access, Expr], ...]
     slots: tuple[Symbol, ...]
 
 
-def _pushes(system: IndexedSystem) -> Iterator[_Pushes]:
+def _force_terms(system: IndexedSystem) -> Iterator[_ForceTerms]:
     for term in system.potentials:
         moved = [(slot, access) for slot, access in term.slots if access.array in system.state]
         slopes = gradient(term.formula, [slot for slot, _ in moved])
         entries = tuple((access, slopes.get(k, S.Zero)) for k, (_, access) in enumerate(moved))
-        yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
+        yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
     for force in system.forces:
-        yield _Pushes(force.targets, tuple(slot for slot, _ in force.slots))
+        yield _ForceTerms(force.targets, tuple(slot for slot, _ in force.slots))
     for term in system.constraints:  # G^T lambda, for any lambda
-        entries = pushes_of(term, system.coordinates, system.time)
-        yield _Pushes(entries, tuple(slot for slot, _ in term.slots))
+        entries = constraint_force_terms(term, system.coordinates, system.time)
+        yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
 
 
 def _maps(system: IndexedSystem, array: Array) -> Iterator[IndexedMap]:
-    last, pushes = array.axes[-1], list(_pushes(system))
+    last, force_terms = array.axes[-1], list(_force_terms(system))
     components: Sequence[int | None] = [None] if last.name else range(last.number)
     for component in components:
-        if all(_vanishes(*_shift(system, each, array, component)) for each in pushes):
+        if all(_is_zero(*_shift(system, each, array, component)) for each in force_terms):
             yield IndexedMap(array.name, component)
-    if system.momenta and all(_vanishes(*_phase(system, each, array)) for each in pushes):
+    if system.momenta and all(_is_zero(*_phase(system, each, array)) for each in force_terms):
         yield IndexedMap(array.name, None, phase=True)
-    if not last.name and last.number <= MOST_TURNED:
+    if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
         for a in range(last.number):
             for b in range(a + 1, last.number):
-                turned = all(_vanishes(*_turn(system, each, array, (a, b))) for each in pushes)
+                turned = all(_is_zero(*_turn(system, each, array, (a, b))) for each in force_terms)
                 if turned and _same_masses(system, array, a, b):
                     yield IndexedMap(array.name, a, b)
 
@@ -86,27 +86,29 @@ def _whole(component: int) -> Place:
 
 
 def _shift(
-    system: IndexedSystem, pushes: _Pushes, array: Array, component: int | None
+    system: IndexedSystem, force_terms: _ForceTerms, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
-    parts = [slope for access, slope in pushes.entries if _component(access, array, component)]
-    return parts, _symbols(system, pushes)
+    parts = [slope for access, slope in force_terms.entries if _component(access, array, component)]
+    return parts, _symbols(system, force_terms)
 
 
 def _turn(
-    system: IndexedSystem, pushes: _Pushes, array: Array, plane: tuple[int, int]
+    system: IndexedSystem, force_terms: _ForceTerms, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
     pairs = [
         ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
     ]
-    return _moved(system, pushes, pairs)
+    return _rotated_terms(system, force_terms, pairs)
 
 
-def _phase(system: IndexedSystem, pushes: _Pushes, array: Array) -> tuple[list[Expr], list[Symbol]]:
+def _phase(system: IndexedSystem, force_terms: _ForceTerms, array: Array) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
-    return _moved(system, pushes, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
+    return _rotated_terms(
+        system, force_terms, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)]
+    )
 
 
 def _conjugate(system: IndexedSystem, array: Array) -> tuple[Array, ...]:
@@ -117,14 +119,14 @@ Entry: TypeAlias = tuple[Array, Place | None]
 """Array with a last index, or without one for all of its entries."""
 
 
-def _moved(
-    system: IndexedSystem, pushes: _Pushes, pairs: Sequence[tuple[Entry, Entry, int]]
+def _rotated_terms(
+    system: IndexedSystem, force_terms: _ForceTerms, pairs: Sequence[tuple[Entry, Entry, int]]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of the derivative along the motion of entries of the first kind by those of the second."""
     parts: list[Expr] = []
-    known = _symbols(system, pushes)
+    known = _symbols(system, force_terms)
     for (array, last), (other, by), sign in pairs:
-        for access, slope in pushes.entries:
+        for access, slope in force_terms.entries:
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
             places = access.places if by is None else (*access.places[:-1], by)
@@ -134,11 +136,11 @@ def _moved(
     return parts, known
 
 
-def _symbols(system: IndexedSystem, pushes: _Pushes) -> list[Symbol]:
-    return [*pushes.slots, *system.parameters, system.time]
+def _symbols(system: IndexedSystem, force_terms: _ForceTerms) -> list[Symbol]:
+    return [*force_terms.slots, *system.parameters, system.time]
 
 
-def _vanishes(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
+def _is_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
     """Return whether the sum of the parts is 0 at all sampled points, of which at least ``SAMPLES`` are required."""
     if Add(*parts) == 0:
         return True
@@ -148,7 +150,7 @@ def _vanishes(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
             values = tape([mp.mpf(chosen.randint(1, 10**6)) / 10**6 + mp.mpf(1) / 3 for _ in symbols])
         except ArithmeticError:
             continue
-        if abs(mp.fsum(values)) > VANISHES * mp.fsum(map(abs, values)):
+        if abs(mp.fsum(values)) > RELATIVE_TOLERANCE * mp.fsum(map(abs, values)):
             return False
         tried += 1
     return tried >= SAMPLES

@@ -16,7 +16,6 @@ from typing import Any
 
 from sympy import Expr, S, Symbol
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
@@ -26,13 +25,14 @@ from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
 from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
-from scvi_codegen.formulas.parts import key_of
+from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.given.kinds import MAPPING, NAMES, TEXT, TEXTS, of, takes
 from scvi_codegen.indices import Access, Array, Loop, Size
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
 from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
+from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.validation.argument_types import MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
 __all__ = ["INDEXED", "IndexedSystem"]
 
@@ -99,7 +99,7 @@ class IndexedSystem:
                 )
 
     @classmethod
-    @takes(
+    @checks_arguments(
         SystemDefinitionError,
         name=TEXT,
         coordinates=TEXTS,
@@ -189,7 +189,7 @@ class IndexedSystem:
         return system
 
     @classmethod
-    @takes(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
+    @checks_arguments(SystemDefinitionError, name=TEXT, coordinates=TEXTS, parameters=MAPPING, tables=TEXTS)
     def from_sympy(
         cls,
         *,
@@ -276,8 +276,8 @@ class IndexedSystem:
         found = []
         for term in self.potentials:
             slots = [slot for slot, access in term.slots if access.array in self.state]
-            slopes = gradient(term.formula, slots)
-            found.append((term, {slot.name: slopes.get(k, S.Zero) for k, slot in enumerate(slots)}))
+            derivatives = gradient(term.formula, slots)
+            found.append((term, {slot.name: derivatives.get(k, S.Zero) for k, slot in enumerate(slots)}))
         return tuple(found)
 
     def _repr_latex_(self) -> str:
@@ -405,11 +405,11 @@ def _friction(
     found = []
     for term in terms:
         moving = [(slot, access) for slot, access in term.slots if access.array in arrays]
-        slopes = gradient(term.formula, [slot for slot, _ in moving])
+        derivatives = gradient(term.formula, [slot for slot, _ in moving])
         targets = tuple(
-            (replace(access, array=arrays[access.array]), -slopes[k])
+            (replace(access, array=arrays[access.array]), -derivatives[k])
             for k, (_, access) in enumerate(moving)
-            if k in slopes
+            if k in derivatives
         )
         if not targets:
             raise SystemDefinitionError(
@@ -421,4 +421,4 @@ def _friction(
 
 
 INDEXED = of("an IndexedSystem", IndexedSystem)
-"""Type check of indexed systems, for :func:`~scvi_codegen.given.kinds.takes`."""
+"""Type check of indexed systems, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""

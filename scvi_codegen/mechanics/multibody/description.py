@@ -71,7 +71,7 @@ class Multibody:
                 "the rates of the coordinates"
             )
         rolling = list(map(variables.write, self._beyond_configuration(variables)))
-        variables.settle(solved_for_speeds(equations, variables))
+        variables.substitute_speeds(solved_for_speeds(equations, variables))
         energy, forces = self._dynamics(variables)
         write = variables.write
         return {
@@ -101,8 +101,10 @@ class Multibody:
             motions = motions_of(self.bodies, self.frame, variables)
             groups = [load_forces(group, self.frame, variables) for group in self.loads]
         except (ValueError, TypeError) as error:
-            said = " ".join(str(error).split())
-            raise SystemDefinitionError(f"SymPy cannot determine the velocities of bodies and loads: {said}") from error
+            reason = " ".join(str(error).split())
+            raise SystemDefinitionError(
+                f"SymPy cannot determine the velocities of bodies and loads: {reason}"
+            ) from error
         if any(entry.has(*variables.x) for motion in motions for entry in motion.inertia):
             raise SystemDefinitionError(
                 "a mass or an inertia depends on a coordinate, which is not supported: make it a parameter"
@@ -114,17 +116,17 @@ class Multibody:
 
 def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr, tuple[Expr, ...]]:
     """Return the potential of the conservative loads, all together or by group, and the other forces."""
-    changing = (*variables.v, variables.time, *variables.given)
+    changing = (*variables.v, variables.time, *variables.other_functions)
     parts = [[sympy.expand_mul(f).as_independent(*changing, as_Add=True) for f in group] for group in groups]
-    still = [[part[0] for part in group] for group in parts]
-    moving = [[part[1] for part in group] for group in parts]
+    static = [[part[0] for part in group] for group in parts]
+    varying = [[part[1] for part in group] for group in parts]
     size = len(variables.x)
-    whole = potential_of(_sum(still, size), variables.x)
+    whole = potential_of(_sum(static, size), variables.x)
     if whole is not None:
-        return whole, _sum(moving, size)
-    found = [potential_of(group, variables.x) for group in still]
-    rest = [group for group, potential in zip(still, found, strict=True) if potential is None]
-    return sympy.Add(*(potential for potential in found if potential is not None)), _sum([*rest, *moving], size)
+        return whole, _sum(varying, size)
+    found = [potential_of(group, variables.x) for group in static]
+    rest = [group for group, potential in zip(static, found, strict=True) if potential is None]
+    return sympy.Add(*(potential for potential in found if potential is not None)), _sum([*rest, *varying], size)
 
 
 def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:

@@ -11,14 +11,14 @@ from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["vanish"]
+__all__ = ["are_zero"]
 
 NEGLIGIBLE = mp.mpf(10) ** -40
 ATTEMPTS, POINTS = 24, 2
 SEED = 20250101
 
 
-def vanish(expressions: Iterable[Expr]) -> bool:
+def are_zero(expressions: Iterable[Expr]) -> bool:
     """Return whether all expressions are zero at two random points; false if fewer points of definition are found."""
     unlike = [expression for expression in expressions if expression != 0]
     if any(map(unsupported_part, unlike)):

@@ -23,7 +23,7 @@ from sympy import Expr, Matrix
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import jacobian
-from scvi_codegen.mechanics.multibody.identities import vanish
+from scvi_codegen.mechanics.multibody.identities import are_zero
 from scvi_codegen.mechanics.multibody.variables import Variables
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
 def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
     """Return the components of a velocity, of shape (3,)."""
     found = tuple(variables.read(component) for component in vector.to_matrix(frame))
-    for symbol in variables.given:
+    for symbol in variables.other_functions:
         if any(component.has(symbol) for component in found):
             raise SystemDefinitionError(
                 f"the velocity of '{place}' depends on '{variables.write(symbol)}', which is neither "
@@ -102,7 +102,7 @@ def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tu
         for i, excess in _excess(motion, variables).items():
             terms[i] += [p * e for p, e in zip(motion.momentum, excess, strict=True)]
     found = tuple(sympy.Add(*row) for row in terms)
-    return tuple(sympy.S.Zero for _ in found) if vanish(found) else found
+    return tuple(sympy.S.Zero for _ in found) if are_zero(found) else found
 
 
 def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:

@@ -14,7 +14,7 @@ import sympy
 from sympy import Add, Dummy, Expr, Pow, Symbol
 from sympy.integrals.manualintegrate import manualintegrate
 
-from scvi_codegen.mechanics.multibody.identities import vanish
+from scvi_codegen.mechanics.multibody.identities import are_zero
 
 __all__ = ["potential_of"]
 
@@ -33,7 +33,7 @@ def potential_of(forces: Sequence[Expr], coordinates: Sequence[Symbol]) -> Expr 
         if part is None:
             return None
         potential -= part
-    return potential if vanish(f + potential.diff(q) for q, f in zip(coordinates, forces, strict=True)) else None
+    return potential if are_zero(f + potential.diff(q) for q, f in zip(coordinates, forces, strict=True)) else None
 
 
 def _antiderivative(expression: Expr, q: Symbol) -> Expr | None:

@@ -47,11 +47,11 @@ class Variables:
         self._plain |= dict.fromkeys(auxiliary, sympy.S.Zero)
 
     @property
-    def given(self) -> tuple[Symbol, ...]:
+    def other_functions(self) -> tuple[Symbol, ...]:
         """Symbols of the functions of time that are neither coordinates nor speeds."""
         return tuple(self._written)[self._own :]
 
-    def settle(self, speeds: Mapping[Symbol, Expr]) -> None:
+    def substitute_speeds(self, speeds: Mapping[Symbol, Expr]) -> None:
         """Replace the generalised speeds by their expressions in coordinates and velocities in all later reads."""
         self._plain |= {self._written[u]: value for u, value in speeds.items()}
 

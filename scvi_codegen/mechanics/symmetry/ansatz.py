@@ -37,7 +37,7 @@ __all__ = [
 Terms: TypeAlias = Mapping[Monomial, Expr]
 """Polynomial whose coefficients depend on parameters."""
 
-MOST_CYCLIC = 12
+MAX_CYCLIC = 12
 
 
 def monomial_columns(m: int, *, curved: bool) -> Iterator[dict[Monomial, int]]:
@@ -68,7 +68,7 @@ def gauge_columns(m: int, *, quadratic: bool) -> Iterator[dict[Monomial, int]]:
 def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
     """Yield momenta of cyclic coordinates, translations and rotations of all bodies together, and t."""
     m, free = system.dimension, system.formula.free_symbols
-    cyclic = [i for i, q in enumerate(system.coordinates) if q not in free][:MOST_CYCLIC]
+    cyclic = [i for i, q in enumerate(system.coordinates) if q not in free][:MAX_CYCLIC]
     yield from ({Monomial(0, (m + i,)): 1} for i in cyclic)
     found = bodies_of(system)
     groups = zip(*(body.columns for body in found), strict=True) if found else [range(m)]

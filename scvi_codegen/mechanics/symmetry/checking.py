@@ -11,25 +11,25 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.given.kinds import FORMULAS, TEXT, takes
-from scvi_codegen.mechanics.constraints import with_reactions
+from scvi_codegen.mechanics.constraints import with_constraint_forces
 from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in
 from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
 from scvi_codegen.mechanics.symmetry.invariants import conserved
 from scvi_codegen.mechanics.symmetry.sampling import rates_of
-from scvi_codegen.mechanics.symmetry.symmetry import MOST_COORDINATES, Symmetry
+from scvi_codegen.mechanics.symmetry.symmetry import MAX_SEARCHED_COORDINATES, Symmetry
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.tables.precision import mp
+from scvi_codegen.validation.argument_types import FORMULAS, TEXT, checks_arguments
 
 __all__ = ["check_symmetry"]
 
-LONGEST_SHOWN = 300
+MAX_SHOWN_LENGTH = 300
 DECIDED_AT = 3
 """Number of points at which the change of L is tested."""
 
 
-@takes(system=SYSTEM, direction=FORMULAS, name=TEXT)
+@checks_arguments(system=SYSTEM, direction=FORMULAS, name=TEXT)
 def check_symmetry(
     system: MechanicalSystem,
     direction: Sequence[Expr | str] | None = None,
@@ -72,7 +72,7 @@ def check_symmetry(
     f = None if gauge is None else _expression(system, gauge, "gauge")
     p, q, t = system.momentum_symbols, system.coordinates, system.time
     product = sympy.Add(*(a * b for a, b in zip(p, xi, strict=True)), -(f or 0))
-    quadratic = system.dimension <= MOST_COORDINATES
+    quadratic = system.dimension <= MAX_SEARCHED_COORDINATES
     gauges = list(gauge_columns(system.dimension, quadratic=quadratic)) if f is None else []
     rows = [row for row in conserved(system, rates_of(system), [product, *gauges]) if 0 in row]
     if not rows and f is None and not system.auxiliaries:
@@ -98,17 +98,17 @@ def _generated(system: MechanicalSystem, G: Expr, name: str) -> Symmetry:
     motion = rates_of(system)
     q, p, t = system.coordinates, system.momentum_symbols, system.time
     if not conserved(system, motion, [G]):
-        slopes = gradient(G, (*q, *p, t))
+        derivatives = gradient(G, (*q, *p, t))
         velocities = motion.transformed if motion.hamiltonian else motion.arguments[len(q) : 2 * len(q)]
         moved = (*velocities, *motion.forces, sympy.S.One)
-        rate = sympy.Add(*(slope * moved[i] for i, slope in slopes.items())).xreplace(motion.numbers)
+        rate = sympy.Add(*(derivative * moved[i] for i, derivative in derivatives.items())).xreplace(motion.numbers)
         rate = rate if motion.hamiltonian else rate.xreplace(dict(zip(p, motion.transformed, strict=True)))
         raise SystemDefinitionError(
             f"{G} does not generate a symmetry of '{system.name}': its rate of change, {{G, H}} + "
             f"G_t, is {_cut(rate)}, not 0"
         )
-    slopes = gradient(G, p)
-    direction = tuple(slopes.get(i, sympy.S.Zero) for i in range(len(q)))
+    derivatives = gradient(G, p)
+    direction = tuple(derivatives.get(i, sympy.S.Zero) for i in range(len(q)))
     gauge = sympy.Add(*(a * b for a, b in zip(p, direction, strict=True)), -G)
     return Symmetry(name=name, coordinates=q, momenta=p, time=t, direction=direction, gauge=gauge, momentum_map=G)
 
@@ -168,16 +168,16 @@ def _defect(system: MechanicalSystem, xi: Sequence[Expr], f: Expr | None) -> str
 
 def _cut(change: Expr) -> str:
     text = str(change)
-    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
+    return text if len(text) <= MAX_SHOWN_LENGTH else f"{text[:MAX_SHOWN_LENGTH]} ..."
 
 
 def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     """Return L_q . xi + L_v . dxi/dt plus the work of forces and multipliers; for a Hamiltonian the rate of p . xi."""
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
-    terms = [sign * slope * xi[i] for i, slope in gradient(system.formula, system.coordinates).items()]
+    terms = [sign * derivative * xi[i] for i, derivative in gradient(system.formula, system.coordinates).items()]
     acting = system.forces or (sympy.S.Zero,) * system.dimension
-    forces = with_reactions(system, [f - system.damping * x for f, x in zip(acting, p, strict=True)])
+    forces = with_constraint_forces(system, [f - system.damping * x for f, x in zip(acting, p, strict=True)])
     terms += [force * component for force, component in zip(forces, xi, strict=True)]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
 
@@ -185,5 +185,5 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
 def _rate(system: MechanicalSystem, f: Expr) -> Expr:
     """Return f_t + f_q . v, where v = H_p for a Hamiltonian."""
     v = forms_of(system).legendre if system.auxiliaries else system.velocities
-    slopes = gradient(f, (*system.coordinates, system.time))
-    return sympy.Add(*(slope * (*v, sympy.S.One)[i] for i, slope in slopes.items()))
+    derivatives = gradient(f, (*system.coordinates, system.time))
+    return sympy.Add(*(derivative * (*v, sympy.S.One)[i] for i, derivative in derivatives.items()))

@@ -26,10 +26,12 @@ NEGLIGIBLE = mp.mpf(10) ** -40
 def integrated(system: MechanicalSystem, change: Expr) -> Expr | None:
     """Return a candidate for f, to be verified; ``None`` if SymPy does not find the integrals."""
     rest = dict.fromkeys(system.velocities, sympy.S.Zero)
-    slopes = [change.diff(v).xreplace(rest) for v in system.velocities]
+    derivatives = [change.diff(v).xreplace(rest) for v in system.velocities]
     s = Symbol("s", positive=True)
     along = {q: s * q for q in system.coordinates}
-    work = sympy.Add(*(q * slope.xreplace(along) for q, slope in zip(system.coordinates, slopes, strict=True)))
+    work = sympy.Add(
+        *(q * derivative.xreplace(along) for q, derivative in zip(system.coordinates, derivatives, strict=True))
+    )
     origin = change.xreplace(rest | dict.fromkeys(system.coordinates, sympy.S.Zero))
     signed = {x: sympy.Dummy(positive=True) for x in (*system.coordinates, *system.parameters)}
     parts = (_definite(work.xreplace(signed), s), manualintegrate(sympy.expand(origin), system.time))
@@ -46,10 +48,10 @@ def _definite(expression: Expr, s: Symbol) -> Expr:
 def is_total_derivative(system: MechanicalSystem, change: Expr, points: Iterable[Sample]) -> bool | None:
     """Return whether such an f exists, tested in 60 digits at these points; ``None`` if there is no point."""
     q, v, t = system.coordinates, system.velocities, system.time
-    slopes = [change.diff(velocity) for velocity in v]
-    conditions = [slope.diff(velocity) for slope in slopes for velocity in v]
-    for slope, position in zip(slopes, q, strict=True):
-        moved = (slope.diff(x) * rate for x, rate in zip((*q, t), (*v, sympy.S.One), strict=True))
+    derivatives = [change.diff(velocity) for velocity in v]
+    conditions = [derivative.diff(velocity) for derivative in derivatives for velocity in v]
+    for derivative, position in zip(derivatives, q, strict=True):
+        moved = (derivative.diff(x) * rate for x, rate in zip((*q, t), (*v, sympy.S.One), strict=True))
         conditions.append(sympy.Add(*moved, -change.diff(position)))
     decided = None
     for sample in points:

@@ -19,13 +19,13 @@ import sympy
 from numpy.typing import NDArray
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.parts import parts
+from scvi_codegen.formulas.subexpressions import parts
 from scvi_codegen.formulas.tape import Tape, evaluate
-from scvi_codegen.mechanics.constraints import constraint_multipliers, with_reactions
+from scvi_codegen.mechanics.constraints import constraint_multipliers, with_constraint_forces
 from scvi_codegen.mechanics.forms import forms_of
-from scvi_codegen.mechanics.rolled import RolledTerms
-from scvi_codegen.mechanics.symmetry.pulls import LARGEST, array_pulls, array_value, exact_pulls
+from scvi_codegen.mechanics.symmetry.group_forces import LARGEST, array_forces, array_value, exact_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.term_groups import TermGroup
 from scvi_codegen.tables.precision import Number, mp
 
 __all__ = ["Rates", "Sample", "drawn_parameters", "rates_of"]
@@ -84,7 +84,7 @@ class Rates:
     time: Symbol
     constants: Mapping[Symbol, float]
     numbers: Mapping[Symbol, sympy.Rational]
-    families: tuple[RolledTerms, ...] = ()
+    families: tuple[TermGroup, ...] = ()
 
     @property
     def closed(self) -> bool:
@@ -101,8 +101,10 @@ class Rates:
             size = 1.5 if k < m else generator.choice(SPREADS, count)
             values[argument] = size * generator.uniform(-1.0, 1.0, count)
         with np.errstate(all="ignore"):
-            pulls = array_pulls(self.families, self.arguments[:m], values, count)
-            return self._sample(values, lambda expression: array_value(expression, values) + np.zeros(count), pulls)
+            group_forces = array_forces(self.families, self.arguments[:m], values, count)
+            return self._sample(
+                values, lambda expression: array_value(expression, values) + np.zeros(count), group_forces
+            )
 
     def points(self, parameters: Mapping[Symbol, Number], count: int) -> Iterator[Sample]:
         """Yield at most ``count`` points at which the system is defined, in 60 digits."""
@@ -118,8 +120,8 @@ class Rates:
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
             try:
                 known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
-                pulls = exact_pulls(self.families, self.arguments[: len(self.momenta)], values)
-                found = self._sample(values, functools.partial(_known_or_evaluated, known, values), pulls)
+                group_forces = exact_forces(self.families, self.arguments[: len(self.momenta)], values)
+                found = self._sample(values, functools.partial(_known_or_evaluated, known, values), group_forces)
             except ArithmeticError:
                 continue
             count -= 1
@@ -136,10 +138,10 @@ class Rates:
                 return found
         return []
 
-    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any], pulls: Sequence[Any]) -> Sample:
+    def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any], group_forces: Sequence[Any]) -> Sample:
         m = len(self.momenta)
         transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
-        forces = tuple(force + pull for force, pull in zip(forces, pulls, strict=True))
+        forces = tuple(force + pull for force, pull in zip(forces, group_forces, strict=True))
         halves = (self.arguments[:m], self.arguments[m : 2 * m])
         q, second = (tuple(values[argument] for argument in half) for half in halves)
         p, v = (second, transformed) if self.hamiltonian else (transformed, second)
@@ -161,10 +163,10 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
     return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 
-def rates_of(system: MechanicalSystem, families: tuple[RolledTerms, ...] = ()) -> Rates:
+def rates_of(system: MechanicalSystem, families: tuple[TermGroup, ...] = ()) -> Rates:
     """Return the rates of a system with term groups ``families``; long numbers are replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
-    forces = with_reactions(system, forms_of(system).thrust)
+    forces = with_constraint_forces(system, forms_of(system).momentum_rate)
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
         replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}

@@ -12,11 +12,11 @@ q by J_p and p by -J_q, if its bracket {J, H} + J_t is zero. Rotations of phase 
 the angular impulse of point vortices, are of this kind.
 
 Symmetries hold for all values of the parameters; one that needs special values is found if these occur in the formula
-as numbers. With more than ``MOST_COORDINATES`` coordinates only cyclic ones, and translations, rotations and boosts of
+as numbers. With more than ``MAX_SEARCHED_COORDINATES`` coordinates only cyclic ones, translations, rotations, boosts of
 all coordinates together, are tried. Any other direction or generator is verified by
 :func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`.
 
-Whether a method conserves a momentum map to round-off: :func:`~scvi_codegen.methods.exactness.Exactness.keeps`.
+Whether a method conserves a momentum map to round-off: :func:`~scvi_codegen.methods.exactness.Exactness.conserves`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,9 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.display.cards import Html, card
 from scvi_codegen.display.mathml import mathml
-from scvi_codegen.display.summary import summary
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.given.kinds import several, takes
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.rolled import rolled
 from scvi_codegen.mechanics.symmetry.ansatz import (
     Terms,
     bodies_of,
@@ -47,15 +44,18 @@ from scvi_codegen.mechanics.symmetry.ansatz import (
     polynomial_in,
     rigid_columns,
 )
+from scvi_codegen.mechanics.symmetry.group_forces import terms_among_few_bodies
 from scvi_codegen.mechanics.symmetry.invariants import Monomial, Polynomial, confirmed, conserved
 from scvi_codegen.mechanics.symmetry.names import name_of
-from scvi_codegen.mechanics.symmetry.pulls import among_few
 from scvi_codegen.mechanics.symmetry.sampling import Rates, rates_of
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.term_groups import rolled
+from scvi_codegen.representation import summary
+from scvi_codegen.validation.argument_types import checks_arguments, several
 
 __all__ = ["SYMMETRIES", "Symmetry", "all_symmetries", "symmetries"]
 
-MOST_COORDINATES = 12
+MAX_SEARCHED_COORDINATES = 12
 MOST_SHOWN = 12
 """Maximum number of components of a direction shown in a notebook."""
 
@@ -103,8 +103,8 @@ class Symmetry:
             .union(self.gauge.free_symbols, *(xi.free_symbols for xi in self.direction))
             .isdisjoint(self.momenta)
         ):
-            slopes = gradient(self.momentum_map, self.coordinates)
-            moved += [(p, -slopes.get(i, sympy.S.Zero)) for i, p in enumerate(self.momenta)]
+            derivatives = gradient(self.momentum_map, self.coordinates)
+            moved += [(p, -derivatives.get(i, sympy.S.Zero)) for i, p in enumerate(self.momenta)]
         changes = [f"{mathml(Symbol('delta'))}{mathml(x)} = {mathml(xi)}" for x, xi in moved if xi != 0]
         facts = [("conserves", Html(mathml(self.momentum_map))), ("direction", Html("; ".join(changes[:MOST_SHOWN])))]
         facts += [("gauge", Html(mathml(self.gauge)))] if self.gauge != 0 else []
@@ -132,10 +132,10 @@ class Symmetry:
 
 
 SYMMETRIES = several("a list of symmetries", Symmetry)
-"""Type check of lists of symmetries, for :func:`~scvi_codegen.given.kinds.takes`."""
+"""Type check of lists of symmetries, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""
 
 
-@takes(system=SYSTEM)
+@checks_arguments(system=SYSTEM)
 @lru_cache(maxsize=64)
 def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     """Return the affine symmetries of a system, a basis with short momentum maps: translations, rotations, boosts, ..
@@ -171,7 +171,7 @@ def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple
 
 def _found(system: MechanicalSystem) -> list[Terms]:
     """Return the momentum maps as polynomials."""
-    if system.dimension > MOST_COORDINATES:
+    if system.dimension > MAX_SEARCHED_COORDINATES:
         return _rigid(system)
     motion = rates_of(system)
     if not motion.closed:  # p . v with momenta other than the auxiliaries: forces contain v
@@ -190,7 +190,7 @@ def _rigid(system: MechanicalSystem) -> list[Terms]:
     if parts is None:
         return _combined(*_conserved_by(system, rates_of(system), columns))
     motion = rates_of(parts.rest, parts.families)
-    of_few = replace(motion, families=among_few(parts.families, bodies_of(system)))
+    of_few = replace(motion, families=terms_among_few_bodies(parts.families, bodies_of(system)))
     rows, known = _conserved_by(parts.rest, of_few, columns)
     if not all(confirmed(motion, known, row) for row in rows):
         rows, known = _conserved_by(parts.rest, motion, columns)
@@ -270,13 +270,13 @@ def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
     factor = sign * sympy.ilcm(1, 1, *(number.q for number in numbers if number.is_Rational))
     signed = {monomial: factor * coefficient for monomial, coefficient in terms.items()}
     J, p = polynomial_in(system, signed), system.momentum_symbols
-    slopes = gradient(J, p)
+    derivatives = gradient(J, p)
     return Symmetry(
         name=name,
         coordinates=system.coordinates,
         momenta=p,
         time=system.time,
-        direction=tuple(slopes.get(i, sympy.S.Zero) for i in range(m)),
+        direction=tuple(derivatives.get(i, sympy.S.Zero) for i in range(m)),
         gauge=polynomial_in(system, {a: (degrees[a] - 1) * x for a, x in signed.items()}),
         momentum_map=J,
     )

@@ -22,8 +22,8 @@ __all__ = [
     "compiled",
     "eliminated",
     "largest_difference",
-    "lost_terms",
     "middle_value",
+    "missing_terms",
     "multipliers_agree",
     "two_points_agree",
 ]
@@ -120,8 +120,8 @@ def eliminated() -> dict[sympy.Symbol, sympy.Expr]:
     free = dict.fromkeys((lambda_1, lambda_2), 0)
     inner = rows["dG/dQ"].subs(free)
     equations = [rows["dG/dQ"] - inner + sympy.Symbol("X", real=True), rows["dG/dv0"]]
-    found: dict[sympy.Symbol, sympy.Expr] = sympy.solve(equations, [lambda_1, lambda_2], dict=True)[0]
-    return {symbol: _positive(value) for symbol, value in found.items()}
+    result: dict[sympy.Symbol, sympy.Expr] = sympy.solve(equations, [lambda_1, lambda_2], dict=True)[0]
+    return {symbol: _positive(value) for symbol, value in result.items()}
 
 
 def _positive(fraction: sympy.Expr) -> sympy.Expr:
@@ -131,7 +131,7 @@ def _positive(fraction: sympy.Expr) -> sympy.Expr:
     return sympy.expand(sign * numerator) / sympy.expand(sign * denominator)
 
 
-def lost_terms() -> tuple[sympy.Expr, sympy.Expr]:
+def missing_terms() -> tuple[sympy.Expr, sympy.Expr]:
     """Return the terms of the compiler's variational (34d) and (34e) that the printed ones lack."""
     full, printed = compiled(variational=True), compiled(variational=False)
 
@@ -155,7 +155,7 @@ class MiddleValue:
     """
 
     condition: sympy.Expr
-    slopes: tuple[sympy.Expr, sympy.Expr]
+    derivatives: tuple[sympy.Expr, sympy.Expr]
     inner: sympy.Expr
     leading: sympy.Expr
 
@@ -166,13 +166,13 @@ def middle_value() -> MiddleValue:
     derived = compiled(variational=True)
     condition = sympy.expand(h**2 * sum(e.residual for e in derived.equations if e.number == "34a"))
     after_middle = condition.diff(Q_1)
-    slopes = tuple(condition.diff(end) / sympy.expand(-after_middle) for end in (q_k, Q_2))
+    derivatives = tuple(condition.diff(end) / sympy.expand(-after_middle) for end in (q_k, Q_2))
     row = next(e.residual for e in derived.equations if e.number == "dG/dQ")
     inner = sympy.expand(row.subs(dict.fromkeys((lambda_1, lambda_2), 0)) + condition / (3 * h))
     q, v = sympy.symbols("q v", real=True)
     moving = inner.subs({Q_1: q + h * v / 2, Q_2: q + h * v, q_k: q})
     leading = sympy.simplify(sympy.series(moving, h, 0, 3).removeO())
-    return MiddleValue(condition, slopes, inner, leading)
+    return MiddleValue(condition, derivatives, inner, leading)
 
 
 def multipliers_agree() -> bool:
@@ -180,5 +180,5 @@ def multipliers_agree() -> bool:
     X, multipliers = sympy.Symbol("X", real=True), eliminated()
     return all(
         sympy.simplify(lost.subs(multipliers) - X * slope) == 0
-        for lost, slope in zip(lost_terms(), middle_value().slopes, strict=True)
+        for lost, slope in zip(missing_terms(), middle_value().derivatives, strict=True)
     )

@@ -47,7 +47,7 @@ def _both(points: int, gauss: int) -> tuple[Structure, Structure]:
     return measured(points, gauss, variational=False), measured(points, gauss, variational=True)
 
 
-def _promised(points: int, gauss: int) -> int:
+def _order_bound(points: int, gauss: int) -> int:
     """Return min(p, q) of Theorem 4.1: the orders of spectral collocation and of the quadrature."""
     return min(SpectralCollocation(points - 1).order or 0, 2 * gauss)
 
@@ -103,11 +103,11 @@ def _check_structure(found: Found, variational: bool) -> Comparison:
 
 def _check_theorem(found: Found, variational: bool) -> Comparison:
     orders = {row: pair[variational].order for row, pair in found.items()}
-    parts = [f"{order:.1f} ({_promised(*row)})" for row, order in orders.items()]
+    parts = [f"{order:.1f} ({_order_bound(*row)})" for row, order in orders.items()]
     return Comparison(
         claim=f"The order is at least min(p, q), Theorem 4.1 ({'in full' if variational else 'as printed'}).",
         measured=f"With 2, 3, 4, 5, 6, 7, 9 points, min(p, q) in parentheses: {', '.join(parts)}.",
-        verdict=holds(all(order > _promised(*row) - 0.3 for row, order in orders.items())),
+        verdict=holds(all(order > _order_bound(*row) - 0.3 for row, order in orders.items())),
         bears_on=("order",),
     )
 
@@ -146,7 +146,7 @@ def _table(found: Found) -> TableBlock:
     return TableBlock(
         columns=(*columns, "min(p, q)"),
         rows=tuple(
-            (*row, *(v for s in pair for v in (s.defect, s.momentum, s.order)), _promised(*row))
+            (*row, *(v for s in pair for v in (s.defect, s.momentum, s.order)), _order_bound(*row))
             for row, pair in found.items()
         ),
         formats={"points": "d", "Gauss points": "d", "order, as printed": ".1f", "order, in full": ".1f"}

@@ -9,8 +9,8 @@ from scvi_codegen.reproduce.correction.example import (
     by_hand,
     compiled,
     eliminated,
-    lost_terms,
     middle_value,
+    missing_terms,
 )
 from scvi_codegen.reproduce.laboratory.experiment import Block, Formula, Listing, Paragraph
 
@@ -208,7 +208,7 @@ def _example() -> tuple[Block, ...]:
         Formula(middle_value().condition, sympy.Integer(0)),
         *(
             Formula(slope, _after(sympy.Function("Q_1")(*_ends()), end))
-            for slope, end in zip(middle_value().slopes, _ends(), strict=True)
+            for slope, end in zip(middle_value().derivatives, _ends(), strict=True)
         ),
         Paragraph(
             "For small h both are 1/2: move an end of the step, and the middle moves half as far. The printed "
@@ -232,7 +232,7 @@ def _ends() -> tuple[sympy.Symbol, sympy.Symbol]:
 def _example_corrected() -> tuple[Block, ...]:
     derived = compiled(variational=True)
     rows = {equation.number: equation for equation in derived.equations}
-    start, end = lost_terms()
+    start, end = missing_terms()
     return (
         Paragraph(
             "6. The same in variational form. The compiler adds the unknowns lambda_1, lambda_2 and two equations, "

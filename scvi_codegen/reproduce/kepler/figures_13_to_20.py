@@ -66,8 +66,8 @@ class Numbers:
 def _run(scheme: str, degree: int = DEGREE) -> tuple[Array, Array, Array, Array]:
     """Return (t, q, p, energy) over the whole span."""
     method = SVI(degree) if scheme == "SVI" else SpectralCollocation(degree)
-    found = trajectory(SYSTEM, method, *perihelion(ECCENTRICITY), h=STEP, span=SPAN)
-    return found.t, found.q, found.p, found.energy()
+    result = trajectory(SYSTEM, method, *perihelion(ECCENTRICITY), h=STEP, span=SPAN)
+    return result.t, result.q, result.p, result.energy()
 
 
 @lru_cache(maxsize=8)

@@ -43,7 +43,7 @@ LONG_STEP = math.pi / 20
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class TimeInterval:
     """Positions of consecutive steps, the range of their energies, and the largest error of the momentum."""
 
     q: Array
@@ -53,22 +53,22 @@ class Segment:
 
 
 @lru_cache(maxsize=1)
-def segments() -> tuple[Segment, ...]:
+def segments() -> tuple[TimeInterval, ...]:
     """Return the steps that are drawn, of one run of 400000 steps."""
     stepper = stepper_of(SYSTEM, TWO_POINTS)
     q, velocity = perihelion(ECCENTRICITY)
     run = stepper.start(q, stepper.momentum(q, velocity), h=LONG_STEP, options=SECTION_4)
-    found = []
+    result = []
     for first, last in SEGMENTS:
         run.record(first - run.steps, save_every=SEGMENTS[-1][-1])
-        found.append(_segment(run.record(last - first)))
-    return tuple(found)
+        result.append(_segment(run.record(last - first)))
+    return tuple(result)
 
 
-def _segment(part: Trajectory) -> Segment:
+def _segment(part: Trajectory) -> TimeInterval:
     energy, momentum = part.energy(), angular_momentum(part.q, part.p)
     error = np.abs(momentum - math.sqrt(1 - ECCENTRICITY**2))
-    return Segment(part.q, float(energy.min()), float(energy.max()), float(error.max()))
+    return TimeInterval(part.q, float(energy.min()), float(energy.max()), float(error.max()))
 
 
 def _figure_23(_: Mapping[str, Result]) -> Result:

@@ -25,7 +25,7 @@ from scvi_codegen.runtime.trajectory import Trajectory
 __all__ = [
     "ECCENTRICITY",
     "FORMS",
-    "KEPT",
+    "PRESERVED",
     "PRINTED",
     "STEP",
     "TWO_FORMS",
@@ -45,7 +45,7 @@ FORMS = (PRINTED, VARIATIONAL)
 TWO_FORMS = (
     "SCVI is run twice: as printed, (34a)-(34e), and in variational form, with the chain-rule term in (34d), (34e)."
 )
-KEPT = 0.05
+PRESERVED = 0.05
 """Largest energy error at which a phase trajectory counts as preserved: a tenth of the semi-major axis."""
 SYMPLECTIC = 1e-11
 """Largest defect of a symplectic step, above the noise of the differences."""
@@ -81,7 +81,7 @@ class Orbit:
     @property
     def lost(self) -> float:
         """First time at which the energy is off by a tenth, or the last time."""
-        off = np.flatnonzero(np.abs(self.energy) > KEPT)
+        off = np.flatnonzero(np.abs(self.energy) > PRESERVED)
         return float(self.run.t[off[0]]) if len(off) else self.end
 
     @property
@@ -111,8 +111,8 @@ def structure_table(points: int, gauss: tuple[int, ...]) -> TableBlock:
     """Return symplecticity defect, change of momentum and order of both forms."""
 
     def row(count: int, form: str) -> tuple[str | int | float, ...]:
-        found = structure_of(shooting(points, count, form))
-        return points, count, form, found.defect, found.momentum, found.order
+        result = structure_of(shooting(points, count, form))
+        return points, count, form, result.defect, result.momentum, result.order
 
     return TableBlock(
         name="structure",
@@ -124,16 +124,16 @@ def structure_table(points: int, gauss: tuple[int, ...]) -> TableBlock:
 
 def structure_check(points: int, gauss: tuple[int, ...], form: str) -> Comparison:
     """Return the check that one form is symplectic."""
-    found = [structure_of(shooting(points, count, form)) for count in gauss]
-    defects = ", ".join(f"{structure.defect:.1e}" for structure in found)
-    orders = ", ".join(f"{structure.order:.1f}" for structure in found)
+    result = [structure_of(shooting(points, count, form)) for count in gauss]
+    defects = ", ".join(f"{structure.defect:.1e}" for structure in result)
+    orders = ", ".join(f"{structure.order:.1f}" for structure in result)
     return Comparison(
         claim=f"SCVI is symplectic ({form}).",
         measured=(
             f"One step h = 0.3 with {points} points and {_counts(gauss)} Gauss points: max |J^T Omega J - Omega| = "
             f"{defects}; measured order {orders}."
         ),
-        verdict=holds(all(structure.defect < SYMPLECTIC for structure in found)),
+        verdict=holds(all(structure.defect < SYMPLECTIC for structure in result)),
         bears_on=("scvi-structure",),
     )
 

@@ -27,7 +27,7 @@ from scvi_codegen.reproduce.kepler.one_step import (
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, judged
 from scvi_codegen.reproduce.laboratory.geometric import (
-    ALONG,
+    AGREEMENT_FACTOR,
     STRAIGHT,
     Line,
     factors,
@@ -70,8 +70,8 @@ N_SETTING = (
 
 def _errors(scheme: str, e: float, quantity: str) -> Array:
     """Return the errors over :data:`POINTS`; NaN if a step has no solution."""
-    found = (one_step(scheme, points - 1, e, LONG_STEP) for points in POINTS)
-    return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in found])
+    result = (one_step(scheme, points - 1, e, LONG_STEP) for points in POINTS)
+    return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in result])
 
 
 def bases(scheme: str, e: float, quantity: str) -> Line | None:
@@ -102,30 +102,30 @@ def _curves_with_errors(quantities: tuple[str, str], e: float) -> list[tuple[str
 
 def _check_geometric(quantities: tuple[str, str]) -> Comparison:
     curves = {e: _curves_with_errors(quantities, e) for e in JUDGED}
-    straight = {e: [is_straight(N, _errors(s, e, q)) for s, q in found] for e, found in curves.items()}
-    slowest = {e: max(line[1] for s, q in found if (line := bases(s, e, q))) for e, found in curves.items()}
+    straight = {e: [is_straight(N, _errors(s, e, q)) for s, q in result] for e, result in curves.items()}
+    slowest = {e: max(line[1] for s, q in result if (line := bases(s, e, q))) for e, result in curves.items()}
     return Comparison(
         claim="Under N-refinement the errors fall geometrically.",
         measured="Straight (N and the logarithm of the error correlate with r^2 above "
         f"{STRAIGHT:g}) are "
-        + ", ".join(f"{sum(found)} of {len(found)} curves with e = {e:g}" for e, found in straight.items())
+        + ", ".join(f"{sum(result)} of {len(result)} curves with e = {e:g}" for e, result in straight.items())
         + "; the slowest falls by "
         + ", by ".join(f"{base:.2g} (e = {e:g})" for e, base in slowest.items())
         + " a point.",
-        verdict=judged(*(one for found in straight.values() for one in found)),
+        verdict=judged(*(one for result in straight.values() for one in result)),
         bears_on=("geometric",),
     )
 
 
 def _check_bases(quantities: tuple[str, str]) -> Comparison:
-    def found(e: float) -> dict[tuple[str, str], tuple[float, float]]:
+    def result(e: float) -> dict[tuple[str, str], tuple[float, float]]:
         return {
             key: (line[1], paper[1])
             for key, paper in PAPER_BASES.items()
             if key[1] in quantities and (line := bases(key[0], e, key[1]))
         }
 
-    by_e = {e: found(e) for e in JUDGED}
+    by_e = {e: result(e) for e in JUDGED}
     parts = {e: ", ".join(f"{s} {q} {base:.2g}" for (s, q), (base, _) in by_e[e].items()) for e in JUDGED}
     printed = ", ".join(f"{s} {q} {paper[1]:g}" for (s, q), paper in PAPER_BASES.items() if q in quantities)
     return Comparison(
@@ -143,8 +143,8 @@ def _check_lines(quantities: tuple[str, str]) -> Comparison:
         claim="The lines c b^N run along the errors.",
         measured="The typical factor between an error and its line is "
         + ", ".join(f"{factor:.1g} with e = {e:g}" for e, factor in off.items())
-        + f". Below {ALONG:g} counts as along.",
-        verdict=judged(*(factor < ALONG for factor in off.values())),
+        + f". Below {AGREEMENT_FACTOR:g} counts as along.",
+        verdict=judged(*(factor < AGREEMENT_FACTOR for factor in off.values())),
     )
 
 
@@ -167,8 +167,8 @@ def _check_superior(quantities: tuple[str, str]) -> Comparison:
 
 def _bases_table(quantities: tuple[str, str]) -> TableBlock:
     def line(scheme: str, e: float, quantity: str) -> tuple[float | None, float | None]:
-        found = bases(scheme, e, quantity)
-        return found or (None, None)
+        result = bases(scheme, e, quantity)
+        return result or (None, None)
 
     return TableBlock(
         columns=("e", "scheme", "error of", "c", "b in c b^N", "paper's c", "paper's b"),

@@ -63,14 +63,14 @@ def ellipse(e: float) -> tuple[Array, Array]:
 
 def angular_momentum(q: Array, p: Array) -> Array:
     """Return M = q1 p2 - q2 p1, along the last axis."""
-    found: Array = q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]
-    return found
+    result: Array = q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0]
+    return result
 
 
 def off_ellipse(q: Array, e: float) -> Array:
     """Return the distance of positions outside the exact orbit: half the sum of the distances to its foci, less 1."""
-    found: Array = (np.hypot(q[:, 0], q[:, 1]) + np.hypot(q[:, 0] + 2 * e, q[:, 1])) / 2 - 1
-    return found
+    result: Array = (np.hypot(q[:, 0], q[:, 1]) + np.hypot(q[:, 0] + 2 * e, q[:, 1])) / 2 - 1
+    return result
 
 
 def perihelion_turn(q: Array, p: Array) -> float:

@@ -27,8 +27,8 @@ __all__ = [
     "SCHEMES",
     "StepErrors",
     "one_step",
+    "orders",
     "shares_won",
-    "slopes",
     "superiority",
 ]
 
@@ -44,7 +44,7 @@ MOSTLY = 0.9
 ROUNDOFF = 1e-13
 """Round-off level of the error of a step."""
 TO_ROUNDOFF = SolverOptions(max_iterations=1000)
-SLOPE_STEPS = ("0.05", "0.025")
+ORDER_STEPS = ("0.05", "0.025")
 """Step sizes in units of (1 - e)^(3/2), the time scale at perihelion."""
 NEGLIGIBLE = mp.mpf(10) ** (5 - DIGITS)
 
@@ -76,7 +76,7 @@ def one_step(scheme: str, degree: int, e: float, h: float) -> StepErrors | None:
 
 
 @lru_cache(maxsize=64)
-def slopes(scheme: str, degree: int, e: float) -> tuple[float | None, ...]:
+def orders(scheme: str, degree: int, e: float) -> tuple[float | None, ...]:
     """Return the order in h of each error as h goes to 0; ``None`` for an error below 1e-55.
 
     Steps are computed in 60 digits, as Runge-Kutta methods: an SVI with as many Gauss points as its degree is Gauss
@@ -84,7 +84,7 @@ def slopes(scheme: str, degree: int, e: float) -> tuple[float | None, ...]:
     """
     tableau = Gauss(degree).tableau if scheme == "SVI" else SpectralCollocation(degree).tableau
     scale = (1 - mp.mpf(e)) ** 1.5
-    larger, smaller = (_precise_errors(tableau, e, scale * mp.mpf(h)) for h in SLOPE_STEPS)
+    larger, smaller = (_precise_errors(tableau, e, scale * mp.mpf(h)) for h in ORDER_STEPS)
     return tuple(
         None if min(pair) < NEGLIGIBLE else float(mp.log(pair[0] / pair[1]) / mp.log(2))
         for pair in zip(larger, smaller, strict=True)

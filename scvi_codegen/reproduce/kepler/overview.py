@@ -183,7 +183,7 @@ def _draw_orbits(orbits: Mapping[str, tuple[Array, Array]], figure: Figure) -> N
 
 CURVE = SVI(4, gauss_legendre(5), chebyshev_lobatto(4))
 START, MOMENTUM, CURVE_STEP = 1.0, 1.0, 2.5
-FAMILIES = {"Legendre": legendre_lobatto, "Chebyshev": chebyshev_lobatto, "equispaced": equispaced}
+NODE_TYPES = {"Legendre": legendre_lobatto, "Chebyshev": chebyshev_lobatto, "equispaced": equispaced}
 COUNTS = (2, 4, 7)
 RUNGE_COUNTS = range(3, 32, 4)
 FAMILY_STYLES = {"Legendre": ("SVI", "o"), "Chebyshev": ("SC", "s"), "equispaced": ("exact", "^")}
@@ -197,7 +197,7 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
     common = int(np.sum(np.min(np.abs(points[:, None] - nodes), axis=1) < 1e-12))
     at_lobatto = sum(any(abs(x - y) < 1e-30 for y in legendre_lobatto(4).points) for x in gauss_lobatto(5).points)
     counts = RUNGE_COUNTS
-    errors = {name: np.array([_interpolation_error(name, n) for n in counts]) for name in FAMILIES}
+    errors = {name: np.array([_interpolation_error(name, n) for n in counts]) for name in NODE_TYPES}
     rows = tuple(zip(counts, *(error.tolist() for error in errors.values()), strict=True))
     end = {name: float(error[-1]) for name, error in errors.items()}
     return Result(
@@ -231,7 +231,7 @@ def _points_of_a_step(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(
-            TableBlock(columns=("n", *FAMILIES), rows=rows, formats=dict.fromkeys(FAMILIES, ".1e"), shown=False),
+            TableBlock(columns=("n", *NODE_TYPES), rows=rows, formats=dict.fromkeys(NODE_TYPES, ".1e"), shown=False),
             TableBlock(
                 name="curve",
                 columns=("node", "Q"),
@@ -256,7 +256,7 @@ def _interpolated(points: Vector, values: Array, at: Array) -> Array:
 
 def _interpolation_error(family: str, count: int) -> float:
     """Return the largest interpolation error of Runge's function on [-1, 1] at 101 points."""
-    points, at = FAMILIES[family](count - 1).points, np.linspace(-1.0, 1.0, 101)
+    points, at = NODE_TYPES[family](count - 1).points, np.linspace(-1.0, 1.0, 101)
     return largest(_interpolated(points, _runge(_numbers(points)), at) - _runge(at))
 
 
@@ -267,7 +267,7 @@ def _runge(x: Array) -> Array:
 def _draw_points(values: Array, errors: Mapping[str, Array], figure: Figure) -> None:
     curve, families, convergence = panels(figure, 1, 3)
     _draw_curve(curve, values)
-    for row, (name, family) in enumerate(FAMILIES.items()):
+    for row, (name, family) in enumerate(NODE_TYPES.items()):
         color, mark = FAMILY_STYLES[name]
         for block, count in enumerate(COUNTS):
             height = -(row + 4.0 * block)

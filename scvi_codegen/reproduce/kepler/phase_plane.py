@@ -15,7 +15,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.forms import (
     ECCENTRICITY,
     FORMS,
-    KEPT,
+    PRESERVED,
     PRINTED,
     STEP,
     TWO_FORMS,
@@ -95,7 +95,7 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -
         energy, momentum = orbits[name].largest
         lost = f", lost at t = {orbits[name].lost:.1f}" if orbits[name].lost < orbits[name].end else ""
         parts.append(f"{name}: energy {energy:.1e}, momentum {momentum:.1e}{lost}")
-    kept = [not orbits[name].failed and orbits[name].largest[0] < KEPT for name in names]
+    kept = [not orbits[name].failed and orbits[name].largest[0] < PRESERVED for name in names]
     return Comparison(
         claim=f"The phase trajectories are preserved by {', '.join(names)}.",
         measured=f"Largest errors: {'; '.join(parts)}.{more}",

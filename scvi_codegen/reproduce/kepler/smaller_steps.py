@@ -22,8 +22,8 @@ from scvi_codegen.reproduce.kepler.one_step import (
     ROUNDOFF,
     SCHEMES,
     one_step,
+    orders,
     shares_won,
-    slopes,
     superiority,
 )
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
@@ -71,12 +71,12 @@ H_SETTING = (
 
 
 def _h_errors(scheme: str, degree: int, e: float, quantity: str) -> Array:
-    found = (one_step(scheme, degree, e, h) for h in STEPS)
-    return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in found])
+    result = (one_step(scheme, degree, e, h) for h in STEPS)
+    return np.array([np.nan if errors is None else getattr(errors, quantity) for errors in result])
 
 
-def _slope(scheme: str, degree: int, e: float, quantity: str) -> float | None:
-    return slopes(scheme, degree, e)[QUANTITIES.index(quantity)]
+def _order(scheme: str, degree: int, e: float, quantity: str) -> float | None:
+    return orders(scheme, degree, e)[QUANTITIES.index(quantity)]
 
 
 def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping[str, Result]) -> Result:
@@ -94,16 +94,16 @@ def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping
 def _check_powers() -> Comparison:
     """Return the check that the exponents of the paper's lines are those of the circle with N points."""
     _, e, degree = READINGS[0]
-    found = {
-        quantity: {round(_slope(s, degree(n), e, quantity) or 0) for n in LEGEND for s in SCHEMES}
+    result = {
+        quantity: {round(_order(s, degree(n), e, quantity) or 0) for n in LEGEND for s in SCHEMES}
         for quantity in PAPER_POWERS
     }
     drawn = {quantity: {round(power) for _, power in lines} for quantity, lines in PAPER_POWERS.items()}
-    same = sum(found[quantity] == drawn[quantity] for quantity in drawn)
+    same = sum(result[quantity] == drawn[quantity] for quantity in drawn)
     return Comparison(
         claim="The errors of q1 fall like h^2, h^4, h^6, h^8, h^12, those of q2 like h^3, h^5, h^7, h^10.",
         measured=(
-            f"With N points: q1 {_listed(found['q1'])} and q2 {_listed(found['q2'])}; h^11 is a line of SVI with six "
+            f"With N points: q1 {_listed(result['q1'])} and q2 {_listed(result['q2'])}; h^11 is a line of SVI with six "
             f"points, whose order is 10. With N the degree: {_slopes_text('q1', 1)}; {_slopes_text('q2', 1)}."
         ),
         verdict=Verdict.PARTLY if 0 < same < len(drawn) else holds(same == len(drawn)),
@@ -117,8 +117,8 @@ def _listed(powers: set[int]) -> str:
 def _check_slopes(quantity: str) -> Comparison:
     """Return the check of the orders in both readings; an SVI conserves the momentum in any case."""
     e_and_degrees = [(e, degree(n)) for _, e, degree in READINGS for n in LEGEND]
-    exact = all(_slope("SVI", d, e, quantity) is None for e, d in e_and_degrees)
-    faster = all((_slope("SVI", d, e, quantity) or 99) > (_slope("SC", d, e, quantity) or 0) for e, d in e_and_degrees)
+    exact = all(_order("SVI", d, e, quantity) is None for e, d in e_and_degrees)
+    faster = all((_order("SVI", d, e, quantity) or 99) > (_order("SC", d, e, quantity) or 0) for e, d in e_and_degrees)
     return Comparison(
         claim=f"The error of the {quantity} falls faster with h for SVI than for SC.",
         measured=f"{_slopes_text(quantity, 0)} with N points; {_slopes_text(quantity, 1)} with N the degree.",
@@ -131,9 +131,9 @@ def _slopes_text(quantity: str, reading: int) -> str:
     _, e, degree = READINGS[reading]
     parts = []
     for scheme in SCHEMES:
-        found = [_slope(scheme, degree(n), e, quantity) for n in LEGEND]
-        powers = ", ".join("no error" if slope is None else f"{slope:.1f}" for slope in found)
-        parts.append(f"{scheme} {'no error' if not any(found) else powers}")
+        result = [_order(scheme, degree(n), e, quantity) for n in LEGEND]
+        powers = ", ".join("no error" if slope is None else f"{slope:.1f}" for slope in result)
+        parts.append(f"{scheme} {'no error' if not any(result) else powers}")
     return f"{quantity} {' and '.join(parts)}"
 
 
@@ -153,7 +153,7 @@ def _slopes_table(quantities: tuple[str, ...]) -> TableBlock:
     return TableBlock(
         columns=("reading", "N", "degree", "scheme", *(f"slope of {quantity}" for quantity in quantities)),
         rows=tuple(
-            (reading, n, degree(n), scheme, *(_slope(scheme, degree(n), e, quantity) for quantity in quantities))
+            (reading, n, degree(n), scheme, *(_order(scheme, degree(n), e, quantity) for quantity in quantities))
             for reading, e, degree in READINGS
             for scheme in SCHEMES
             for n in LEGEND

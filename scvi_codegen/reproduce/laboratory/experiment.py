@@ -75,10 +75,10 @@ class Comparison:
 
 def common_verdict(checks: Iterable[Comparison]) -> Verdict:
     """Return the verdict of several checks: ``PARTLY`` if they differ, ``SHOWN`` if none decides anything."""
-    found = {check.verdict for check in checks} - {Verdict.SHOWN}
-    if not found:
+    result = {check.verdict for check in checks} - {Verdict.SHOWN}
+    if not result:
         return Verdict.SHOWN
-    return found.pop() if len(found) == 1 else Verdict.PARTLY
+    return result.pop() if len(result) == 1 else Verdict.PARTLY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

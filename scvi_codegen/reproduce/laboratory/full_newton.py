@@ -31,14 +31,14 @@ def newton_counts(
     """
     derived = derive(system, method)
     equations = sympy.Matrix([equation.residual for equation in derived.equations])
-    residual, slope = _function(derived, equations), _function(derived, sympy.Matrix(derived.jacobian))
+    residual, jacobian_function = _function(derived, equations), _function(derived, sympy.Matrix(derived.jacobian))
     end = _function(derived, sympy.Matrix([equation.residual for equation in derived.end_momentum]))
     line = _function(derived, sympy.Matrix([derived.initial_guess[unknown] for unknown in derived.unknowns]))
     position, momentum, counts = np.array(q, dtype=float), np.array(p, dtype=float), []
     for _ in range(steps):
         state = (*position, *momentum, h)
         unknowns = line(np.zeros(len(derived.unknowns)), state).ravel()
-        unknowns, count = _solved(unknowns, state, residual, slope)
+        unknowns, count = _solved(unknowns, state, residual, jacobian_function)
         position, momentum = unknowns[-system.dimension :], end(unknowns, state).ravel()
         counts.append(count)
     return counts
@@ -57,10 +57,12 @@ def _function(derived: StepEquations, expression: sympy.Matrix) -> Function:
     return lambda unknowns, state: np.array(function(*unknowns, *state), dtype=float)
 
 
-def _solved(unknowns: Array, state: Sequence[float], residual: Function, slope: Function) -> tuple[Array, int]:
+def _solved(
+    unknowns: Array, state: Sequence[float], residual: Function, jacobian_function: Function
+) -> tuple[Array, int]:
     """Return the unknowns and the number of updates."""
     count, size = 0, np.inf
     while size >= SECTION_3.tolerance and count < SECTION_3.max_iterations:
-        update = np.linalg.solve(slope(unknowns, state), residual(unknowns, state).ravel())
+        update = np.linalg.solve(jacobian_function(unknowns, state), residual(unknowns, state).ravel())
         unknowns, size, count = unknowns - update, np.abs(update).max(), count + 1
     return unknowns, count

@@ -8,7 +8,17 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ALONG", "STRAIGHT", "WINDOW", "Line", "factors", "fitted_line", "is_straight", "typical", "within"]
+__all__ = [
+    "AGREEMENT_FACTOR",
+    "STRAIGHT",
+    "WINDOW",
+    "Line",
+    "factors",
+    "fitted_line",
+    "is_straight",
+    "typical",
+    "within",
+]
 
 Array = NDArray[np.float64]
 Line: TypeAlias = tuple[float, float]
@@ -18,7 +28,7 @@ WINDOW = 1e-13, 1e-1
 """Range of errors that count: smaller ones are round-off, larger ones are not resolved."""
 LEAST = 3
 """Least number of errors for a fit."""
-ALONG = 30.0
+AGREEMENT_FACTOR = 30.0
 """Largest typical factor between errors and a line that counts as agreement."""
 STRAIGHT = 0.9
 """Least squared correlation of N and the logarithms of errors that decrease geometrically."""
@@ -48,8 +58,8 @@ def is_straight(n: Array, errors: Array) -> bool:
 def factors(n: Array, errors: Array, line: Line) -> Array:
     """Return the factor, at least 1, between each error inside the window and a line."""
     used = within(errors)
-    found: Array = np.exp(np.abs(np.log(errors[used]) - np.log(line[0]) - n[used] * np.log(line[1])))
-    return found
+    result: Array = np.exp(np.abs(np.log(errors[used]) - np.log(line[0]) - n[used] * np.log(line[1])))
+    return result
 
 
 def typical(all_factors: Iterable[Array]) -> float:

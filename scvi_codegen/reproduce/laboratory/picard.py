@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.tables.basis import cardinal_slopes, cardinal_values, differentiation_matrix
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, differentiation_matrix
 from scvi_codegen.tables.nodes import chebyshev_lobatto
 from scvi_codegen.tables.quadrature import gauss_legendre
 
@@ -60,8 +60,8 @@ def galerkin(degree: int, points: int) -> Equations:
     """Return (30) on Chebyshev nodes with Gauss points: the first s rows of the stiffness (29), solved for Q."""
     nodes, rule = chebyshev_lobatto(degree).points, gauss_legendre(points)
     weights = _array([rule.weights])[0] / 2.0
-    values, slopes = (_array(table(nodes, rule.points)) for table in (cardinal_values, cardinal_slopes))
-    stiffness = 4.0 * (slopes.T * weights) @ slopes
+    values, derivatives = (_array(table(nodes, rule.points)) for table in (cardinal_values, cardinal_derivatives))
+    stiffness = 4.0 * (derivatives.T * weights) @ derivatives
     return Equations(_unit(nodes), values, -np.linalg.solve(stiffness[:-1, 1:], (values.T * weights)[:-1]), weights)
 
 

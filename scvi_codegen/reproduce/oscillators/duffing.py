@@ -76,7 +76,7 @@ def _run(scheme: str, span: float) -> Trajectory:
     return trajectory(OSCILLATOR, METHODS[scheme], POSITION, VELOCITY, h=0.6, span=span)
 
 
-def _level_curve() -> tuple[Array, Array]:
+def _energy_curve() -> tuple[Array, Array]:
     """Return the exact orbit in the phase plane, p^2 = 1 + q^2 - 4 q^4/3."""
     end = np.sqrt((3.0 + np.sqrt(57.0)) / 8.0)
     angle = np.linspace(0.0, 2.0 * np.pi, 600)
@@ -126,14 +126,14 @@ def _phase(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(TableBlock(columns=columns, rows=tuple(rows), formats=dict.fromkeys(columns[1:], ".1e")),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve()), width=10.0, height=8.6),
+        picture=Picture(draw=partial(_draw_phase, orbits, _energy_curve()), width=10.0, height=8.6),
     )
 
 
 def _draw_phase(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Array], figure: Figure) -> None:
     rows = np.reshape(np.array(panels(figure, 3, len(orbits)), dtype=object), (3, -1))
     for (whole, part, distance), (scheme, (q, p, offset)) in zip(rows.T, orbits.items(), strict=True):
-        color = COLORS[_family(scheme)]
+        color = COLORS[_scheme_name(scheme)]
         near = (q > WINDOW[0]) & (q < WINDOW[1]) & (p > WINDOW[0]) & (p < WINDOW[1])
         whole.plot(*thinned(q, p, most=MOST_DOTS), ".", color=color, markersize=2)
         part.plot(q[near], p[near], ".", color=color, markersize=4)
@@ -148,7 +148,7 @@ def _draw_phase(orbits: Mapping[str, tuple[Array, ...]], exact: tuple[Array, Arr
         distance.ticklabel_format(axis="y", scilimits=(0, 0))
 
 
-def _family(scheme: str) -> str:
+def _scheme_name(scheme: str) -> str:
     """Return the name of a scheme without its degree or order."""
     return scheme.partition(",")[0].removesuffix("6")
 
@@ -198,7 +198,7 @@ def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
     (axes,) = panels(figure, 1, 1)
     for scheme, error in errors.items():
         style = ":" if scheme.endswith("degree 6") else "-"
-        draw_error(axes, t, error, _family(scheme), scheme, linestyle=style)
+        draw_error(axes, t, error, _scheme_name(scheme), scheme, linestyle=style)
     axes.set(xlabel="t", ylabel="|H - H(0)|")
     axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 

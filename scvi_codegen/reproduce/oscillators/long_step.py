@@ -22,7 +22,15 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
     judged,
 )
-from scvi_codegen.reproduce.laboratory.geometric import ALONG, WINDOW, Line, factors, fitted_line, typical, within
+from scvi_codegen.reproduce.laboratory.geometric import (
+    AGREEMENT_FACTOR,
+    WINDOW,
+    Line,
+    factors,
+    fitted_line,
+    typical,
+    within,
+)
 from scvi_codegen.reproduce.laboratory.readings import BY_DEGREE, BY_POINTS, READINGS, SCHEMES, Reading
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
 from scvi_codegen.reproduce.oscillators.one_degree import largest
@@ -166,8 +174,8 @@ def _lines(curves: Curves) -> Comparison:
     return Comparison(
         claim="The errors run along 1e14 (0.09)^N (SVI) and 1e10 (0.21)^N (SC), the lines of the legend.",
         measured=f"The typical factor between an error and its line is {listed(BY_POINTS)} with N points, and "
-        f"{listed(BY_DEGREE)} with N the degree. Below {ALONG:g} counts as along.",
-        verdict=holds(all(factor < ALONG for (reading, *_), factor in off.items() if reading == BY_POINTS)),
+        f"{listed(BY_DEGREE)} with N the degree. Below {AGREEMENT_FACTOR:g} counts as along.",
+        verdict=holds(all(factor < AGREEMENT_FACTOR for (reading, *_), factor in off.items() if reading == BY_POINTS)),
     )
 
 

@@ -95,12 +95,12 @@ def area_factor(stepper: Stepper, q: float, p: float, h: float, *, distance: flo
 def offset_from_curve(run: Trajectory, *, distance: float = 1e-5) -> Array:
     """Return the distance of each state from the energy curve, to first order: (H - H(0)) / |grad H|."""
 
-    def slope(dq: float, dp: float) -> Array:
+    def derivative(dq: float, dp: float) -> Array:
         ahead, behind = (run.stepper.energy(run.q + s * dq, run.p + s * dp, run.t, run.parameters) for s in (1.0, -1.0))
         difference: Array = (ahead - behind) / (2.0 * distance)
         return difference
 
-    offset: Array = energy_error(run) / np.hypot(slope(distance, 0.0), slope(0.0, distance))
+    offset: Array = energy_error(run) / np.hypot(derivative(distance, 0.0), derivative(0.0, distance))
     return offset
 
 

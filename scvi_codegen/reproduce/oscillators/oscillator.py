@@ -81,7 +81,7 @@ def _position_error(scheme: str) -> Array:
 
 def _phase_trajectories(_: Mapping[str, Result]) -> Result:
     runs = {"SVI": _run(SVI_LABEL, 100.0), "SC": _run("SC", 100.0)}
-    apart = {
+    difference = {
         scheme: largest(np.hypot(run.q[:, 0] - np.sin(run.t), run.p[:, 0] - np.cos(run.t)))
         for scheme, run in runs.items()
     }
@@ -94,14 +94,14 @@ def _phase_trajectories(_: Mapping[str, Result]) -> Result:
         checks=(
             Comparison(
                 claim="Plotted every five steps, the phase trajectories of SVI and SC show their differences.",
-                measured=f"The states are off the exact ones by at most {apart['SVI']:.1e} (SVI) and {apart['SC']:.1e} "
+                measured=f"Differences from exact states: {difference['SVI']:.1e} (SVI) and {difference['SC']:.1e} "
                 f"(SC); a line of the picture is {VISIBLE:g} wide, so both lie on the exact states.",
-                verdict=holds(apart["SC"] > VISIBLE),
+                verdict=holds(difference["SC"] > VISIBLE),
             ),
             Comparison(
                 claim="SVI is more accurate in phase than SC with the same points and step.",
-                measured=f"Largest error of a state: SVI {apart['SVI']:.1e}, SC {apart['SC']:.1e}.",
-                verdict=holds(apart["SVI"] < apart["SC"]),
+                measured=f"Largest error of a state: SVI {difference['SVI']:.1e}, SC {difference['SC']:.1e}.",
+                verdict=holds(difference["SVI"] < difference["SC"]),
                 bears_on=("accuracy",),
             ),
         ),

@@ -196,8 +196,8 @@ def _errors_table(curves: Mapping[Variant, Curves], steps: tuple[float, ...]) ->
 
 def _powers(what: str) -> Comparison:
     """Return the check that the powers of the legend are those of the curves."""
-    found = {variant: {round(fit.power) for fit in _fits(what, variant).values() if fit} for variant in SHOWN[what]}
-    printed, ours = set(PRINTED[what]), found[POINTS]
+    result = {variant: {round(fit.power) for fit in _fits(what, variant).values() if fit} for variant in SHOWN[what]}
+    printed, ours = set(PRINTED[what]), result[POINTS]
     outcome = "These are the printed ones"
     if missing := sorted(printed - ours):
         others = _powers_of_h(sorted(ours - printed)) or "nothing"

@@ -86,7 +86,7 @@ def _two_points(scheme: str) -> Trajectory:
     return trajectory(PENDULUM, method, POSITION, VELOCITY, h=SMALL_STEP, span=60.0 * math.pi, options=SECTION_4)
 
 
-def _level_curve() -> tuple[Array, Array]:
+def _energy_curve() -> tuple[Array, Array]:
     """Return the exact orbit in the phase plane, p^2/2 - cos q = -cos q(0)."""
     angle = np.linspace(0.0, 2.0 * np.pi, 400)
     q = POSITION[0] * np.cos(angle)
@@ -117,7 +117,7 @@ def _phase_of_long_run(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(energy_table(runs),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve(), DOTS), width=10.0, height=3.7),
+        picture=Picture(draw=partial(_draw_phase, orbits, _energy_curve(), DOTS), width=10.0, height=3.7),
     )
 
 
@@ -126,13 +126,13 @@ def _draw_phase(
 ) -> None:
     limit = 1.05 * max(largest(np.concatenate(orbit)) for orbit in orbits.values())
     for axes, (scheme, (q, p)) in zip(panels(figure, 1, len(orbits)), orbits.items(), strict=True):
-        draw_orbit(axes, q, p, _family(scheme), scheme, **style)
+        draw_orbit(axes, q, p, _scheme_name(scheme), scheme, **style)
         axes.plot(*exact, color="black", linestyle="--", linewidth=0.7, label="exact")
         axes.set(xlabel="q", ylabel="p", title=scheme, aspect="equal", xlim=(-limit, limit), ylim=(-limit, limit))
         axes.legend(loc="center", markerscale=3)
 
 
-def _family(scheme: str) -> str:
+def _scheme_name(scheme: str) -> str:
     """Return the name of a scheme without its degree or order."""
     return scheme.partition(",")[0].removesuffix("4")
 
@@ -188,7 +188,7 @@ def _draw_energy(t: Array, errors: Mapping[str, Array], figure: Figure) -> None:
     (axes,) = panels(figure, 1, 1)
     for scheme, error in errors.items():
         style = ":" if scheme.endswith("degree 4") else "-"
-        draw_error(axes, t, error, _family(scheme), scheme, linestyle=style)
+        draw_error(axes, t, error, _scheme_name(scheme), scheme, linestyle=style)
     axes.set(xlabel="t", ylabel="|H - H(0)|")
     axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
@@ -221,7 +221,7 @@ def _phase_with_two_points(_: Mapping[str, Result]) -> Result:
             ),
         ),
         tables=(energy_table(runs),),
-        picture=Picture(draw=partial(_draw_phase, orbits, _level_curve(), {}), width=8.0, height=4.2),
+        picture=Picture(draw=partial(_draw_phase, orbits, _energy_curve(), {}), width=8.0, height=4.2),
     )
 
 

@@ -167,8 +167,8 @@ def _row(stepper: Stepper, *state: float) -> tuple[float, ...]:
     speed = sympy.solve(printed_36(), v)[0].evalf(20, subs=values)
     residual = step * printed_37().evalf(20, subs=values)
     end = sympy.diff(action(), new).evalf(20, subs=values) - p1
-    apart = max(abs(float(other[0][0]) - q1), abs(float(other[1][0]) - p1))
-    return (*state, q1, p1, float(speed), float(residual), float(end), apart)
+    difference = max(abs(float(other[0][0]) - q1), abs(float(other[1][0]) - p1))
+    return (*state, q1, p1, float(speed), float(residual), float(end), difference)
 
 
 def _vanishes(expression: sympy.Expr) -> bool:
@@ -177,15 +177,15 @@ def _vanishes(expression: sympy.Expr) -> bool:
 
 
 def _symbolic_checks(scheme: Scheme) -> Iterator[Comparison]:
-    for number, found, printed, claim in (
+    for number, result, printed, claim in (
         ("36", scheme.stage, printed_36(), "(34a) has the form (36)"),
         ("37", scheme.momentum, printed_37(), "(34d) can be rewritten as (37)"),
     ):
-        same = _vanishes(found - printed)
+        same = _vanishes(result - printed)
         yield Comparison(
             claim=f"For two points {claim}.",
             measured=f"The difference of the derived and the printed ({number}) "
-            + ("simplifies to 0." if same else f"is {sympy.simplify(found - printed)}."),
+            + ("simplifies to 0." if same else f"is {sympy.simplify(result - printed)}."),
             verdict=holds(same),
         )
     start, end = (
@@ -222,13 +222,13 @@ def _correction_checks() -> Iterator[Comparison]:
 
 
 def _numerical_check(rows: Sequence[Sequence[float]]) -> Comparison:
-    residual, end, apart = (max(abs(row[i]) for row in rows) for i in (-3, -2, -1))
+    residual, end, difference = (max(abs(row[i]) for row in rows) for i in (-3, -2, -1))
     return Comparison(
         claim="q_(k+1) and v_k follow from (36), (37), then p_(k+1) from (34e).",
         measured=f"{len(rows)} steps of the compiled integrator, h from {rows[0][2]} to {rows[-1][2]}: h times the "
         f"residual of (37) at most {residual:.1e}, error of p_(k+1) at most {end:.1e}; SVI of degree 1 gives the same "
-        f"step to {apart:.1e}.",
-        verdict=holds(max(residual, end, apart) < SMALL),
+        f"step to {difference:.1e}.",
+        verdict=holds(max(residual, end, difference) < SMALL),
     )
 
 

@@ -171,7 +171,7 @@ def table_7(results: Mapping[str, Result]) -> Result:
 
 
 def _result(setting: Setting) -> Result:
-    found = costs(setting.number)
+    result = costs(setting.number)
     names = {scheme: method.name for scheme, method in setting.methods.items()}
     doubt = float(np.abs(_reference(setting, FINER) - _reference(setting, 2 * FINER)).max())
     return Result(
@@ -188,13 +188,13 @@ def _result(setting: Setting) -> Result:
             f"The final position is compared with SVI of degree {REFERENCE.degree} at h/{FINER}, which differs from "
             f"that at h/{2 * FINER} by {doubt:.0e}; its error is given relative to the largest |q| of the run.",
         ),
-        checks=tuple(_checks(setting, found)),
-        tables=(_table(setting, found),),
-        picture=Picture(draw=partial(draw_costs, _bars(setting, found)), width=9.0, height=3.8),
+        checks=tuple(_checks(setting, result)),
+        tables=(_table(setting, result),),
+        picture=Picture(draw=partial(draw_costs, _bars(setting, result)), width=9.0, height=3.8),
     )
 
 
-def _table(setting: Setting, found: Mapping[str, Cost]) -> TableBlock:
+def _table(setting: Setting, result: Mapping[str, Cost]) -> TableBlock:
     return TableBlock(
         columns=(
             "scheme",
@@ -219,7 +219,7 @@ def _table(setting: Setting, found: Mapping[str, Cost]) -> TableBlock:
                 cost.position,
                 1e3 * cost.seconds_a_digit if cost.position < 1.0 else None,
             )
-            for one, cost in zip(_bars(setting, found), found.values(), strict=True)
+            for one, cost in zip(_bars(setting, result), result.values(), strict=True)
         ),
         formats={"over SRK": ".2f", "s (paper)": ".2f", "over SRK (paper)": ".2f"}
         | {"energy error": ".1e", "position error": ".1e"},
@@ -238,22 +238,22 @@ class Bars:
     position: float
 
 
-def _bars(setting: Setting, found: Mapping[str, Cost]) -> tuple[Bars, ...]:
+def _bars(setting: Setting, result: Mapping[str, Cost]) -> tuple[Bars, ...]:
     return tuple(
         Bars(
             scheme=scheme,
             method=setting.methods[scheme].name,
-            ratio=cost.seconds / found["SRK"].seconds,
+            ratio=cost.seconds / result["SRK"].seconds,
             printed=setting.seconds[scheme] / setting.seconds["SRK"],
             energy=cost.energy,
             position=cost.position,
         )
-        for scheme, cost in found.items()
+        for scheme, cost in result.items()
     )
 
 
-def _checks(setting: Setting, found: Mapping[str, Cost]) -> Sequence[Comparison]:
-    srk, svi, sc = (found[scheme] for scheme in ("SRK", "SVI", "SC"))
+def _checks(setting: Setting, result: Mapping[str, Cost]) -> Sequence[Comparison]:
+    srk, svi, sc = (result[scheme] for scheme in ("SRK", "SVI", "SC"))
     ratio, printed = svi.seconds / srk.seconds, setting.seconds["SVI"] / setting.seconds["SRK"]
     share = svi.seconds_a_digit / srk.seconds_a_digit
     by_sc = svi.seconds / sc.seconds

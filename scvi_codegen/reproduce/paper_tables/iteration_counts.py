@@ -142,8 +142,8 @@ def picard_counts(number: int, reading: Reading, tolerance: float = SECTION_3.to
 def attraction(q: Array) -> Array:
     """Return accelerations at positions (n, 2)."""
     with np.errstate(all="ignore"):  # iterates that reach the centre or diverge do not converge
-        found: Array = -q / np.hypot(q[:, :1], q[:, 1:]) ** 3
-    return found
+        result: Array = -q / np.hypot(q[:, :1], q[:, 1:]) ** 3
+    return result
 
 
 def _picard_count(e: float, h: float, equations: Equations, tolerance: float) -> Count:
@@ -175,8 +175,8 @@ class Agreement:
     ratio: float
 
 
-def agreement(found: Counts, printed: Counts) -> Agreement:
+def agreement(result: Counts, printed: Counts) -> Agreement:
     """Compare counts cell by cell."""
-    pairs = [(found[setting], count) for setting, count in printed.items()]
+    pairs = [(result[setting], count) for setting, count in printed.items()]
     ratios = [ours.total / theirs.total for ours, theirs in pairs if ours.total and theirs.total]
     return Agreement(len(pairs), sum(a.converged == b.converged for a, b in pairs), statistics.median(ratios))

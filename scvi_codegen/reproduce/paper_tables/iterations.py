@@ -65,7 +65,7 @@ def _all_counts(number: int) -> dict[str, Counts]:
 
 def table(number: int, _: Mapping[str, Result]) -> Result:
     """Return Table 8 or 9."""
-    e, printed, found = ECCENTRICITY[number], printed_counts(number), _all_counts(number)
+    e, printed, result = ECCENTRICITY[number], printed_counts(number), _all_counts(number)
     return Result(
         name=f"table-{number}",
         title=f"Kepler problem, number of iterations with eccentricity e = {e}",
@@ -84,17 +84,17 @@ def table(number: int, _: Mapping[str, Result]) -> Result:
         ),
         checks=(
             _dashes(number, printed),
-            *(_faster(name, found[name]) for name in found if name != "Picard, by degree"),
-            *(_stabler(name, found[name]) for name in found if name != "Picard, by degree"),
-            _example(number, printed, found),
+            *(_faster(name, result[name]) for name in result if name != "Picard, by degree"),
+            *(_stabler(name, result[name]) for name in result if name != "Picard, by degree"),
+            _example(number, printed, result),
         ),
-        tables=(_counts_table(printed, found), _tolerances(number, printed)),
-        picture=Picture(draw=partial(draw_counts, {"as printed": printed} | found), width=9.0, height=11.5),
+        tables=(_counts_table(printed, result), _tolerances(number, printed)),
+        picture=Picture(draw=partial(draw_counts, {"as printed": printed} | result), width=9.0, height=11.5),
     )
 
 
-def _counts_table(printed: Counts, found: Mapping[str, Counts]) -> TableBlock:
-    headings = [f"{name} {what}" for name in found for what in ("max", "total", "energy error", "failure")]
+def _counts_table(printed: Counts, result: Mapping[str, Counts]) -> TableBlock:
+    headings = [f"{name} {what}" for name in result for what in ("max", "total", "energy error", "failure")]
     numbers = ["N", "paper max", "paper total", *(heading for heading in headings if "failure" not in heading)]
     return TableBlock(
         columns=("h", "N", "scheme", "paper max", "paper total", *headings),
@@ -103,7 +103,7 @@ def _counts_table(printed: Counts, found: Mapping[str, Counts]) -> TableBlock:
                 *setting,
                 count.largest,
                 count.total,
-                *(cell for counts in found.values() for cell in _cells(counts[setting])),
+                *(cell for counts in result.values() for cell in _cells(counts[setting])),
             )
             for setting, count in printed.items()
         ),
@@ -149,15 +149,15 @@ def _dashes(number: int, printed: Counts) -> Comparison:
     )
 
 
-def _pairs(found: Counts) -> Iterator[tuple[float, Count, Count]]:
+def _pairs(result: Counts) -> Iterator[tuple[float, Count, Count]]:
     """Yield (h, SC, SVI) for every h and N."""
-    for (h, n, scheme), count in found.items():
+    for (h, n, scheme), count in result.items():
         if scheme == "SC":
-            yield h, count, found[h, n, "SVI"]
+            yield h, count, result[h, n, "SVI"]
 
 
-def _faster(name: str, found: Counts) -> Comparison:
-    totals = [(sc.total, svi.total) for _, sc, svi in _pairs(found) if sc.sound and svi.sound]
+def _faster(name: str, result: Counts) -> Comparison:
+    totals = [(sc.total, svi.total) for _, sc, svi in _pairs(result) if sc.sound and svi.sound]
     ratios = [svi / sc for sc, svi in totals if sc and svi]
     fewer, equal = sum(ratio < 1.0 for ratio in ratios), sum(ratio == 1.0 for ratio in ratios)
     return Comparison(
@@ -169,11 +169,11 @@ def _faster(name: str, found: Counts) -> Comparison:
     )
 
 
-def _stabler(name: str, found: Counts) -> Comparison:
-    converged = [(sc.converged, svi.converged) for _, sc, svi in _pairs(found)]
+def _stabler(name: str, result: Counts) -> Comparison:
+    converged = [(sc.converged, svi.converged) for _, sc, svi in _pairs(result)]
     by_sc, by_svi = (sum(column) for column in zip(*converged, strict=True))
     alone = sum(sc and not svi for sc, svi in converged)
-    (sc, svi), (sc_large, svi_large) = _sound(found, 0.0), _sound(found, LARGE)
+    (sc, svi), (sc_large, svi_large) = _sound(result, 0.0), _sound(result, LARGE)
     verdict = Verdict.PARTLY if by_svi > by_sc and alone else holds(by_svi > by_sc)
     return Comparison(
         claim="SVI is more stable than SC, especially with large time-steps.",
@@ -190,15 +190,15 @@ def _share(part: float) -> Verdict:
     return holds(part >= 0.9) if part >= 0.9 or part <= 0.5 else Verdict.PARTLY
 
 
-def _sound(found: Counts, least: float) -> tuple[int, int]:
+def _sound(result: Counts, least: float) -> tuple[int, int]:
     """Return the number of settings with h >= least at which SC, and at which SVI, remains bound."""
-    pairs = [(sc.sound, svi.sound) for h, sc, svi in _pairs(found) if h >= least]
+    pairs = [(sc.sound, svi.sound) for h, sc, svi in _pairs(result) if h >= least]
     return sum(sc for sc, _ in pairs), sum(svi for _, svi in pairs)
 
 
-def _example(number: int, printed: Counts, found: Mapping[str, Counts]) -> Comparison:
+def _example(number: int, printed: Counts, result: Mapping[str, Counts]) -> Comparison:
     h, n, scheme = EXAMPLE
-    ours = "; ".join(f"{_text(counts[EXAMPLE])} by '{name}'" for name, counts in found.items())
+    ours = "; ".join(f"{_text(counts[EXAMPLE])} by '{name}'" for name, counts in result.items())
     method, start = BY_POINTS.method(scheme, n), perihelion(ECCENTRICITY[number])
     full = newton_counts(SYSTEM, method, *start, h=h, steps=steps_in(SPAN, h))
     return Comparison(
@@ -225,11 +225,11 @@ def draw_counts(tables: Mapping[str, Counts], figure: Figure) -> None:
     from matplotlib.colors import LogNorm
 
     norm, where = LogNorm(3.0, 100.0), panels(figure, len(tables), 1)
-    for axes, (title, found) in zip(where, tables.items(), strict=True):
-        _draw_tiles(axes, found, norm)
+    for axes, (title, result) in zip(where, tables.items(), strict=True):
+        _draw_tiles(axes, result, norm)
         axes.set_title(
             f"{title}: largest number of iterations in a step / all"
-            + (NOTE if any(_lost(count) for count in found.values()) else "")
+            + (NOTE if any(_lost(count) for count in result.values()) else "")
         )
     figure.colorbar(ScalarMappable(norm, "YlOrRd"), ax=where, label="iterations a step", shrink=0.6)
 
@@ -238,13 +238,13 @@ def _lost(count: Count) -> bool:
     return count.converged and count.energy >= 1.0
 
 
-def _draw_tiles(axes: Axes, found: Counts, norm: LogNorm) -> None:
+def _draw_tiles(axes: Axes, result: Counts, norm: LogNorm) -> None:
     from matplotlib import colormaps
 
-    steps = list(dict.fromkeys(h for h, _, _ in found))
-    columns = list(dict.fromkeys((n, scheme) for _, n, scheme in found))
+    steps = list(dict.fromkeys(h for h, _, _ in result))
+    columns = list(dict.fromkeys((n, scheme) for _, n, scheme in result))
     colors = np.full((len(steps), len(columns), 4), (0.93, 0.93, 0.93, 1.0))
-    for (h, n, scheme), count in found.items():
+    for (h, n, scheme), count in result.items():
         y, x, shade = steps.index(h), columns.index((n, scheme)), 0.0
         if count.total is not None:
             shade = norm(count.total / steps_in(SPAN, h))

@@ -85,7 +85,7 @@ GUESSES = {
     "solve": ("guess_from(", LINE),
     "guess_from": ("gather(EXTRAPOLATION",),
     LINE: ("line_from(",),
-    "line_from": (f"{PREFIX}_velocity(", "place_on_line("),
+    "line_from": (f"{PREFIX}_velocity(", "start_on_line("),
 }
 
 SVI_STEPS = (
@@ -109,7 +109,7 @@ SVI_STEPS = (
         counterpart="evaluate sums L_q and L_v, and their symbolic derivatives, over the quadrature points.",
         evidence={
             "evaluate": ("add_quadrature(",),
-            "add_quadrature": ("quadrature_value(", "quadrature_slope(", "scatter(", "scatter_slopes("),
+            "add_quadrature": ("quadrature_value(", "quadrature_slope(", "scatter(", "scatter_derivatives("),
         },
     ),
     ROOT,
@@ -169,7 +169,7 @@ def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], rema
     code = generate_source(planar_pendulum(), method, solver="newton", prefix=PREFIX)[0].amalgamated().code
     functions = functions_of(code)
     missing = {step.number: _missing(step, code, functions) for step in steps}
-    found = [number for number, fragments in missing.items() if not fragments]
+    result = [number for number, fragments in missing.items() if not fragments]
     lost = "; ".join(f"STEP{number} lacks {', '.join(fragments)}" for number, fragments in missing.items() if fragments)
     return Result(
         name=name,
@@ -184,7 +184,7 @@ def _result(name: str, title: str, method: Method, steps: tuple[Step, ...], rema
         checks=(
             Comparison(
                 claim=f"The algorithm has the steps STEP1 to STEP{len(steps)}.",
-                measured=f"{len(found)} of {len(steps)} steps have their counterpart in the C text"
+                measured=f"{len(result)} of {len(steps)} steps have their counterpart in the C text"
                 + (f"; {lost}." if lost else ", each found by name in the function that has it."),
                 verdict=holds(not lost),
             ),

@@ -92,7 +92,7 @@ def _all_properties() -> tuple[Properties, ...]:
 
 def table_4(results: Mapping[str, Result]) -> Result:
     """Return Table 4: properties of collocation methods."""
-    found = _all_properties()
+    result = _all_properties()
     return Result(
         name="table-4",
         title="Properties of different collocation methods",
@@ -103,34 +103,34 @@ def table_4(results: Mapping[str, Result]) -> Result:
             "SC, the spectral collocation of the paper's experiments, collocates at the nodes 1 .. s of s + 1 "
             "Chebyshev-Lobatto nodes and has no column in the paper's table; it is added here.",
         ),
-        checks=(*(_mark_check(name, found) for name in MARKS), _collocation_check(found), _stability_check(found)),
-        tables=(_property_table(found),),
-        picture=Picture(draw=partial(draw_marks, found), width=9.0, height=5.2),
+        checks=(*(_mark_check(name, result) for name in MARKS), _collocation_check(result), _stability_check(result)),
+        tables=(_property_table(result),),
+        picture=Picture(draw=partial(draw_marks, result), width=9.0, height=5.2),
     )
 
 
-def _property_table(found: Sequence[Properties]) -> TableBlock:
+def _property_table(result: Sequence[Properties]) -> TableBlock:
     return TableBlock(
         columns=("family", "stages", "order", *MARKS),
         rows=tuple(
             (one.family, one.stages, one.order, *("yes" if one.marks[name] else "no" for name in MARKS))
-            for one in found
+            for one in result
         ),
         formats={"stages": "d", "order": "d"},
     )
 
 
-def _mark_check(name: str, found: Sequence[Properties]) -> Comparison:
+def _mark_check(name: str, result: Sequence[Properties]) -> Comparison:
     """Return the check of the marks of one row for every family and number of stages."""
     agreeing, others = 0, []
     for family, (_, _, column) in FAMILIES.items():
         expected = column in MARKS[name]
-        members = [one for one in found if one.family == family]
+        members = [one for one in result if one.family == family]
         differing = [one.stages for one in members if one.marks[name] != expected]
         agreeing += len(members) - len(differing)
         if differing:
             others.append(f"{family} with {_listed(differing)} {'is not' if expected else 'is'}")
-    total = sum(one.family in FAMILIES for one in found)
+    total = sum(one.family in FAMILIES for one in result)
     return Comparison(
         claim=f"{_joined(MARKS[name])} methods are {name}" + (", the others are not." if len(MARKS[name]) < 4 else "."),
         measured=f"So it is for {agreeing} of {total} tableaux"
@@ -139,8 +139,8 @@ def _mark_check(name: str, found: Sequence[Properties]) -> Comparison:
     )
 
 
-def _collocation_check(found: Sequence[Properties]) -> Comparison:
-    members = [one for one in found if one.family == "SC"]
+def _collocation_check(result: Sequence[Properties]) -> Comparison:
+    members = [one for one in result if one.family == "SC"]
     named = {name: [one.stages for one in members if one.marks[name]] for name in MARKS}
     unstable = [one.stages for one in members if not one.marks["A-stable"]]
     orders = ", ".join(str(one.order) for one in members)
@@ -153,9 +153,9 @@ def _collocation_check(found: Sequence[Properties]) -> Comparison:
     )
 
 
-def _stability_check(found: Sequence[Properties]) -> Comparison:
+def _stability_check(result: Sequence[Properties]) -> Comparison:
     svi, sc = (
-        [one.stages for one in found if one.family == name and one.marks["A-stable"]] for name in ("Gauss", "SC")
+        [one.stages for one in result if one.family == name and one.marks["A-stable"]] for name in ("Gauss", "SC")
     )
     return Comparison(
         claim="SVI shows better stability than Chebyshev collocation methods when using large time-steps (section 5).",
@@ -177,11 +177,11 @@ def _joined(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
-def draw_marks(found: Sequence[Properties], figure: Figure) -> None:
+def draw_marks(result: Sequence[Properties], figure: Figure) -> None:
     """Draw a panel for each property: families down, stages across, a filled square where it holds."""
-    families = list(dict.fromkeys(one.family for one in found))
+    families = list(dict.fromkeys(one.family for one in result))
     for axes, name in zip(panels(figure, 2, 2), MARKS, strict=True):
-        for one in found:
+        for one in result:
             color = COLORS["SRK"] if one.marks[name] else "#eeeeee"
             axes.add_patch(_square(one.stages, families.index(one.family), color))
         axes.set(xlim=(0.5, MOST_STAGES + 0.5), ylim=(len(families) - 0.5, -0.5), title=name)

@@ -146,12 +146,12 @@ def _entries_table(number: int, printed: Exact, computed: Tableau) -> TableBlock
     abscissae, rows = _rows(number)
     texts = [text.replace("v", "w'") for _, text in _labelled(rows[:-1], rows[-1], abscissae)]
     values = [_number(value) for _, value in _labelled(*printed)]
-    found = list(_labelled(computed.A, computed.b, computed.c))
+    result = list(_labelled(computed.A, computed.b, computed.c))
     return TableBlock(
         columns=("entry", "as printed", "its value", "by (23)", "difference"),
         rows=tuple(
             (label, f"{text}", float(value), float(exact), float(abs(value - exact)))
-            for text, value, (label, exact) in zip(texts, values, found, strict=True)
+            for text, value, (label, exact) in zip(texts, values, result, strict=True)
         ),
         formats={"its value": ".15f", "by (23)": ".15f", "difference": ".1e"},
     )

@@ -90,14 +90,14 @@ def collocation_step(f: Field, start: Array, h: Any, c: Sequence[Any]) -> Array:
     """Return the step (22): u(t0 + h x) = start + sum_k g_k x^k with u' = f(u) at the points."""
     powers = np.arange(1, len(c) + 1)
     x = np.array(c, dtype=object)[:, None]
-    values, slopes = x**powers, powers * x ** (powers - 1)
-    inverse = np.array(mp.inverse(mp.matrix(slopes.tolist())).tolist(), dtype=object)
+    values, derivatives = x**powers, powers * x ** (powers - 1)
+    inverse = np.array(mp.inverse(mp.matrix(derivatives.tolist())).tolist(), dtype=object)
 
     def step(g: Array) -> Array:
         return np.array(inverse @ np.array([f(start + point) * h for point in values @ g]))
 
-    found: Array = fixed_point(step, np.full((len(c), len(start)), mp.zero, dtype=object))
-    return np.array(start + found.sum(axis=0))
+    result: Array = fixed_point(step, np.full((len(c), len(start)), mp.zero, dtype=object))
+    return np.array(start + result.sum(axis=0))
 
 
 def tableau_step(f: Field, start: Array, h: Any, tableau: Tableau) -> Array:
@@ -149,9 +149,9 @@ def _compiled_difference(family: str, name: str) -> float:
     method = RungeKutta(collocation_tableau(c, f"{family.replace(' ', '-')}:{COMPILED_STAGES}"))
     stepper = quick_stepper(name, method)
     q, p = np.split(start, 2)
-    found = np.concatenate(stepper.step(q, p, float(STEP)))
+    result = np.concatenate(stepper.step(q, p, float(STEP)))
     exact = collocation_step(FIELDS[name], np.array([mp.mpf(x) for x in start]), mp.mpf(float(STEP)), c)
-    return float(np.abs(found - exact.astype(float)).max())
+    return float(np.abs(result - exact.astype(float)).max())
 
 
 def _tableaux() -> list[tuple[str, Tableau]]:

@@ -42,10 +42,10 @@ __all__ = [
     "cell",
     "errors",
     "exact_steps",
+    "fitted_order",
     "quadrature_error",
     "quick_stepper",
     "rate",
-    "slope",
 ]
 
 Array = NDArray[np.float64]
@@ -125,8 +125,8 @@ def exact_steps(name: str, h: float) -> tuple[ExactStep, ...]:
 @lru_cache(maxsize=4096)
 def errors(name: str, method: Method, h: float) -> MapErrors:
     """Return the errors of one step of a method, the largest over the starts."""
-    found = [_errors(quick_stepper(name, method), exact, h) for exact in exact_steps(name, h)]
-    worst = np.max([(error.action, error.legendre, error.map) for error in found], axis=0)
+    result = [_errors(quick_stepper(name, method), exact, h) for exact in exact_steps(name, h)]
+    worst = np.max([(error.action, error.legendre, error.map) for error in result], axis=0)
     return MapErrors(*map(float, worst))
 
 
@@ -174,7 +174,7 @@ def _along(name: str, exact: ExactStep, h: float, rule: Quadrature) -> Array:
     return np.array(values)
 
 
-def slope(h: Sequence[float], error: Sequence[float]) -> float:
+def fitted_order(h: Sequence[float], error: Sequence[float]) -> float:
     """Return the exponent r of error = C h^r at the smallest steps above the plateau; NaN if there are few."""
     seen = [(x, y) for x, y in zip(h, error, strict=True) if y > PLATEAU]
     if len(seen) < SMALLEST:

@@ -33,7 +33,7 @@ from scvi_codegen.reproduce.theorems.convergence import (
     TITLES,
     cell,
     errors,
-    slope,
+    fitted_order,
 )
 from scvi_codegen.reproduce.theorems.pictures import Panel, Series, draw_panels
 
@@ -76,8 +76,8 @@ class Order:
 
 def _order(name: str, label: str, method: SCVI | SVI) -> Order:
     s = method.degree
-    found = [errors(name, method, h) for h in STEPS[name]]
-    measured = {key: slope(STEPS[name], [getattr(error, key) for error in found]) - 1 for key in QUANTITIES}
+    result = [errors(name, method, h) for h in STEPS[name]]
+    measured = {key: fitted_order(STEPS[name], [getattr(error, key) for error in result]) - 1 for key in QUANTITIES}
     return Order(name, label, s, SpectralCollocation(s).tableau.order, method.rule.order, **measured)
 
 
@@ -194,7 +194,7 @@ def _run(_: Mapping[str, Result]) -> Result:
 
 def _body(orders: list[Order]) -> tuple[Paragraph | Formula, ...]:
     galerkin = [order for order in orders if order.label == f"{GALERKIN}, {CURTIS}"]
-    found = ", ".join(f"{o.map:.2f} for s = {o.degree}, q = {o.q} ({o.expected})" for o in galerkin)
+    result = ", ".join(f"{o.map:.2f} for s = {o.degree}, q = {o.q} ({o.expected})" for o in galerkin)
     h = sympy.Symbol("h")
     third = sympy.Symbol("q'''(0)")
     return (
@@ -212,7 +212,7 @@ def _body(orders: list[Order]) -> tuple[Paragraph | Formula, ...]:
             "In the table the order expected is min(2s, q) for SCVI. For SVI it is min(2s, q, 2(q - s + 1)): the "
             "quadrature must also resolve the stationarity conditions, in which the variation has degree s and becomes "
             "no smoother with h. Gauss and Lobatto rules of s points or more do; with Clenshaw-Curtis rules the order "
-            f"of the map on Kepler's problem is {found}; the order expected is in parentheses."
+            f"of the map on Kepler's problem is {result}; the order expected is in parentheses."
         ),
     )
 

@@ -47,12 +47,12 @@ def _series(name: str, label: str, key: str) -> list[float]:
 
 
 def _rates() -> Rates:
-    found = {}
+    result = {}
     for name in TITLES:
         for label in (GALERKIN, FULL, PRINTED):
             for key in QUANTITIES if label != PRINTED else ("map",):
-                found[name, label, key] = rate(DEGREES, _series(name, label, key))
-    return found
+                result[name, label, key] = rate(DEGREES, _series(name, label, key))
+    return result
 
 
 def _bases(rates: Rates, label: str) -> str:
@@ -111,7 +111,7 @@ def _rate_picture() -> Picture:
 
 def _run_rates(_: Mapping[str, Result]) -> Result:
     rates = _rates()
-    rows = tuple((TITLES[name], label, QUANTITIES[key], *found) for (name, label, key), found in rates.items())
+    rows = tuple((TITLES[name], label, QUANTITIES[key], *result) for (name, label, key), result in rates.items())
     series = tuple(
         (TITLES[name], label, QUANTITIES[key], *map(cell, _series(name, label, key))) for name, label, key in rates
     )

@@ -12,17 +12,17 @@ import numpy as np
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.given.counts import checked_count
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.compilers import compiler_title
 from scvi_codegen.native.fingerprint import fingerprint
 from scvi_codegen.native.flags import check_flags
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source, check_interface
-from scvi_codegen.runtime.goal import Goal
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.counts import checked_count
 from scvi_codegen.version import __version__
 
 __all__ = ["MANIFEST", "Build", "Manifest", "read_manifest", "write_manifest"]
@@ -88,7 +88,7 @@ class Manifest:
     t: float
     save_every: int
     steps: int | None
-    goal: Goal | None = None
+    plan: StepPlan | None = None
     rows: int
     model: str | None
     certificate: Any
@@ -97,7 +97,7 @@ class Manifest:
 
     def stepper(self) -> Stepper:
         """Return the integrator, compiled or loaded from the cache."""
-        controlled = self.source if self.goal else None
+        controlled = self.source if self.plan else None
         return Stepper(
             self.source,
             self.interface,
@@ -146,18 +146,18 @@ class Manifest:
             raise ValueError(f"{len(self.parameters)} parameters where {len(self.interface.parameters)} are wanted")
         for name, value in zip(self.interface.parameters, self.parameters, strict=True):
             checked_number(value, name)
-        if (self.goal is None) == (self.steps is None) or (self.goal is None) == (self.h == 0.0):
+        if (self.plan is None) == (self.steps is None) or (self.plan is None) == (self.h == 0.0):
             raise ValueError("a run has steps of h, or a goal")
-        if self.goal and not (np.isfinite([self.goal.t_end, self.goal.tau]).all() and 0 <= self.goal.tolerance < 1):
-            raise ValueError(f"{self.goal} is not one")
+        if self.plan and not (np.isfinite([self.plan.t_end, self.plan.tau]).all() and 0 <= self.plan.tolerance < 1):
+            raise ValueError(f"{self.plan} is not one")
 
     def to_json(self) -> str:
         """Return a JSON text for :meth:`from_json`, with the C code line by line."""
         document = {
-            "format": FORMAT_TO_A_TIME if self.goal else FORMAT,
+            "format": FORMAT_TO_A_TIME if self.plan else FORMAT,
             **{field: getattr(self, field) for field in PLAIN},
             "options": None if self.options is None else asdict(self.options),
-            **({"goal": asdict(self.goal)} if self.goal else {}),
+            **({"plan": asdict(self.plan)} if self.plan else {}),
             "builds": [asdict(build) for build in self.builds],
             "interface": json.loads(self.interface.to_json()),
             "source": self.source.to_record(),
@@ -175,11 +175,11 @@ class Manifest:
             document["save_every"] = document["every"]
             document["model"] = document["model"] and re.sub(r"(?m)^every\b", "save_every", document["model"])
         plain = {field: document[field] for field in PLAIN}
-        options, goal = document["options"], document["goal"] if document["format"] == FORMAT_TO_A_TIME else None
+        options, plan = document["options"], document["plan"] if document["format"] == FORMAT_TO_A_TIME else None
         found = cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
-            goal=None if goal is None else Goal(**goal),
+            plan=None if plan is None else StepPlan(**plan),
             builds=tuple(Build(**build) for build in document["builds"]),
             interface=Interface.from_json(json.dumps(document["interface"])),
             source=Source.from_record(document["source"]),

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from scvi_codegen.display.summary import LONGEST, clipped
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
 from scvi_codegen.files.labelled import checked_units
-from scvi_codegen.given.kinds import MAPPING, PATH, takes
+from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
-from scvi_codegen.runtime.kept_states import checked_row
-from scvi_codegen.runtime.portions import first_length
 from scvi_codegen.runtime.quantities import quantities
+from scvi_codegen.runtime.run_loop import first_step_size
+from scvi_codegen.runtime.saved_states import checked_row
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
     from scvi_codegen.runtime.run import Run
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 PIECES_IN_MEMORY = 2
 
 
-@takes(folder=PATH)
+@checks_arguments(folder=PATH)
 def load_run(folder: str | os.PathLike[str]) -> RecordedRun:
     """Return the run recorded in a folder, as far as it goes; another process may still be recording it.
 
@@ -74,8 +74,8 @@ class RecordedRun:
         return (len(self._paths) - 1) * self.manifest.rows + len(self._last)
 
     def __repr__(self) -> str:
-        goal = self.manifest.goal
-        end = f"t = {self.t[-1]:g} of {goal.t_end:g}" if goal else f"step {self.steps} of {self.manifest.steps}"
+        plan = self.manifest.plan
+        end = f"t = {self.t[-1]:g} of {plan.t_end:g}" if plan else f"step {self.steps} of {self.manifest.steps}"
         return clipped(f"<RecordedRun '{self.folder}': {len(self)} states, {end}>", LONGEST)
 
     @overload
@@ -106,14 +106,14 @@ class RecordedRun:
     @property
     def finished(self) -> bool:
         """Return whether the run has reached its end."""
-        goal, steps = self.manifest.goal, self.manifest.steps
-        return bool(goal and self.t[-1] == goal.t_end) if steps is None else self.steps >= steps
+        plan, steps = self.manifest.plan, self.manifest.steps
+        return bool(plan and self.t[-1] == plan.t_end) if steps is None else self.steps >= steps
 
     @cached_property
     def h(self) -> float:
         """Step size; for adaptive steps as of :class:`Trajectory`."""
-        goal = self.manifest.goal
-        return first_length(goal, self.t[:2]) if goal else self.manifest.h
+        plan = self.manifest.plan
+        return first_step_size(plan, self.t[:2]) if plan else self.manifest.h
 
     def resumed(self) -> Run:
         """Return the run at its last checkpoint, to continue in memory; :func:`resume_run` continues in the folder.
@@ -121,18 +121,18 @@ class RecordedRun:
         Raises:
             BuildError: if there is no C compiler.
         """
-        manifest, goal = self.manifest, self.manifest.goal
+        manifest, plan = self.manifest, self.manifest.plan
         return self.stepper.from_checkpoint(
             self._last.memory,
-            t_end=goal.t_end if goal else None,
-            tolerance=(goal.tolerance or None) if goal else None,
-            h=(goal.tau or None) if goal else None,
+            t_end=plan.t_end if plan else None,
+            tolerance=(plan.tolerance or None) if plan else None,
+            h=(plan.tau or None) if plan else None,
             parameters=manifest.parameters,
             options=manifest.options,
         )
 
     @cached_property
-    def _standing(self) -> Run:
+    def _checkpointed_run(self) -> Run:
         """The run at its last checkpoint, for inspection only."""
         return self.resumed()
 
@@ -215,7 +215,7 @@ class RecordedRun:
             units=checked_units(units),
         )
 
-    @takes(path=PATH, units=MAPPING)
+    @checks_arguments(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
         """Write ``.npz``, ``.csv``, ``.h5`` or ``.zarr`` in parts; otherwise as :meth:`Trajectory.save`.
 
@@ -227,7 +227,7 @@ class RecordedRun:
 
     def _trajectory(self, piece: tuple[Any, ...], rows: NDArray[np.int64]) -> Trajectory:
         t, q, p, iterations = piece
-        manifest, run = self.manifest, self._standing
+        manifest, run = self.manifest, self._checkpointed_run
         taken = manifest.save_every * rows
         transformed = bool(manifest.interface.energy_parameter)
         step_error, worst_step_time = run.step_error
@@ -238,7 +238,7 @@ class RecordedRun:
             iterations=iterations,
             step_sizes=self._lengths(t, rows),
             h=self.h,
-            goal=manifest.goal,
+            plan=manifest.plan,
             steps=run.steps,
             rejected_steps=run.rejected_steps,
             step_error=step_error,
@@ -251,7 +251,7 @@ class RecordedRun:
 
     def _lengths(self, t: Array, rows: NDArray[np.int64]) -> Array:
         """Return (n,) sizes of the steps after the states; NaN for an adaptive step whose end is not saved."""
-        if self.manifest.goal is None:
+        if self.manifest.plan is None:
             return np.broadcast_to(self.manifest.h, t.shape)
         found = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
         return np.append(found, np.nan)[: len(t)]

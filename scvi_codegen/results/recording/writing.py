@@ -17,27 +17,27 @@ import numpy as np
 from scvi_codegen.errors import RecordingError, RecordingWarning, StateError, StepFailedError, warn
 from scvi_codegen.files.atomic import sync_folder
 from scvi_codegen.files.export import Piece, chunk_rows
-from scvi_codegen.given.counts import checked_count
-from scvi_codegen.given.kinds import FUNCTION, PATH, REAL, TEXT, of, takes
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.flags import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
-from scvi_codegen.runtime.goal import Goal
-from scvi_codegen.runtime.portions import record
 from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.run_loop import record
+from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
+from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["record_run", "resume_run"]
 
 LOCK = ".lock"
 CHECKPOINT_SECONDS = 10.0
-SHORTEST_PORTION, LONGEST_PORTION = 0.01, 0.1
+SHORTEST_CHUNK_SECONDS, LONGEST_CHUNK_SECONDS = 0.01, 0.1
 """Bounds of the duration of a chunk in seconds, which limits the loss when a process is killed."""
 
 
-@takes(
+@checks_arguments(
     run=of("a Run, as stepper.start gives it", Run),
     folder=PATH,
     checkpoint_seconds=REAL,
@@ -99,17 +99,17 @@ def record_run(
         t=run.t,
         save_every=checked_count(save_every, "save_every", least=1),
         steps=_checked_steps(run, steps),
-        goal=run.goal,
+        plan=run.plan,
         rows=chunk_rows(run.stepper.dimension) if rows is None else checked_count(rows, "rows", least=1),
         model=model,
         certificate=_certificate(certificate),
         builds=(Build.of(run.stepper, 0),),
     )
-    recorder = _Recorder(target, manifest, run, *_pace(checkpoint_seconds, checkpoint_steps))
-    with recorder.telling_where_it_stands():
+    recorder = _Recorder(target, manifest, run, *_checked_checkpoints(checkpoint_seconds, checkpoint_steps))
+    with recorder.reporting_recovery():
         _prepare(target)
     with _locked(target), run.alone():
-        with recorder.telling_where_it_stands():
+        with recorder.reporting_recovery():
             _clear(target)
             recorder.keep(_piece(record(run, 0), 0))
             recorder.write()
@@ -119,7 +119,7 @@ def record_run(
     return load_run(target)
 
 
-@takes(folder=PATH, checkpoint_seconds=REAL, progress=FUNCTION, stop=FUNCTION)
+@checks_arguments(folder=PATH, checkpoint_seconds=REAL, progress=FUNCTION, stop=FUNCTION)
 def resume_run(
     folder: str | os.PathLike[str],
     *,
@@ -159,10 +159,10 @@ def resume_run(
         continued = manifest.continued_by(Build.of(run.stepper, run.steps))
         if len(continued.builds) > len(manifest.builds):
             _warn_of_another_build(manifest.builds[-1], continued.builds[-1])
-        continued, run.goal = _further(continued, run, steps, t_end)
-        recorder = _Recorder(target, continued, run, *_pace(checkpoint_seconds, checkpoint_steps))
-        recorder.go_on_from(target)
-        with recorder.telling_where_it_stands():
+        continued, run.plan = _extended(continued, run, steps, t_end)
+        recorder = _Recorder(target, continued, run, *_checked_checkpoints(checkpoint_seconds, checkpoint_steps))
+        recorder.load_last_file(target)
+        with recorder.reporting_recovery():
             _remove(unfinished(target))
             write_manifest(target, continued)  # fails early if the folder cannot be written
         recorder.advance(progress, stop)
@@ -178,7 +178,7 @@ class _Recorder:
         self.number, self.written, self.written_t = 0, -1, run.t
         self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.checkpoint())
 
-    def go_on_from(self, folder: Path) -> None:
+    def load_last_file(self, folder: Path) -> None:
         """Load the last file in order to complete it."""
         paths = chunk_paths(folder)
         chunk = read_chunk(paths[-1])
@@ -190,7 +190,7 @@ class _Recorder:
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
         """Advance to the end; write a checkpoint also on any exception."""
         try:
-            for done in self._portions():
+            for done in self._advance_in_chunks():
                 if progress is not None:
                     progress(done)
                 if stop is not None and stop():
@@ -202,10 +202,10 @@ class _Recorder:
             raise
         self.checkpoint()
 
-    def _portions(self) -> Iterator[int]:
+    def _advance_in_chunks(self) -> Iterator[int]:
         """Advance in chunks, write checkpoints when due, and yield the number of completed steps."""
         manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
-        wanted = min(LONGEST_PORTION, max(SHORTEST_PORTION, self.seconds))
+        wanted = min(LONGEST_CHUNK_SECONDS, max(SHORTEST_CHUNK_SECONDS, self.seconds))
         while not manifest.reached(run):
             began = time.monotonic()
             self._advance(min(portion, self._most_steps()))
@@ -249,7 +249,7 @@ class _Recorder:
         Raises:
             RecordingError: if that fails; the message reports the last step in the folder.
         """
-        with self.telling_where_it_stands():
+        with self.reporting_recovery():
             self.write()
 
     def write(self) -> None:
@@ -265,16 +265,16 @@ class _Recorder:
         self.number, self.kept = self.number + full, ([] if full else [piece], step, reached, memory)
 
     @contextmanager
-    def telling_where_it_stands(self) -> Iterator[None]:
+    def reporting_recovery(self) -> Iterator[None]:
         """Convert system errors to :class:`RecordingError` with the state of the folder and a remedy."""
         try:
             yield
         except RecordingError:
             raise
         except OSError as error:
-            raise RecordingError(self._where_it_stands(error)) from error
+            raise RecordingError(self._recovery_message(error)) from error
 
-    def _where_it_stands(self, error: OSError) -> str:
+    def _recovery_message(self, error: OSError) -> str:
         problem = f"'{self.folder}' cannot be written: {error.strerror or error}"
         if self.written < 0:
             return f"{problem}. Nothing was recorded"
@@ -298,25 +298,25 @@ def _check_inputs(run: Run) -> None:
 
 def _checked_steps(run: Run, steps: int | None) -> int | None:
     """Return the number of fixed steps; ``None`` for adaptive steps."""
-    if run.goal is None:
+    if run.plan is None:
         return checked_count(steps, "steps", least=0)
     if steps is not None:
-        raise StateError(f"adaptive steps end at t_end={run.goal.t_end:g}: omit steps={steps}")
+        raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}")
     return None
 
 
-def _further(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, Goal | None]:
+def _extended(manifest: Manifest, run: Run, steps: int | None, t_end: float | None) -> tuple[Manifest, StepPlan | None]:
     """Return the manifest and the step plan of a run with a new end."""
-    if run.goal is None:
+    if run.plan is None:
         if t_end is not None:
             raise StateError(f"the run has fixed steps h = {run.h:g}: give steps instead of t_end")
         wanted = manifest.steps if steps is None else steps
         return replace(manifest, steps=checked_count(wanted, "steps", least=0)), None
     _checked_steps(run, steps)
-    goal = run.goal if t_end is None else replace(run.goal, t_end=checked_number(t_end, "t_end"))
-    if (goal.t_end - run.t) * (run.goal.t_end - manifest.t) < 0.0:
-        raise StateError(f"the run is at t = {run.t:g}, already beyond t_end = {goal.t_end:g}: give a later t_end")
-    return replace(manifest, goal=goal), goal
+    plan = run.plan if t_end is None else replace(run.plan, t_end=checked_number(t_end, "t_end"))
+    if (plan.t_end - run.t) * (run.plan.t_end - manifest.t) < 0.0:
+        raise StateError(f"the run is at t = {run.t:g}, already beyond t_end = {plan.t_end:g}: give a later t_end")
+    return replace(manifest, plan=plan), plan
 
 
 def _piece(trajectory: Trajectory, first: int) -> Piece:
@@ -324,21 +324,21 @@ def _piece(trajectory: Trajectory, first: int) -> Piece:
     return trajectory.t[first:], trajectory.q[first:], trajectory.p[first:], trajectory.iterations[first:]
 
 
-def _pace(seconds: float, steps: int | None) -> tuple[float, int | None]:
+def _checked_checkpoints(seconds: float, steps: int | None) -> tuple[float, int | None]:
     if not seconds >= 0.0:
         raise StateError(f"checkpoint_seconds must be at least 0, not {seconds!r}")
     return seconds, None if steps is None else checked_count(steps, "checkpoint_steps", least=1)
 
 
-def _certificate(given: Any) -> Any:
+def _certificate(argument: Any) -> Any:
     """Return a certificate as JSON data."""
-    if isinstance(given, str | os.PathLike):
+    if isinstance(argument, str | os.PathLike):
         try:
-            return json.loads(Path(given).read_text(encoding="utf-8"))
+            return json.loads(Path(argument).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise StateError(f"the certificate '{given}' cannot be read as JSON: {error}") from error
+            raise StateError(f"the certificate '{argument}' cannot be read as JSON: {error}") from error
     try:
-        return json.loads(given.to_json() if hasattr(given, "to_json") else json.dumps(given))
+        return json.loads(argument.to_json() if hasattr(argument, "to_json") else json.dumps(argument))
     except (TypeError, ValueError) as error:
         raise StateError(f"the certificate is not JSON data: {error}") from error
 

@@ -17,25 +17,25 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
-from scvi_codegen.given.kinds import MAPPING, of, takes
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.lowering.indexed import one_coordinate
-from scvi_codegen.mechanics.indexed.expansion import unroll_sums
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
+from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.runtime.accuracy import unwarned
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.indexed_interface import read_arrays
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.validation.argument_types import MAPPING, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.indexed.small import SmallStepper, small_start
 from scvi_codegen.verification.indexed.whole import WholeStart, whole_checks
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
-from scvi_codegen.verification.subject import State, Subject
+from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
 __all__ = ["verify_indexed"]
 
@@ -44,8 +44,8 @@ ROUNDINGS = 16.0 * SMALL_STEPS
 """Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
-@takes(system=INDEXED, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
-@unwarned()
+@checks_arguments(system=INDEXED, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
+@without_accuracy_warnings()
 def verify_indexed(
     system: IndexedSystem,
     method: Method | str,
@@ -88,19 +88,19 @@ def verify_indexed(
     run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
     arrays = read_arrays(stepper.interface, q, parameters, tables)
     start = WholeStart(system, chosen, stepper, arrays, run.p, run.h, run.t)
-    subject = _subject(start)
+    tested = _subject(start)
     checks = (
         *checked(
             "unrolled system",
             f"{SMALL_STEPS} steps equal those of the unrolled system",
-            partial(_beside, start, subject),
+            partial(_compared_with_unrolled, start, tested),
         ),
-        *step_checks(subject),
-        *structure_checks(subject),
-        *convergence_checks(subject),
+        *step_checks(tested),
+        *structure_checks(tested),
+        *convergence_checks(tested),
         *whole_checks(start),
     )
-    given = subject.given
+    given = tested.given
     return issued(
         stepper.source.files,
         title=stepper.interface.title,
@@ -117,7 +117,7 @@ def verify_indexed(
     )
 
 
-def _subject(start: WholeStart) -> Subject:
+def _subject(start: WholeStart) -> SystemUnderTest:
     """Return the loops on a few indices as an integrator of the unrolled system."""
     small = small_start(start.stepper.interface, start.arrays, start.p)
     given = small.given
@@ -126,14 +126,14 @@ def _subject(start: WholeStart) -> Subject:
     written = unroll_sums(start.system, given.sizes, tables=given.places, parameters={**numbers, **given.fields})
     q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (given.state, small.p))
     stepper = SmallStepper(start.stepper, small, written)
-    return Subject(written, start.method, cast(Stepper, stepper), None, State(q, p, start.t, start.h))
+    return SystemUnderTest(written, start.method, cast(Stepper, stepper), None, State(q, p, start.t, start.h))
 
 
-def _beside(start: WholeStart, subject: Subject) -> Finding:
+def _compared_with_unrolled(start: WholeStart, tested: SystemUnderTest) -> Finding:
     """Return the largest difference from the compiled unrolled system, in units of rounding of the first step."""
-    first = subject.states[0]
-    other = compile_stepper(subject.system, start.method, flags=start.stepper.flags)
-    run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": subject.parameters}
-    own, expected = (each.integrate(first.q, first.p, **run) for each in (subject.stepper, other))
-    apart = np.abs(np.concatenate([own.q - expected.q, own.p - expected.p], axis=1)) / subject.rounding(first)
-    return Finding(float(apart.max()), ROUNDINGS, "in units of rounding of a step")
+    first = tested.states[0]
+    other = compile_stepper(tested.system, start.method, flags=start.stepper.flags)
+    run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
+    own, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
+    difference = np.abs(np.concatenate([own.q - expected.q, own.p - expected.p], axis=1)) / tested.rounding(first)
+    return Finding(float(difference.max()), ROUNDINGS, "in units of rounding of a step")

@@ -22,9 +22,9 @@ __all__ = ["SmallStepper", "small_start"]
 
 Numbers = NDArray[np.float64]
 
-WINDOWS = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))
+CUT_SIZES = ((5, 6), (4, 4), (3, 3), (3, 2), (2, 2), (2, 1), (6, 6), (8, 8), (12, 12), (16, 16))
 """Numbers of indices of a size and of rows of a table; the first pair that is consistent and small is used."""
-FEW = 9
+MAX_COORDINATES = 9
 """Largest number of coordinates; steps in 60 digits take seconds for it."""
 
 
@@ -42,23 +42,23 @@ def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, N
     Raises:
         StateError: if no small cut is closed under the accesses of the system.
     """
-    found = None
-    for window, rows in WINDOWS:
-        start = _cut(interface, given, p, _kept(interface, given, p, window, rows))
+    result = None
+    for window, rows in CUT_SIZES:
+        start = _cut(interface, given, p, _indices_to_keep(interface, given, p, window, rows))
         try:
             check_accesses(interface, start.given.sizes, start.given.places)
         except StateError:
             continue
         count = sum(values.size for values in start.given.state.values())
-        if count <= FEW:
+        if count <= MAX_COORDINATES:
             return start
-        found = found or start
-    if found is None:
+        result = result or start
+    if result is None:
         raise StateError("no small array sizes were found at which all indices are in range")
-    return found
+    return result
 
 
-def _kept(
+def _indices_to_keep(
     interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
 ) -> dict[str, NDArray[np.int64]]:
     """Return the indices to keep for each size."""
@@ -138,9 +138,9 @@ class SmallStepper:
 
     interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
 
-    def __init__(self, stepper: IndexedStepper, start: SmallStart, written: MechanicalSystem) -> None:
-        self.stepper, self.arrays, self.written = stepper, start.given, written
-        self.defaults = [float(value) for value in written.defaults]
+    def __init__(self, stepper: IndexedStepper, start: SmallStart, unrolled: MechanicalSystem) -> None:
+        self.stepper, self.arrays, self.unrolled = stepper, start.given, unrolled
+        self.defaults = [float(value) for value in unrolled.defaults]
 
     def integrate(
         self,
@@ -211,22 +211,22 @@ class SmallStepper:
 
     def _values(self, parameters: Any) -> dict[str, Any]:
         """Return numbers and fields from the parameters of the unrolled system, by name or in order."""
-        names = [parameter.name for parameter in self.written.parameters]
+        names = [parameter.name for parameter in self.unrolled.parameters]
         given = self.defaults if parameters is None else parameters
         known = dict(given) if isinstance(given, Mapping) else dict(zip(names, given, strict=True))
-        found: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
+        result: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
         for array in self.stepper.interface.fields:
             shape = array.shape(self.arrays.sizes)
             entries = ["_".join([array.name, *map(str, place)]) for place in np.ndindex(*shape)]
-            found[array.name] = np.array([known[name] for name in entries]).reshape(shape)
-        return found
+            result[array.name] = np.array([known[name] for name in entries]).reshape(shape)
+        return result
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
-        found, start = {}, 0
+        result, start = {}, 0
         for name, values in self.arrays.state.items():
-            found[name] = np.asarray(flat)[start : start + values.size].reshape(values.shape)
+            result[name] = np.asarray(flat)[start : start + values.size].reshape(values.shape)
             start += values.size
-        return found
+        return result
 
     def _flat(self, run: IndexedRun) -> tuple[Numbers, Numbers]:
         return _joined(run.q), _joined(run.p)

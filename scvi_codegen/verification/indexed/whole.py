@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.formulas.summed import Elements
+from scvi_codegen.formulas.indexed_values import Elements
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
@@ -30,7 +30,7 @@ EPSILON = 2.0**-52
 ROUNDINGS = 64.0
 SHORT = 2.0**-60
 """Factor of h for steps whose increment is h times the rate at the start, wholly in the compensation terms."""
-NUDGE = 2.0**-30
+PERTURBATION = 2.0**-30
 """Relative change of the state by which the effect of rounding is estimated."""
 WORK, MOST_STEPS = 4_000_000, 1000
 """Number of coordinates times steps of the run, and its largest number of steps."""
@@ -83,8 +83,8 @@ def whole_checks(start: WholeStart) -> Iterator[Check]:
     yield from checked("rates", f"at {sizes} the loops give the rates of NumPy", partial(_rates, start))
     yield from checked("energies", f"at {sizes} kinetic and potential energy equal NumPy's", partial(_energies, start))
     if start.method.symmetric:
-        promise = f"at {sizes} a step with -h undoes the step with h"
-        yield from checked("reversal at full size", promise, partial(_reversal, start))
+        statement = f"at {sizes} a step with -h undoes the step with h"
+        yield from checked("reversal at full size", statement, partial(_reversal, start))
     yield from _long_run(start, sizes)
 
 
@@ -92,23 +92,27 @@ def _rates(start: WholeStart) -> Finding:
     """Return the error of (z1 - z0) / h of a very small step, with compensation, in units of rounding."""
     run, worst = start.run(start.h * SHORT), 0.0
     run.advance(1)
-    expected, nudged = _numpy_rates(start), _numpy_rates(_nudged(start))
+    expected, nudged = _numpy_rates(start), _numpy_rates(_perturbed(start))
     ends = ((start.arrays.state, run.q), (start.p, run.p))
-    for (before, after), low, slopes, others in zip(ends, run._compensation, expected, nudged, strict=True):
-        size = max((float(np.abs(each).max(initial=0.0)) for each in slopes.values()), default=0.0)
-        noise = max((float(np.abs(each - others[name]).max(initial=0.0)) for name, each in slopes.items()), default=0.0)
-        unit = EPSILON * (size + noise / NUDGE) or 1.0
-        for name, exact in slopes.items():
+    for (before, after), low, derivatives, others in zip(ends, run._compensation, expected, nudged, strict=True):
+        size = max((float(np.abs(each).max(initial=0.0)) for each in derivatives.values()), default=0.0)
+        noise = max(
+            (float(np.abs(each - others[name]).max(initial=0.0)) for name, each in derivatives.items()), default=0.0
+        )
+        unit = EPSILON * (size + noise / PERTURBATION) or 1.0
+        for name, exact in derivatives.items():
             rate = ((after[name] - before[name]) + low[name]) / run.h
             worst = max(worst, float(np.abs(rate - exact).max(initial=0.0)) / unit)
     return Finding(worst, ROUNDINGS, "in units of rounding")
 
 
-def _nudged(start: WholeStart) -> WholeStart:
+def _perturbed(start: WholeStart) -> WholeStart:
     """Return the start with every number of the state perturbed."""
 
     def moved(state: Mapping[str, Numbers]) -> dict[str, Numbers]:
-        return {name: x * (1 + NUDGE * np.cos(1.0 + np.arange(x.size)).reshape(x.shape)) for name, x in state.items()}
+        return {
+            name: x * (1 + PERTURBATION * np.cos(1.0 + np.arange(x.size)).reshape(x.shape)) for name, x in state.items()
+        }
 
     return replace(start, arrays=replace(start.arrays, state=moved(start.arrays.state)), p=moved(start.p))
 
@@ -116,21 +120,23 @@ def _nudged(start: WholeStart) -> WholeStart:
 def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
     """Return dq/dt and dp/dt of every coordinate, computed with NumPy."""
     system = start.system
-    found = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
-    for term, slopes in system.kernels:
+    result = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
+    for term, derivatives in system.kernels:
         at = start.elements(term.loops)
         for slot, access in term.slots:
-            if slot.name in slopes:
-                np.add.at(found[access.array.name], at.of(access), _values(start, at, slopes[slot.name], term.slots))
+            if slot.name in derivatives:
+                np.add.at(
+                    result[access.array.name], at.of(access), _values(start, at, derivatives[slot.name], term.slots)
+                )
     for force in system.forces:
         at = start.elements(force.loops)
         for access, formula in force.targets:
-            np.add.at(found[access.array.name], at.of(access), _values(start, at, formula, force.slots))
+            np.add.at(result[access.array.name], at.of(access), _values(start, at, formula, force.slots))
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
-        return {q.name: -found[p.name] for q, p in pairs}, {q.name: found[q.name] for q, _ in pairs}
+        return {q.name: -result[p.name] for q, p in pairs}, {q.name: result[q.name] for q, _ in pairs}
     masses = _masses(start)
-    return {name: p / masses[name] for name, p in start.p.items()}, found
+    return {name: p / masses[name] for name, p in start.p.items()}, result
 
 
 def _masses(start: WholeStart) -> dict[str, Numbers]:
@@ -171,9 +177,9 @@ def _reversal(start: WholeStart) -> Finding:
     lengths = [np.abs(each) for each in (*start.arrays.state.values(), *run.q.values())]
     lengths += [np.abs(run.h * p * inverse[name]) for state in (start.p, run.p) for name, p in state.items()]
     size = max(float(each.max(initial=0.0)) for each in lengths) or 1.0
-    apart = [np.abs(back.q[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
-    apart += [np.abs(run.h * inverse[name] * (back.p[name] - p)).max(initial=0.0) for name, p in start.p.items()]
-    return Finding(float(max(apart)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
+    difference = [np.abs(back.q[name] - q).max(initial=0.0) for name, q in start.arrays.state.items()]
+    difference += [np.abs(run.h * inverse[name] * (back.p[name] - p)).max(initial=0.0) for name, p in start.p.items()]
+    return Finding(float(max(difference)) / size, ROUNDINGS * EPSILON, "relative to the largest coordinate")
 
 
 def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
@@ -192,15 +198,15 @@ def _long_run(start: WholeStart, sizes: str) -> Iterator[Check]:
     change = abs(run.energy - before[2]) / (abs(before[0]) + abs(before[1]) or 1.0)
     if not start.system.changes_energy:
         if start.method.symplectic and run.step_error < RESOLVED:
-            promise = f"at {sizes} conserved up to round-off"
-            yield from checked("energy", promise, partial(Finding, float(change), walk, f"relative, {where}"))
+            statement = f"at {sizes} conserved up to round-off"
+            yield from checked("energy", statement, partial(Finding, float(change), walk, f"relative, {where}"))
         else:
             yield information("energy", f"at {sizes} relative change", float(change), where)
     if start.method.symplectic:
         for k, name in enumerate(start.stepper.momentum_map_names):
             off = float(abs(run.momentum_maps[k] - maps[k])) / (terms or 1.0)
-            promise = f"at {sizes} conserved to round-off (symmetry)"
-            yield from checked(name, promise, partial(Finding, off, walk, f"relative to its terms, {where}"))
+            statement = f"at {sizes} conserved to round-off (symmetry)"
+            yield from checked(name, statement, partial(Finding, off, walk, f"relative to its terms, {where}"))
 
 
 def _fail(failure: StepFailedError) -> None:

@@ -1,0 +1,125 @@
+"""Comparison of all contenders on one case: compile all, then time them in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from scvi_codegen.benchmark.cases import STATES, Array, Case, case
+from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES, constrained_contenders
+from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
+from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
+from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
+from scvi_codegen.benchmark.forced_cases import FORCED_CASES
+from scvi_codegen.benchmark.measuring import PEER_ERRORS, measure
+from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.references import Reference, reference
+from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+
+__all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_constrained", "run_ensemble", "run_forced"]
+
+ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
+"""Names of the cases that are run as ensembles."""
+
+TRAJECTORIES = 64
+Makers = dict[str, Callable[[], Iterable[Contender]]]
+"""Functions that return contenders, by name of the peer."""
+
+ReferenceOf = Callable[[Case, Array | None], Reference]
+"""Function that returns the final states of a case, from its velocities or from momenta."""
+
+
+@without_accuracy_warnings()
+def run_case(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare single trajectories of this package and all peers."""
+    return _race_alone(case(name), plan, report_activity)
+
+
+@without_accuracy_warnings()
+def run_forced(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare single trajectories with friction and driving forces."""
+    return _race_alone(FORCED_CASES[name](), plan, report_activity)
+
+
+def _race_alone(chosen: Case, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    chosen = replace(chosen, span=chosen.span * plan.share)
+    ours = partial(our_contenders, chosen, methods=plan.methods, quick=plan.quick)
+    return race(chosen, ours, _makers(chosen, plan), plan, report_activity)
+
+
+def _makers(chosen: Case, plan: Plan) -> Makers:
+    return {peer: partial(peer_contenders, peer, chosen, quick=plan.quick) for peer in plan.peers}
+
+
+@without_accuracy_warnings()
+def run_constrained(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare rods as constraints in this package with peers, and this package, in the angles of the rods."""
+    both = CONSTRAINED_CASES[name]().shortened(plan.share)
+    ours = partial(constrained_contenders, both, quick=plan.quick)
+    return race(both.angles, ours, _makers(both.angles, plan), plan, report_activity)
+
+
+@without_accuracy_warnings()
+def run_ensemble(name: str, plan: Plan, report_activity: ReportActivity) -> CaseResult:
+    """Compare ensembles of 64 trajectories in one thread; heyoka in its batch mode.
+
+    They start from the eight states of the case repeatedly, so that eight references suffice.
+    """
+    few = case(name)
+    few = replace(few, name=f"ensemble:{name}", span=few.span * plan.share)
+    copies = 2 if plan.quick else TRAJECTORIES // STATES
+    many = replace(few, q=np.tile(few.q, (copies, 1)), velocity=np.tile(few.velocity, (copies, 1)))
+    makers: Makers = {"heyoka": partial(heyoka_ensembles, many, plan.quick)} if "heyoka" in plan.peers else {}
+    return race(few, partial(our_ensembles, many, quick=plan.quick), makers, plan, report_activity)
+
+
+def race(
+    chosen: Case,
+    ours: Callable[[], list[Contender]],
+    makers: Makers,
+    plan: Plan,
+    report_activity: ReportActivity,
+    ends: ReferenceOf = reference,
+) -> CaseResult:
+    """Time the contenders of this package and of peers in turn, and compare them with the reference."""
+    report_activity(f"{chosen.name}: reference")
+    exact = ends(chosen, None)
+    report_activity(f"{chosen.name}: step sizes")
+    skipped: dict[str, str] = {}
+    contenders = [*ours(), *_peer_contenders(chosen, makers, skipped, report_activity)]
+    report_activity(f"{chosen.name}: {len(contenders)} settings")
+
+    def reference_of(contender: Contender) -> Reference:
+        return exact if contender.momenta is None else ends(chosen, contender.momenta[:STATES])
+
+    result = measure(contenders, reference_of, repeats=plan.rounds)
+    return CaseResult(
+        name=chosen.name,
+        span=chosen.span,
+        dimension=chosen.dimension,
+        accuracy=exact.accuracy,
+        measurements=tuple(result),
+        skipped=skipped,
+    )
+
+
+def _peer_contenders(
+    chosen: Case, makers: Makers, skipped: dict[str, str], report_activity: ReportActivity
+) -> Iterator[Contender]:
+    for name, make in makers.items():
+        missing = missing_module(PEERS[name])
+        if missing is not None:
+            skipped[name] = f"{missing} is not installed (pip install 'scvi-codegen[bench]')"
+        elif not PEERS[name].suits(chosen):
+            skipped[name] = "not applicable to this problem"
+        else:
+            report_activity(f"{chosen.name}: compiling {name}")
+            try:
+                yield from make()
+            except PEER_ERRORS as error:
+                skipped[name] = f"{type(error).__name__}: {error}"

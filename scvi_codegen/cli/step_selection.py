@@ -1,0 +1,124 @@
+"""Step-size selection of ``scvi-codegen run``: ``--tolerance``, ``--error`` and ``--advise``."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from typing import TypeVar
+
+import click
+
+from scvi_codegen.advice.advice import Advice, Evidence, advise
+from scvi_codegen.cli.command_group import tell
+from scvi_codegen.cli.formatting import duration
+from scvi_codegen.errors import AccuracyWarning, StateError
+from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.model import Model
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.global_error import GlobalError
+from scvi_codegen.validation.counts import check_tolerance
+
+__all__ = ["model_with_adaptive_steps", "model_with_advised_step", "model_with_global_error"]
+
+AnyModel = TypeVar("AnyModel", Model, IndexedModel)
+ROUND_OFF = 2.0**-52
+"""Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""
+MAX_STEPS = 10**9
+"""Largest number of steps that is started without ``--step``: a quarter of an hour at one microsecond each."""
+
+
+def model_with_adaptive_steps(model: AnyModel, tolerance: float) -> AnyModel:
+    """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off.
+
+    Raises:
+        StateError: unless the tolerance is positive and below 1.
+    """
+    check_tolerance(tolerance)
+    if tolerance < ROUND_OFF:
+        click.echo(f"Warning: tolerance {tolerance:g} is below double precision: round-off is used instead", err=True)
+    allowed = tolerance if tolerance >= ROUND_OFF else None
+    return replace(model, h=None, tolerance=allowed, error=None, steps=None, span=model.covered)
+
+
+def model_with_global_error(
+    model: AnyModel, error: float, *, solver: str = "", options: SolverOptions | None, threads: int | None = None
+) -> tuple[AnyModel, GlobalError]:
+    """Return the model with a local tolerance that meets a global error bound, and the estimate of that error.
+
+    The estimate compares runs with different steps and is printed. Adaptive steps of one tolerance are reproducible to
+    the last bit, so that the run that follows is the one whose error was estimated.
+
+    Raises:
+        StateError: unless the error is positive and below 1, and for steps of tau (a time transformation).
+    """
+    wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
+        if isinstance(wanted, IndexedModel):
+            result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
+        else:
+            result = wanted.confirmed(wanted.stepper(solver=solver), options=options)
+    local = f"{result.tolerance:.1e}" if result.tolerance else "round-off"
+    numbers = {
+        "requested": error,
+        "estimate": result.estimate,
+        "digits": result.digits,
+        "confirmed": result.confirmed,
+        "confirmed_until": result.confirmed_until,
+        "tolerance": result.tolerance,
+        "runs": result.runs,
+    }
+    tell(
+        f"global error: estimated at {result.estimate:.1e} (relative) from {result.runs} runs; the bound {error:g} "
+        f"is confirmed until t = {result.confirmed_until:g}, with a local tolerance of {local}",
+        global_error=numbers,
+    )
+    return replace(wanted, tolerance=result.local_tolerance, error=None), result
+
+
+def model_with_advised_step(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:
+    """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
+
+    Prints the recommendation and its pilot runs to stdout, warnings to stderr.
+
+    Raises:
+        StateError: with a time transformation, if the tolerance is not positive, if every pilot run fails, or if more
+            than ``MAX_STEPS`` steps are needed.
+    """
+    if model.has_time_transformation:
+        raise StateError("--advise is not available with a time transformation: use --tolerance (local error)")
+    advice = advise(
+        model.system,
+        model.method,
+        model.q,
+        model.momenta(model.stepper(solver=solver)),
+        model.covered,
+        tolerance,
+        t=model.t,
+        solver=solver,
+        options=options,
+    )
+    numbers = {"h": advice.h, "steps": advice.steps, "message": advice.message, "warnings": list(advice.warnings)}
+    tell(_text(advice), advice=numbers)
+    for warning in advice.warnings:
+        click.echo(f"Warning: {warning}", err=True)
+    if advice.steps > MAX_STEPS:
+        raise StateError(
+            f"the recommended run has {advice.steps} steps, more than {MAX_STEPS:g}: use a method of higher order, a "
+            f"larger --advise or a shorter --span, or pass --step {advice.h:.6g} to run it"
+        )
+    return replace(model, h=advice.h, tolerance=None, error=None, steps=advice.steps, span=None)
+
+
+def _text(advice: Advice) -> str:
+    """Return the recommendation and one line for each pilot run."""
+    lines = [f"  h = {row.h:<12.6g} {_outcome(row, abs(advice.h) * advice.steps)}" for row in advice.evidence]
+    return "\n".join([advice.message, *lines, ""])
+
+
+def _outcome(row: Evidence, span: float) -> str:
+    if not math.isfinite(row.error):
+        return "fails"
+    error = f"error {row.error:.2g}" if row.error < 1.0 else "no correct digit"
+    return f"{error:15} {duration(row.seconds * span)} for the whole span"

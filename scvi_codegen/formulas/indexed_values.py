@@ -1,0 +1,83 @@
+"""Evaluation of indexed sums at all their elements, by NumPy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sympy import Expr, Symbol
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.formulas.vectorized import on_arrays
+from scvi_codegen.indices import Access, Loop, Place
+
+__all__ = ["Elements"]
+
+MAX_ELEMENTS = 5_000_000
+"""Maximum number of elements of the loops of a term that are evaluated at once."""
+
+
+class Elements:
+    """Index values of all elements of loops, as arrays.
+
+    Args:
+        loops: of a term.
+        sizes: value of each size.
+        tables: index tables by name.
+
+    Raises:
+        StateError: if there are more than ``MAX_ELEMENTS``.
+    """
+
+    def __init__(self, loops: Sequence[Loop], sizes: Mapping[str, int], tables: Mapping[str, NDArray[Any]]) -> None:
+        self.loops, self.sizes, self.tables = {loop.index: loop for loop in loops}, sizes, tables
+        pairs = {loop.behind: loop for loop in loops if loop.behind}
+        spans = [(loop, np.arange(loop.first.at(sizes), loop.end.at(sizes))) for loop in loops if not loop.behind]
+        counts = [len(span) * (len(span) - 1) // 2 if loop.index in pairs else len(span) for loop, span in spans]
+        if (total := math.prod(counts)) > MAX_ELEMENTS:
+            raise StateError(f"a sum has {total} elements, more than the {MAX_ELEMENTS} that can be evaluated by NumPy")
+        grids = np.meshgrid(*(np.arange(count) for count in counts), indexing="ij")
+        self.index: dict[str, NDArray[np.int64]] = {}
+        for (loop, span), grid in zip(spans, grids, strict=True):
+            if loop.index not in pairs:
+                self.index[loop.index] = span[grid.reshape(-1)]
+                continue
+            first, second = np.triu_indices(len(span), 1)
+            self.index[loop.index], self.index[pairs[loop.index].index] = (
+                span[each[grid.reshape(-1)]] for each in (first, second)
+            )
+
+    def of(self, access: Access) -> tuple[Any, ...]:
+        """Return the indices of an access at all elements, one array or number per axis."""
+        return tuple(self._place(place) for place in access.places)
+
+    def _place(self, place: Place) -> Any:
+        if place.table:
+            return self.tables[place.table][self.index[place.index], place.column]
+        if not place.index:
+            return place.base.at(self.sizes)
+        loop, moved = self.loops[place.index], self.index[place.index] + place.base.number
+        return moved % loop.end.at(self.sizes) if loop.periodic else moved
+
+    def values(
+        self,
+        formula: Expr,
+        slots: Sequence[tuple[Symbol, Access]],
+        arrays: Mapping[str, NDArray[np.float64]],
+        numbers: Mapping[Expr, float],
+    ) -> Any:
+        """Return the values of a formula at every element.
+
+        Args:
+            formula: in the symbols of slots and numbers.
+            slots: symbol and access of each array entry.
+            arrays: arrays by name.
+            numbers: values by symbol.
+        """
+        known: dict[Expr, Any] = {slot: arrays[access.array.name][self.of(access)] for slot, access in slots}
+        found = on_arrays(formula, {**known, **numbers})
+        count = next((len(values) for values in self.index.values()), 1)
+        return np.broadcast_to(found, (count,)) if self.index else found

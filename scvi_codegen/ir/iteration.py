@@ -1,0 +1,169 @@
+"""Common interface of the fixed-point iterations: kernels, tables, stored values, and their support headers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import ClassVar
+
+from scvi_codegen.ir.kernel import IndexedSum, Kernel
+from scvi_codegen.ir.numbers import Number, NumberTable
+
+__all__ = ["FixedPointIteration", "IterationTable", "PredictorTables", "StoredValues", "transposed"]
+
+
+class StoredValues(Enum):
+    """Values at the points of a step that are stored for the predictor and the error estimate of the curve."""
+
+    FORCES = auto()
+    VELOCITIES = auto()
+    ACCELERATIONS = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class IterationTable:
+    """A table by its name in C: one number per point, or rows of them; double-double if necessary."""
+
+    name: str
+    numbers: tuple[Number, ...] | NumberTable
+    in_two_parts: bool = False
+
+    @property
+    def is_matrix(self) -> bool:
+        """True if it has rows."""
+        return isinstance(self.numbers[0], tuple)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictorTables:
+    """(lanes, lanes) predictor tables for values at the points: ``last_alone``, or ``last`` and ``before``.
+
+    Attributes:
+        abscissae: of the stored values on a step, without padding.
+        degree, highest, next: (lanes,) weights of the leading Legendre coefficient of the curve through them, and of
+            the next lower one; zeros if there is none.
+    """
+
+    abscissae: tuple[Number, ...]
+    degree: int
+    highest: tuple[Number, ...]
+    next: tuple[Number, ...]
+    last_alone: NumberTable
+    last: NumberTable
+    before: NumberTable
+
+    @property
+    def tables(self) -> Iterator[IterationTable]:
+        """Tables by their names in C."""
+        yield IterationTable("LAST_ALONE", self.last_alone)
+        yield IterationTable("LAST", self.last)
+        yield IterationTable("BEFORE", self.before)
+
+
+class FixedPointIteration(ABC):
+    """Fixed-point iteration whose kernels are evaluated at points on SIMD lanes: data, from which C is rendered.
+
+    Attributes:
+        lanes: a power of two, the number of points or more.
+        guess: predictor of the stored values.
+        mass_entries: (i, j), i >= j, of the derivatives of the kernel that computes the mass, if any.
+        kept: values at the points of a step.
+        final_iterations: number of iterations after the one that converges.
+        in_groups: whether its C supports several vectors for the points of a step, besides one.
+    """
+
+    __slots__ = ()
+
+    lanes: int
+    guess: PredictorTables
+    mass_entries: tuple[tuple[int, int], ...]
+    kept: ClassVar[StoredValues]
+    final_iterations: ClassVar[int] = 0
+    in_groups: ClassVar[bool] = True
+
+    @property
+    @abstractmethod
+    def kernels(self) -> tuple[Kernel, ...]:
+        """Kernels that are evaluated on SIMD lanes."""
+
+    @property
+    @abstractmethod
+    def tables(self) -> Iterator[IterationTable]:
+        """All tables, in the order in which they are printed."""
+
+    @property
+    @abstractmethod
+    def parts(self) -> tuple[str, ...]:
+        """Support headers of its C, in order, after those of the meaning of a lane."""
+
+    @abstractmethod
+    def memory(self, dimension: int) -> int:
+        """Return the number of doubles kept from step to step."""
+
+    def with_forces(self, forces: tuple[IndexedSum, ...]) -> FixedPointIteration | None:
+        """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
+        return None
+
+    @property
+    def facts(self) -> Mapping[str, int]:
+        """Macros that its support headers require."""
+        return {}
+
+    @property
+    def constant_mass(self) -> Kernel | None:
+        """Kernel of the masses if they are constant and diagonal."""
+        return None
+
+    @property
+    def derivatives_part(self) -> str:
+        """Support header of tangent and adjoint vectors by fixed-point iteration; ``""`` if there is none."""
+        return ""
+
+    @property
+    def derivatives_tables(self) -> tuple[IterationTable, ...]:
+        """Tables that this header requires besides :attr:`tables`."""
+        return ()
+
+    @property
+    def damping(self) -> Kernel | None:
+        """Kernel of the rate of a uniform damping, a function of the parameters, if there is one."""
+        return None
+
+    @property
+    def integral_part(self) -> str:
+        """Support header of integrals along the curve; ``""`` if nothing is integrated."""
+        return ""
+
+    @property
+    def predictor_matrix(self) -> NumberTable:
+        """Table between the stored values and the predicted ones; empty if they are the same."""
+        return ()
+
+    @property
+    def serves_many(self) -> bool:
+        """True if lanes may be trajectories."""
+        return False
+
+    @property
+    def error_power(self) -> int:
+        """Exponent of h in the squared leading displacement over that of the curvature (all but a mean velocity)."""
+        return 2 * self.guess.degree + (0 if self.kept is StoredValues.VELOCITIES else 2)
+
+    @property
+    def diagonal(self) -> bool:
+        """True if the mass matrix is diagonal."""
+        return all(i == j for i, j in self.mass_entries)
+
+    @property
+    def mass_part(self) -> str:
+        """Support header of solves with the mass matrix."""
+        return "diagonal_mass" if self.diagonal else "full_mass"
+
+
+def transposed(table: NumberTable, points: int) -> NumberTable:
+    """Return the transpose of a padded table; lanes beyond the points remain 0."""
+    padding = (0,) * (len(table) - points)
+    columns = tuple(zip(*table[:points], strict=True))[:points]
+    return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))

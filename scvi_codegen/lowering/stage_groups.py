@@ -1,0 +1,196 @@
+"""Stage groups: kernels with their derivatives, gathers and scatters as loops over rounded tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import sympy
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.ir.stage_groups import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
+from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.unknown_layout import UnknownLayout
+from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.work_and_impulse import exchanges
+from scvi_codegen.methods.stage_system import Gather, StageGroup
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["argument_name", "has_action", "lowered_stage_group"]
+
+MOST_PAIRS_COMPARED, LARGEST_DIFFERENCE = 16, mp.mpf(10) ** -20
+"""Number of pairs of mixed derivatives that are compared by value, and their largest relative difference."""
+
+
+def has_action(system: MechanicalSystem) -> bool:
+    """Return whether the discrete Lagrangian exists as a function of both ends of a step.
+
+    It does not if velocities do not determine momenta, with forces, with constraints, or with damping.
+    """
+    if system.forces or system.constraints or system.damping != 0:
+        return False
+    return not isinstance(system, HamiltonianSystem) or system.is_regular
+
+
+def lowered_stage_group(system: MechanicalSystem, family: StageGroup, sites: UnknownLayout) -> LoweredStageGroup:
+    """Return a stage group in loops: its kernel with derivatives, and rounded tables."""
+    slopes, blocks = _derivative_blocks(family, sites)
+    names = tuple(argument_name(system, gather) for gather in family.gathers)
+    u = f"u = ({', '.join(names)})"
+    return LoweredStageGroup(
+        name=family.name,
+        arguments=names,
+        abscissae=lower_vector(family.abscissae),
+        weights=lower_vector(family.weights),
+        gathers=tuple(_gather_loop(family, g, sites) for g in range(len(family.gathers))),
+        scatters=tuple(_scatter_loop(family, s, sites) for s in range(len(family.scatters))),
+        value=system_kernel(
+            system,
+            f"{family.name}_value",
+            family.results,
+            of=family.arguments,
+            purpose=f"{_results(family, names)} at {u}.",
+        ),
+        slope=system_kernel(
+            system,
+            f"{family.name}_slope",
+            family.results,
+            of=family.arguments,
+            slopes=slopes,
+            purpose=f"The same, and the nonzero derivatives with respect to {u}.",
+        ),
+        blocks=blocks,
+        integrand=_integrand(system, family, u) if family.in_action else None,
+        integrand_power=family.scalar_power,
+    )
+
+
+def _results(family: StageGroup, names: tuple[str, ...]) -> str:
+    """Return a description of the results of a kernel."""
+    if family.computes:
+        return family.computes
+    if family.name == "node":
+        return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
+    if family.scalar_power:
+        return f"Derivatives of d^{family.scalar_power}L/dt^{family.scalar_power}"
+    slopes = [f"L_{name}" for name in names]
+    if family.forced:
+        slopes[0] += " + f"
+    return " and ".join(slopes) if len(family.scatters) == len(names) else "L_v"
+
+
+def _integrand(system: MechanicalSystem, family: StageGroup, u: str) -> Kernel | None:
+    """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
+    if given := exchanges(system):
+        rates, purpose = [each.rate for each in given], f"Power and impulse rates of the forces at {u}."
+        return system_kernel(system, "exchanges", rates, of=family.arguments, purpose=purpose)
+    if not has_action(system):
+        return None
+    assert family.scalar is not None
+    k = family.scalar_power
+    rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
+    return system_kernel(
+        system,
+        "lagrangian" if family.name == "quadrature" else f"{family.name}_action",
+        (family.scalar,),
+        of=family.arguments,
+        purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
+    )
+
+
+def argument_name(system: MechanicalSystem, gather: Gather) -> str:
+    """Return the name of the arguments of a gather as used in formulas."""
+    names = {
+        system.coordinates: "q",
+        system.velocities: "v",
+        **dict(zip(curve_rates(system, 3), ("a", "j", "s"), strict=True)),
+        multipliers(system): "lambda",
+        system.auxiliaries: "p",
+        auxiliary_multipliers(system): "nu",
+    }
+    own = gather.arguments[0].name.rpartition("_")[0] if gather.arguments else ""
+    return names.get(gather.arguments, own)
+
+
+def _derivative_blocks(
+    family: StageGroup, sites: UnknownLayout
+) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
+    """Return the nonzero derivatives, grouped by scatter and gather."""
+    entries = _slopes(family)
+    slopes: list[sympy.Expr] = []
+    blocks = []
+    for s, scatter in enumerate(family.scatters):
+        top = sum(len(other.results) for other in family.scatters[:s])
+        for g, gather in enumerate(family.gathers):
+            left = sum(len(other.arguments) for other in family.gathers[:g])
+            rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
+            found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
+            if found:
+                row, column = sites.first[len(scatter.results)], sites.first[len(gather.arguments)]
+                pairs = tuple((row + i, column + j) for i, j in found)
+                blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(slopes), entries=pairs))
+                slopes.extend(entries[top + i, left + j] for i, j in found)
+    return tuple(slopes), tuple(blocks)
+
+
+def _slopes(family: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
+    """Return the nonzero derivatives of results with respect to arguments; symmetric for a gradient."""
+    entries = jacobian(family.results, family.arguments)
+    if family.scalar is None or family.forced:
+        return entries
+    _check_symmetry(family, entries)
+    return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
+
+
+def _check_symmetry(family: StageGroup, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
+    """Raise :class:`MethodError` if mixed derivatives differ: Newton's method would not converge with them."""
+    unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
+    for i, j in unlike[:MOST_PAIRS_COMPARED]:
+        pair = entries[i, j], entries.get((j, i), sympy.S.Zero)
+        symbols = sorted(pair[0].free_symbols | pair[1].free_symbols, key=str)
+        known = {symbol: mp.mpf(k + 3) / (k + 5) for k, symbol in enumerate(symbols)}
+        try:
+            one, other = (evaluate(entry, known) for entry in pair)
+            size = sum(abs(evaluate(term, known)) for entry in pair for term in sympy.Add.make_args(entry))
+        except ArithmeticError:
+            continue
+        if abs(one - other) > LARGEST_DIFFERENCE * size:  # the terms may cancel
+            u = family.arguments
+            raise MethodError(
+                f"the results of the stage group '{family.name}' are not the gradient of its scalar: the "
+                "derivative of that "
+                f"for {u[i]} by {u[j]} is {pair[0]}, of that for {u[j]} by {u[i]} {pair[1]}. They must be equal: check "
+                "the signs and the order of the results in its scatters, or give the stage group no scalar"
+            )
+
+
+def _gather_loop(family: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
+    gather = family.gathers[index]
+    size = len(gather.arguments)
+    return GatherLoop(
+        name=f"{family.name}_gather_{index}",
+        first=sites.first[size],
+        sites=size,
+        offset=sum(len(other.arguments) for other in family.gathers[:index]),
+        from_state=bool(gather.table.entries[0][0]),
+        power=gather.power + 1,
+        table=lower_matrix(gather.table.columns([b + 1 for b in sites.columns[size]]).entries),
+    )
+
+
+def _scatter_loop(family: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
+    scatter = family.scatters[index]
+    size = len(scatter.results)
+    return ScatterLoop(
+        name=f"{family.name}_scatter_{index}",
+        first=sites.first[size],
+        sites=size,
+        offset=sum(len(other.results) for other in family.scatters[:index]),
+        power=scatter.power,
+        table=lower_matrix(scatter.table.columns([*sites.rows[size], -1]).entries),
+    )

@@ -1,0 +1,91 @@
+"""Vectorised values of formulas, and the forces of term groups at many points or at one point in 60 digits."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from sympy import Expr, Symbol
+
+from scvi_codegen.formulas.tape import Tape, evaluate
+from scvi_codegen.mechanics.symmetry.bodies import Body
+from scvi_codegen.mechanics.term_groups import TermGroup
+from scvi_codegen.tables.precision import Number, mp
+
+__all__ = ["LARGEST", "array_forces", "array_value", "exact_forces", "terms_among_few_bodies"]
+
+LARGEST = 10**300
+"""Bound below which numbers can be converted to binary64."""
+FEW = 12
+"""Number of bodies per term group that :func:`terms_among_few_bodies` selects."""
+
+
+def terms_among_few_bodies(families: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
+    """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
+    own = {place: number for number, body in enumerate(bodies) for place in body.columns}
+    chosen = dict[int, None]()
+    for term_group in families:
+        met = dict.fromkeys(own.get(place, -1 - place) for row in term_group.places for place in row)
+        chosen |= dict.fromkeys(list(met)[:FEW])
+    return tuple(
+        term_group.where([all(own.get(place, -1 - place) in chosen for place in row) for row in term_group.places])
+        for term_group in families
+    )
+
+
+def array_forces(
+    families: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
+) -> Sequence[Any]:
+    """Return the force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
+    if not families:
+        return [0.0] * len(coordinates)
+    q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
+    for term_group in families:
+        places, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
+        values |= {slot: q[places[:, k]] for k, slot in enumerate(term_group.slots)}
+        for symbol, column in zip(term_group.given, term_group.values, strict=True):
+            values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
+        for k, slope in enumerate(term_group.slopes):
+            np.add.at(force, places[:, k], array_value(slope, values) + np.zeros((len(places), count)))
+    return list(force)
+
+
+def exact_forces(
+    families: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
+) -> list[Number]:
+    """Return the force on each coordinate at one point, in 60 digits."""
+    force: list[Number] = [mp.zero] * len(coordinates)
+    for term_group in families:
+        shared_symbols = [symbol for symbol in known if symbol not in coordinates]
+        tape = Tape(term_group.slopes, (*term_group.slots, *term_group.given, *shared_symbols))
+        shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
+        for row, *given in zip(term_group.places, *term_group.values, strict=True):
+            for x in given:
+                numbers.setdefault(x, known[x] if x in known else evaluate(x, {}))
+            found = tape([*(known[coordinates[place]] for place in row), *(numbers[x] for x in given), *shared])
+            for place, force_term in zip(row, found, strict=True):
+                force[place] += force_term
+    return force
+
+
+def array_value(expression: Any, known: dict[Any, Any]) -> Any:
+    """Return the values of an expression, NaN where undefined; ``known`` has its symbols and caches subexpressions."""
+    if expression not in known:
+        known[expression] = _array_node(expression, known)
+    return known[expression]
+
+
+def _array_node(expression: Any, known: dict[Any, Any]) -> Any:
+    if not expression.args:
+        return float(expression) if not expression.is_Rational or abs(expression) < LARGEST else np.nan
+    arguments = [array_value(argument, known) for argument in expression.args]
+    if expression.is_Add:
+        return functools.reduce(np.add, arguments)
+    if expression.is_Mul:
+        return functools.reduce(np.multiply, arguments)
+    if expression.is_Pow:
+        return np.power(arguments[0], float(arguments[1]) if expression.exp.is_Number else arguments[1])
+    name = type(expression).__name__
+    return getattr(np, f"arc{name[1:]}" if name.startswith("a") else name)(*arguments)

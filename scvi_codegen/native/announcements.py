@@ -1,0 +1,66 @@
+"""Announcement of derivations and compilations that take longer than a second.
+
+They are announced on stderr where that is a terminal, and always by the logger ``scvi_codegen`` at level INFO.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+__all__ = ["announce_to", "announced", "tell"]
+
+PATIENCE_SECONDS = 1.0
+LOGGER = logging.getLogger("scvi_codegen")
+
+
+def _print(what: str) -> None:
+    """Print a line on stderr, also if it is a file."""
+    if sys.stderr is not None:
+        print(f"scvi-codegen: {what} ...", file=sys.stderr, flush=True)
+
+
+def _print_on_terminal(what: str) -> None:
+    """Print a line on stderr if it is a terminal."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        _print(what)
+
+
+_listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", default=None)
+
+
+def tell(what: str) -> None:
+    """Announce a message now, e.g. the expected duration of a computation."""
+    (_listener.get() or _print)(what)
+
+
+@contextmanager
+def announced(what: str) -> Iterator[None]:
+    """Announce a computation if it takes longer than a second."""
+    listener = _listener.get() or _print_on_terminal
+
+    def announce() -> None:
+        LOGGER.info(what)
+        listener(what)
+
+    timer = threading.Timer(PATIENCE_SECONDS, announce)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def announce_to(listener: Callable[[str], None]) -> Iterator[None]:
+    """Context in which announcements are passed to a function, from a separate thread, instead of stderr."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)

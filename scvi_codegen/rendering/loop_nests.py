@@ -1,0 +1,259 @@
+"""Nested loops around a kernel, as C.
+
+A slot is read, and a sum is added to its target, in the innermost loop on whose index it depends: in a sum over pairs i
+< j the data of i are read before the loop over j, and added once after it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
+
+from scvi_codegen.indices import Access, Loop, Place
+from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
+from scvi_codegen.rendering.layout import wrapped, wrapped_comment
+from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
+from scvi_codegen.rendering.thread_sharing import Sharing
+
+__all__ = ["DIRECTION", "Lines", "Nest"]
+
+DIRECTION = "V"
+"""Name of the array that the slots along a direction are read from."""
+
+Lines: TypeAlias = Callable[[int], list[str]]
+"""Function that returns the lines of a slot, by its number."""
+
+
+def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
+    """Yield the offset of each array in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
+    sizes: list[str] = []
+    for array in (*program.coordinates, *program.momenta, *program.velocities):
+        yield array.name, " + ".join(sizes) or "0"
+        sizes.append(product_text(array))
+
+
+class Nest:
+    """Loops of a kernel, with arguments and parameters assigned in the outermost loop in which they are known.
+
+    The innermost loop is divided into parts. On each part the neighbours across a periodic boundary have constant
+    distances from the index, so that no element needs a test.
+
+    Args:
+        program: with the arrays.
+        looped: the kernel.
+        scalar: type of the arguments.
+        source: array that they are read from; empty if there are none.
+        chunked: whether all values of a part are computed before any is added, in loops without conflicts, which a
+            compiler vectorises.
+        sharing: how threads share it; without sharing, one task covers all.
+    """
+
+    def __init__(
+        self,
+        program: IndexedProgram,
+        looped: LoopedKernel,
+        scalar: str,
+        source: str,
+        *,
+        chunked: bool = False,
+        sharing: Sharing = Sharing.ALONE,
+    ) -> None:
+        self.program, self.looped, self.scalar, self.source = program, looped, scalar, source
+        self.chunked, self.sharing = chunked, sharing
+        self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
+        self.loops = {loop.index: loop for loop in looped.loops}
+        self.scalars = len(program.parameter_names)
+
+    def depth_of(self, access: Access) -> int:
+        """Return the depth of the innermost loop on whose index an entry depends."""
+        return max((self.levels[index] for index in access.indices), default=0)
+
+    def is_innermost(self, access: Access) -> bool:
+        """Return whether an entry depends on the index of the innermost loop."""
+        return self.depth_of(access) == len(self.looped.loops)
+
+    def text(
+        self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]] = ()
+    ) -> list[str]:
+        """Return the lines of the nested loops.
+
+        Args:
+            prepare, finish: lines of targets before and after the loops that do not change them.
+            innermost: lines in the innermost loop.
+            behind: lines, those of each target in a separate loop over the same part.
+        """
+        return self._inside(0, prepare, innermost, finish, behind)
+
+    def _inside(
+        self, depth_of: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]]
+    ) -> list[str]:
+        lines = list(self._found(depth_of))
+        outer = [k for k, target in enumerate(self.looped.targets) if self.depth_of(target) == depth_of]
+        if depth_of == len(self.looped.loops):
+            return [*lines, *innermost]
+        lines += [line for k in outer for line in prepare(k)]
+        loop, inner = self.looped.loops[depth_of], self._inside(depth_of + 1, prepare, innermost, finish, behind)
+        last = depth_of + 1 == len(self.looped.loops)
+        lines += self._parts(loop, inner, behind) if last else _loop(loop, *self._span(loop), inner)
+        return lines + [line for k in outer for line in finish(k)]
+
+    def _parts(self, loop: Loop, inner: Sequence[str], behind: Sequence[Sequence[str]]) -> list[str]:
+        """Return the innermost loop, divided into parts if necessary."""
+        first, end = self._span(loop)
+        offsets = self._offsets(loop)
+        if not offsets and not self.chunked:
+            return _loop(loop, first, end, inner)
+        lines = [f"end = {end} - begin > CHUNK ? begin + CHUNK : {end};" if self.chunked else f"end = {end};"]
+        lines += [
+            f"const long long {_shift(loop.index, offset)} = around(begin, {offset}, {size_text(loop.end)}, &end);"
+            for offset in offsets
+        ]
+        if self.chunked:
+            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.targets)}][CHUNK];"]
+        lines += _loop(loop, "begin", "end", inner)
+        for each in behind:
+            lines += _loop(loop, "begin", "end", each)
+        return [
+            f"for (long long begin = {first}, end; begin < {end}; begin = end) {{",
+            *(f"  {line}" for line in lines),
+            "}",
+        ]
+
+    def _span(self, loop: Loop) -> tuple[str, str]:
+        """Return the first index and the end of a loop in a task."""
+        if self.sharing in (Sharing.IN_TURN, Sharing.IN_TILES) and loop is self.looped.loops[0]:
+            return "here->of.first", "here->of.end"
+        if self.sharing is Sharing.IN_TILES and loop is self.looped.loops[1]:
+            return f"between({_first(loop)}, here->behind.first, here->behind.end)", "here->behind.end"
+        return _first(loop), size_text(loop.end)
+
+    def adding(self, k: int, value: str) -> list[str]:
+        """Return the lines that add to the element of a target, if the task adds to it."""
+        if self.sharing is not Sharing.BY_PLACES:
+            return [f"F[{self.place_of(self.looped.targets[k])}] += {value};"]
+        named = [self._named(k)] if self._in_a_part(k) else []
+        return [*named, f"if (whole || within(here, place_{k}))", f"  F[place_{k}] += {value};"]
+
+    def _named(self, k: int) -> str:
+        return f"const long long place_{k} = {self.place_of(self.looped.targets[k])};"
+
+    def _in_a_part(self, k: int) -> bool:
+        """Return whether an element is only known in the loops over a part."""
+        return self.chunked and self.is_innermost(self.looped.targets[k])
+
+    def _passed_over(self) -> list[str]:
+        """Return the lines that skip an element that adds to nothing in a task."""
+        wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.targets))]
+        past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
+        return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
+
+    def _part_passed_over(self, loop: Loop) -> list[str]:
+        """Return the lines that skip a part of the innermost loop that adds to nothing in a task."""
+        if self.sharing is not Sharing.BY_PLACES:
+            return []
+        places = range(len(self.looped.targets))
+        named = [self._named(k) for k in places if self._in_a_part(k)]
+        tests = [f"wanted |= within(here, place_{k});" for k in places]
+        look = _loop(loop, "begin", "end && !wanted", [*named, *tests])
+        return ["int wanted = whole;", *look, "if (!wanted)", "  continue;"]
+
+    def _offsets(self, loop: Loop) -> list[int]:
+        """Return the distances of neighbours across a periodic boundary."""
+        accesses = (*self.looped.slots, *self.looped.targets, *self.looped.given)
+        places = [place for access in accesses for place in access.places]
+        moved = {place.base.number for place in places if place.index == loop.index and not place.table}
+        return sorted(moved - {0}) if loop.periodic else []
+
+    def _found(self, depth_of: int) -> Iterator[str]:
+        """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
+        for k, target in enumerate(self.looped.targets if self.sharing is Sharing.BY_PLACES else ()):
+            if self.depth_of(target) == depth_of and not self._in_a_part(k):
+                yield self._named(k)
+        if depth_of == len(self.looped.loops):
+            yield from self._passed_over()
+        for k, slot in enumerate(self.looped.slots):
+            if self.depth_of(slot) == depth_of and self.source:
+                source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
+                yield f"u[{k}] = {source}[{self.place_of(slot)}];"
+        for k, access in enumerate(self.looped.given, self.scalars):
+            if self.depth_of(access) == depth_of:
+                yield f"parameters[{k}] = field_{access.array.name}[{self.place(access)}];"
+
+    def place_of(self, access: Access) -> str:
+        """Return the index of an entry in the state."""
+        return f"start_{access.array.name} + {self.place(access)}"
+
+    def place(self, access: Access) -> str:
+        """Return the index of an entry in its array, in row-major order."""
+        text = ""
+        for place, axis in zip(access.places, access.array.axes, strict=True):
+            here = self.index(place)
+            first = text if text.isidentifier() or text.endswith(")") else f"({text})"
+            text = f"{first} * {size_text(axis)} + {here}" if text else here
+        return text
+
+    def index(self, place: Place) -> str:
+        """Return an index on an axis."""
+        if place.table:
+            columns = next(table for table in self.program.tables if table.name == place.table).axes[1].number
+            return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
+        if not place.index:
+            return size_text(place.base)
+        name, offset = f"index_{place.index}", place.base.number
+        loop = self.loops[place.index]
+        if not offset or not loop.periodic:
+            return name + (f" {'+' if offset > 0 else '-'} {abs(offset)}" if offset else "")
+        if loop is self.looped.loops[-1]:
+            return f"{name} + {_shift(place.index, offset)}"
+        return f"wrapped_index({name} + {offset}, {size_text(loop.end)})".replace("+ -", "- ")
+
+    def function(self, head: str, arguments: Sequence[str], lines: Sequence[str], *, values: str = "") -> str:
+        """Return the loops as a function; without values no kernel is evaluated."""
+        known = [*self._arrays("\n".join(lines)), *self._unknowns(), *self._parameters(values)]
+        body = [*sizes_text(self.program, "\n".join([*known, *lines])), *known, *lines]
+        text = "\n".join(wrapped(line.strip(), indent=2 + len(line) - len(line.lstrip())) for line in body)
+        whole = (argument.replace(" ", "\0") for argument in arguments)
+        signature = wrapped(f"{head}({', '.join(whole)})", indent=0)
+        return f"{wrapped_comment(self.looped.text)}\n{signature}\n{{\n{text}\n}}"
+
+    def _unknowns(self) -> Iterator[str]:
+        """Yield the declaration of the arguments of the kernel, if it has any."""
+        if self.source and self.looped.slots:
+            yield f"{self.scalar} u[{len(self.looped.slots)}];"
+        elif self.source:
+            yield f"const {self.scalar} u[1] = {{0}};"
+            yield f"(void){self.source};"
+
+    def _parameters(self, values: str) -> Iterator[str]:
+        """Yield the declarations of the parameters and values of the kernel."""
+        if values:
+            yield f"{values};"
+            yield f"double parameters[{max(1, self.scalars + len(self.looped.given))}] = {{0}};"
+            yield from (f"parameters[{k}] = given->parameters[{k}];" for k in range(self.scalars))
+
+    def _arrays(self, text: str) -> Iterator[str]:
+        """Yield the offsets of the arrays that occur."""
+        for name, start in _starts(self.program):
+            if re.search(rf"\bstart_{name}\b", text):
+                yield f"const long long start_{name} = {start};"
+        for kind, arrays, number in (("field", self.program.fields, "double"), ("table", self.program.tables, "int")):
+            for k, array in enumerate(arrays):
+                if f"{kind}_{array.name}[" in text:
+                    yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"
+
+
+def _first(loop: Loop) -> str:
+    return f"index_{loop.behind} + 1" if loop.behind else size_text(loop.first)
+
+
+def _shift(index: str, offset: int) -> str:
+    return f"shift_{index}_{'plus' if offset > 0 else 'minus'}_{abs(offset)}"
+
+
+def _loop(loop: Loop, first: str, end: str, lines: Sequence[str]) -> list[str]:
+    """Return a loop over first <= index < end."""
+    name = f"index_{loop.index}"
+    head = f"for (long long {name} = {first}; {name} < {end}; {name}++)"
+    body = [f"  {line}" for line in lines]
+    return [head, *body] if len(lines) == 1 else [f"{head} {{", *body, "}"]

@@ -1,0 +1,314 @@
+"""Rendering of programs through the Jinja templates.
+
+Entry templates are named after the file they make; parts are in ``templates/parts``. Templates contain only structure:
+loops over the program's tables and the C that does not depend on it. Kernels are printed by
+:mod:`scvi_codegen.rendering.printer` through filters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Literal, NamedTuple, TypeAlias, cast, get_args
+
+from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.derivatives import Derivatives
+from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
+from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel_parts import is_divided
+from scvi_codegen.ir.program import Program
+from scvi_codegen.rendering.control import predictor_text
+from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
+from scvi_codegen.rendering.environment import support_text, template_environment
+from scvi_codegen.rendering.fallback import Fallback
+from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, iteration_source
+from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
+from scvi_codegen.rendering.source import Interface, Source, included
+from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
+from scvi_codegen.rendering.unrolled_equations import unrolled_equations
+
+__all__ = [
+    "EMBEDDED",
+    "Embedded",
+    "EventSearch",
+    "ExampleRun",
+    "render",
+    "render_derivatives",
+    "render_embedded",
+    "render_events",
+    "render_example",
+]
+
+Embedded: TypeAlias = Literal["double", "single"]
+"""Precision of C source for a microcontroller."""
+
+EMBEDDED: tuple[Embedded, ...] = get_args(Embedded)
+
+TARGETS: dict[Embedded, Target] = {"double": DOUBLE, "single": SINGLE}
+
+DECLARATIONS = {
+    "stepper": "parts/declarations.h.jinja",
+    "ensemble": "parts/ensemble_declarations.h.jinja",
+    "events": "parts/events_declarations.h.jinja",
+}
+"""Inner part of a header by the name of its template."""
+
+
+LARGEST_INLINED = 150
+"""Largest number of operations of the kernels of an iteration that is inlined into the loop over steps.
+
+Larger ones are slower inlined: six bodies by 3 per cent, a chain of 64 masses by 20.
+"""
+
+
+class ExampleInput(NamedTuple):
+    """Input as a function of time: (n + 1,) breakpoints, and (n, 4) coefficients of powers of the time since."""
+
+    name: str
+    breakpoints: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleRun:
+    """Run of the generated ``main.c``: initial state, step, and output interval.
+
+    Attributes:
+        h: step size, ``None`` for adaptive steps.
+        span: of time.
+        tolerance: of adaptive steps; with a time transformation the step tau.
+        controlled: whether the integrator has adaptive steps or a time transformation.
+        to_end: whether it continues to the end of the span, in a number of steps of tau that is not known before.
+        inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
+        end: of a run with inputs.
+    """
+
+    q: tuple[float, ...]
+    p: tuple[float, ...]
+    parameters: tuple[float, ...]
+    t: float
+    h: float | None
+    span: float
+    tolerance: float
+    controlled: bool
+    save_every: int
+    outputs: int
+    to_end: bool = False
+    inputs: tuple[ExampleInput, ...] = ()
+    end: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EventSearch:
+    """Data of the search for zeros of functions of the state.
+
+    Attributes:
+        prefix, dimension: of the integrator.
+        kernel: the functions at u = (q, p, v).
+        uses_velocity: whether v occurs in them.
+        transformed: whether time is, so that the integrator's velocities are dq/dtau.
+        nodes: (d + 1,) fractions of a part of a step at which they are evaluated.
+        coefficients: (d + 1, d + 1) from values there to coefficients of powers of x in [-1, 1].
+        doubts: factors of the last two coefficients in the error estimate.
+    """
+
+    prefix: str
+    dimension: int
+    kernel: Kernel
+    uses_velocity: bool
+    transformed: bool
+    nodes: tuple[float, ...]
+    coefficients: tuple[tuple[float, ...], ...]
+    doubts: tuple[float, float]
+
+    @property
+    def velocity(self) -> str:
+        """Support header that provides v."""
+        return "event_velocity_in_tau" if self.transformed else "event_velocity"
+
+
+def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
+    """Return header and source of a program; with control, with adaptive steps. Equal programs give equal bytes.
+
+    If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
+    """
+    return _render(program.prefix, _context(program, DOUBLE, control, fallback))
+
+
+def render_derivatives(derivatives: Derivatives) -> Source:
+    """Return the source of a program solved by Newton's method, with the derivative of steps and its transpose."""
+    program = derivatives.program
+    context = _context(program, DOUBLE, None, kernels=(*program.kernels, *derivatives.kernels), beside=derivatives)
+    return _render(program.prefix, context | {"derivatives": derivatives, "unrolled_equations": None})
+
+
+def render_embedded(program: Program, precision: Embedded, control: Control | None = None) -> Source:
+    """Return the source for a microcontroller: one file, bounded iterations, scalars of its registers.
+
+    Raises:
+        MethodError: for a number outside the range of single precision.
+    """
+    target = TARGETS[precision]
+    target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
+    bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
+    bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
+    return _render(program.prefix, _context(program, target, control) | bounded).amalgamated()
+
+
+def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
+    environment = template_environment()
+    code = environment.get_template(f"{entry}.c.jinja").render(context)
+    own = cast("Mapping[str, str]", context.get("own_headers", {}))
+    return Source(
+        prefix=prefix,
+        header=environment.get_template(f"{entry}.h.jinja").render(context),
+        code=code,
+        declarations=environment.get_template(DECLARATIONS[entry]).render(context),
+        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
+    )
+
+
+def _control_context(program: Program, control: Control | None) -> dict[str, object]:
+    """Return the template's context for adaptive steps; the predictor tables are a separate header."""
+    name = f"support/{program.prefix}_predictor.h"
+    if not (control and control.predictor and program.sweep):
+        return {"control": control, "own_headers": {}}
+    return {"control": control, "own_headers": {name: predictor_text(control.predictor)}}
+
+
+def render_ensemble(program: Program) -> Source | None:
+    """Return source that integrates many trajectories at once, one per lane; ``None`` without a fixed-point iteration.
+
+    Also ``None`` with integrals: with a time transformation, trajectories have no common times.
+    """
+    sweep = program.sweep
+    if sweep is None or not sweep.serves_many or program.integrals:
+        return None
+    prefix = f"{program.prefix}_ensemble"
+    context = {
+        "program": program,
+        "prefix": prefix,
+        "target": DOUBLE,
+        "real": DOUBLE.scalar,
+        "max_iterations": MAX_ITERATIONS,
+        "points": len(sweep.guess.abscissae),
+        "cut": is_divided(sweep.kernels),
+        "needs_velocities": sweep.kept is StoredValues.VELOCITIES,
+        "hot": "static",
+        "sweep": iteration_source(sweep, TRAJECTORIES, fallback="none"),
+    }
+    return _render(prefix, context, "ensemble")
+
+
+def render_events(search: EventSearch) -> Source:
+    """Return header and source of the search for events."""
+    context = {
+        "search": search,
+        "prefix": search.prefix,
+        "target": DOUBLE,
+        "real": DOUBLE.scalar,
+        "kernel": search.kernel,
+        "cut": is_divided((search.kernel,)),
+        "inverse_roots": _inverse_roots(scalar_functions(search.kernel)),
+    }
+    return _render(f"{search.prefix}_events", context, "events")
+
+
+def render_example(interface: Interface, start: ExampleRun, precision: Embedded = "double") -> dict[str, str]:
+    """Return ``main.c`` and ``Makefile`` that run the integrator with nothing but a C compiler."""
+    target = TARGETS[precision]
+    target.check((*start.q, *start.p, *start.parameters, start.t, start.h or start.span))
+    for each in start.inputs:
+        target.check((*each.breakpoints, *chain(*each.coefficients)))
+    context = {
+        "interface": interface,
+        "prefix": interface.prefix,
+        "start": start,
+        "distances": (ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION),
+        "target": target,
+        "real": target.scalar,
+        "threads": False,
+    }
+    environment = template_environment()
+    return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
+
+
+def workspace_size(program: Program) -> int:
+    """Return the doubles of workspace: scratch, memory; unknowns, point, update, pivots, rows, Jacobian of Newton.
+
+    Without Newton's method one instead, for the result of a fallback.
+    """
+    if not program.newton:
+        return scratch_size(program) + program.memory + 1
+    rows = program.unknowns + program.sites
+    jacobian = program.matrix_size(program.sites, program.blocks + (1 if program.action else 0))
+    return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
+
+
+def scratch_size(program: Program) -> int:
+    """Return the doubles for the kernels of one stage group, or for the mass matrix with its derivatives."""
+    mass = program.matrix_size(program.dimension, 1) + len(program.mass_entries)
+    return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
+
+
+def _context(
+    program: Program,
+    target: Target,
+    control: Control | None,
+    fallback: Fallback | None = None,
+    *,
+    kernels: Sequence[Kernel] | None = None,
+    beside: Derivatives | None = None,
+) -> dict[str, object]:
+    kernels = program.kernels if kernels is None else kernels
+    fallback, scalars = fallback or ("own" if program.newton else "none"), _scalar_kernels(program, control, kernels)
+    lanes = beside.lane_kernels if beside else ()
+    return {
+        "program": program,
+        "prefix": program.prefix,
+        "target": target,
+        "real": target.scalar,
+        "kernels": kernels,
+        "cut": is_divided((*scalars, *(program.sweep.kernels if program.sweep else ()), *lanes)),
+        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
+        "workspace": workspace_size(program),
+        "scratch": scratch_size(program),
+        "max_iterations": MAX_ITERATIONS,
+        "most_iterations": "INT_MAX",
+        "embedded": False,
+        "derivatives": None,
+        "unrolled_equations": unrolled_equations(program, target),
+        "fallback": fallback,
+        **_control_context(program, control),
+        **_lane_context(program, fallback, lanes),
+    }
+
+
+def _scalar_kernels(
+    program: Program, control: Control | None, kernels: Sequence[Kernel] | None = None
+) -> tuple[Kernel, ...]:
+    own = program.kernels if kernels is None else kernels
+    splitting = program.splitting.kernels if program.splitting else ()
+    return (*own, *splitting, *((control.density,) if control and control.density else ()))
+
+
+def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
+    """Return the template's context for the fixed-point iteration; ``beside``: kernels of its derivative."""
+    sweep = program.sweep
+    if sweep is None:
+        return {"sweep": None}
+    hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
+    kernels = (*sweep.kernels, *beside)
+    text = iteration_source(sweep, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
+    return {"sweep": text, "hot": hot}
+
+
+def _size(sweep: FixedPointIteration) -> int:
+    """Return the number of operations of all kernels on lanes."""
+    return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
+
+
+def _inverse_roots(functions: set[str]) -> list[int]:
+    """Return the k of all ``inverse_root_k``."""
+    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))

@@ -1,0 +1,138 @@
+"""Type checks of the arguments of public functions, with errors that name the argument.
+
+Numbers and arrays, which may be anything convertible, are checked when they are converted
+(:mod:`scvi_codegen.native.arguments`, :mod:`scvi_codegen.validation.counts`).
+"""
+
+from __future__ import annotations
+
+import functools
+import numbers
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from inspect import Parameter, signature
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from scvi_codegen.errors import ArgumentError, ScviCodegenError
+from scvi_codegen.validation.keywords import keyword_hint
+
+__all__ = [
+    "CANVAS",
+    "FORMULA",
+    "FORMULAS",
+    "FUNCTION",
+    "MAPPED",
+    "MAPPING",
+    "NAMES",
+    "NUMBERS",
+    "PATH",
+    "REAL",
+    "SWITCH",
+    "TEXT",
+    "TEXTS",
+    "WHOLE",
+    "ArgumentType",
+    "check_kind",
+    "checks_arguments",
+    "of",
+    "several",
+]
+
+Called = TypeVar("Called", bound=Callable[..., Any])
+MAX_SHOWN_LENGTH = 60
+
+
+@dataclass(frozen=True, slots=True)
+class ArgumentType:
+    """Type check of an argument: its description after "must be", and a predicate."""
+
+    words: str
+    accepts: Callable[[Any], bool]
+
+
+def of(words: str, *types: type) -> ArgumentType:
+    """Return the check for an instance of one of the types."""
+    return ArgumentType(words, lambda value: isinstance(value, types))
+
+
+def several(words: str, *types: type) -> ArgumentType:
+    """Return the check for a list, a tuple or another sequence of such instances, except text."""
+    return ArgumentType(words, lambda value: _is_sequence(value) and all(isinstance(entry, types) for entry in value))
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+TEXT = of("text", str)
+FORMULA = ArgumentType(
+    "a formula as text, or a number",
+    lambda value: isinstance(value, str | numbers.Real) and not isinstance(value, bool),
+)
+TEXTS = several("a list of texts", str)
+NAMES = several("a list of names, as ['x', 'y']", str)
+SWITCH = of("True or False", bool, np.bool_)
+WHOLE = ArgumentType("a whole number", lambda value: hasattr(value, "__index__") and not isinstance(value, bool))
+REAL = of("a number", numbers.Real)
+PATH = of("a path", str, os.PathLike)
+MAPPING = ArgumentType(
+    "a mapping from names, as {'k': 2.0}",
+    lambda value: isinstance(value, Mapping) and all(isinstance(name, str) for name in value),
+)
+NUMBERS = ArgumentType("a list of numbers", lambda value: _is_sequence(value) or isinstance(value, np.ndarray))
+MAPPED = of("a mapping, as {x: 2.0}", Mapping)
+FORMULAS = ArgumentType("a list of formulas", lambda value: _is_sequence(value) or hasattr(value, "shape"))
+FUNCTION = ArgumentType("a function", callable)
+CANVAS = ArgumentType("Matplotlib axes", lambda value: hasattr(value, "plot") and hasattr(value, "figure"))
+
+
+def check_kind(kind: ArgumentType, value: Any, name: str, error: type[ScviCodegenError] = ArgumentError) -> None:
+    """Raise an error that names the argument if the value fails the check."""
+    if not kind.accepts(value):
+        shown = repr(value)
+        shown = shown if len(shown) <= MAX_SHOWN_LENGTH else f"{shown[:MAX_SHOWN_LENGTH]} .."
+        raise error(f"{name} must be {kind.words}, not {shown}")
+
+
+def checks_arguments(
+    error: type[ScviCodegenError] = ArgumentError, /, **kinds: ArgumentType
+) -> Callable[[Called], Called]:
+    """Check arguments by name at each call; an argument whose default is ``None`` may be ``None``.
+
+    >>> @checks_arguments(name=TEXT)
+    ... def greet(name):
+    ...     return f"hello {name}"
+    >>> greet(3)
+    Traceback (most recent call last):
+    scvi_codegen.errors.ArgumentError: name must be text, not 3
+
+    A keyword that the function does not have raises an error with a suggestion.
+    """
+
+    def decorate(function: Called) -> Called:
+        parameters = signature(function).parameters
+        names = tuple(parameters)
+        known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
+        open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
+        optional = {name for name in names if parameters[name].default is None}
+
+        @functools.wraps(function)
+        def checked(*given: Any, **named: Any) -> Any:
+            if not (open_ended or named.keys() <= known.keys()):
+                name = next(name for name in named if name not in known)
+                raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
+            pairs: Iterable[tuple[str, Any]] = (*zip(names, given, strict=False), *named.items())
+            for name, value in pairs:
+                if name in kinds and not (value is None and name in optional):
+                    check_kind(kinds[name], value, name, error)
+            return function(*given, **named)
+
+        for of_a_cache in ("cache_clear", "cache_info"):
+            if hasattr(function, of_a_cache):
+                setattr(checked, of_a_cache, getattr(function, of_a_cache))
+        return cast(Called, checked)
+
+    return decorate

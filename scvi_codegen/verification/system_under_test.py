@@ -1,0 +1,269 @@
+"""System under test: the stepper, a stepper with Newton's method alone, and generic states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.exact.motion import ExactMotion, exact_motion
+from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native.announcements import tell
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.verification.linearisation import Jacobian, linearised
+
+__all__ = ["EPSILON", "State", "SystemUnderTest"]
+
+Array = NDArray[np.float64]
+
+EPSILON = 2.0**-52
+WIDTH = 1e-5
+"""Width of differences of constraints, relative to the state."""
+PERTURBATION, PERTURBATIONS = 0.05, 6
+"""Perturbation of the initial state relative to its size; divided by 4 up to six times until a step succeeds."""
+PARAMETER_PERTURBATION = 0.05
+STEPS_BETWEEN = 5
+"""Number of steps from the first state to the second."""
+MAX_COORDINATES = 12
+"""Largest number of coordinates whose exact motion is computed; 18 take minutes."""
+REFERENCE_STEPS, ANNOUNCED_SECONDS = 12, 10.0
+"""Number of 60-digit steps that take as long as a certificate of a large system; duration that is announced."""
+MAX_UNKNOWNS = 200
+"""Largest number of unknowns of a step solved in 60 digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """State (q, p) at time t, and the size h of the step to take from it."""
+
+    q: Array
+    p: Array
+    t: float
+    h: float
+
+    @property
+    def z(self) -> Array:
+        """Phase-space vector (q, p), (2m,)."""
+        return np.concatenate([self.q, self.p])
+
+
+@dataclass(frozen=True)
+class SystemUnderTest:
+    """Integrator under test.
+
+    Attributes:
+        system: mechanical system.
+        method: method of the stepper.
+        stepper: stepper as built.
+        newton: stepper with Newton's method alone, or ``None``.
+        given: state and step size of the certificate.
+    """
+
+    system: MechanicalSystem
+    method: Method
+    stepper: Stepper
+    newton: Stepper | None
+    given: State
+
+    @cached_property
+    def parameters(self) -> dict[str, float]:
+        """Values slightly off the defaults, if steps succeed: equal masses would hide interchanged ones."""
+        moved = {
+            name.name: value * (1 + PARAMETER_PERTURBATION * np.sin(k + 1.0))
+            if value
+            else PARAMETER_PERTURBATION * np.cos(k + 1.0)
+            for k, (name, value) in enumerate(self.system.constants.items())
+        }
+        kept = {name: float(moved[name] if value else 0.0) for name, value in self._defaults.items()}
+        for values in (moved, kept):
+            if self._works(values):
+                return {name: float(value) for name, value in values.items()}
+        return dict(self._defaults)
+
+    @property
+    def constant_inputs(self) -> dict[str, float]:
+        """:attr:`parameters` with constant inputs, for long runs on which cubic inputs would grow."""
+        rates = [f"{name}_{power}" for name in self.stepper.interface.inputs for power in "123"]
+        return self.parameters | dict.fromkeys(rates, 0.0)
+
+    @property
+    def damping(self) -> float:
+        """Damping rate at :attr:`parameters`; 0 without damping."""
+        values = {parameter: self.parameters[parameter.name] for parameter in self.system.parameters}
+        return float(self.system.damping.xreplace(values))
+
+    @property
+    def _defaults(self) -> dict[str, float]:
+        return {name.name: value for name, value in self.system.constants.items()}
+
+    def _works(self, parameters: Mapping[str, float]) -> bool:
+        try:
+            self.stepper.step(self.given.q, self.given.p, self.given.h, self.given.t, parameters)
+        except StepFailedError:
+            return False
+        return True
+
+    @cached_property
+    def moved(self) -> MechanicalSystem:
+        """System with :attr:`parameters` as defaults."""
+        return self.system.with_parameters(**self.parameters)
+
+    @cached_property
+    def motion(self) -> ExactMotion:
+        """Exact motion of :attr:`moved`.
+
+        Raises:
+            StateError: if it has too many coordinates.
+        """
+        if self.system.dimension > MAX_COORDINATES:
+            raise StateError(f"{self.system.dimension} coordinates exceed the limit of {MAX_COORDINATES} in 60 digits")
+        return exact_motion(self.moved)
+
+    @cached_property
+    def states(self) -> tuple[State, State]:
+        """Two generic states: a step forward is taken from the first, a step backward from the second."""
+        first = self._perturbed()
+        now = first
+        for _ in range(STEPS_BETWEEN):
+            try:
+                q, p = self.step(now)
+            except StepFailedError:
+                break
+            now = State(q, p, now.t + now.h, now.h)
+        return first, State(now.q, now.p, now.t, -now.h / 2)
+
+    def _perturbed(self) -> State:
+        given, m = self.given, len(self.given.q)
+        sizes = self.scales(given)
+        directions = np.concatenate([np.cos(1.0 + np.arange(m)), np.sin(2.0 + 1.3 * np.arange(m))])
+        for k in range(PERTURBATIONS):
+            z = given.z + PERTURBATION / 4**k * sizes * directions
+            t = given.t + 0.37 * given.h
+            try:
+                state = State(*self._projected(z[:m], z[m:], t), t, given.h)
+                self.step(state)
+            except (StateError, StepFailedError):
+                continue
+            return state
+        return given
+
+    def _projected(self, q: Array, p: Array, t: float) -> tuple[Array, Array]:
+        """Return the projection of (q, p) onto the constraint manifold, if there are constraints."""
+        if not self.system.constraints:
+            return q, p
+        return self.stepper.project(q, p, t=t, parameters=self.parameters)
+
+    def tangents(self, state: State) -> Array:
+        """Return (2m, 2(m - c)) directions, in units of :meth:`scales`, tangent to the constrained phase space."""
+        left = 2 * (len(state.q) - len(self.system.constraints))
+        result: Array = np.linalg.svd(self.constraint_derivatives(state, self.scales(state)))[2][-left:].T
+        return result
+
+    def constraint_derivatives(self, state: State, units: Array) -> Array:
+        """Return (2c, 2m) derivatives of constraints and their rates with respect to the state, in ``units``."""
+        m, columns = len(state.q), []
+        for unit in np.diag(WIDTH * units):
+            ends = [state.z + sign * unit for sign in (1, -1)]
+            values = [self.stepper.constraint_values(z[:m], z[m:], state.t, self.parameters) for z in ends]
+            columns.append((np.concatenate(values[0]) - np.concatenate(values[1])) / (2 * WIDTH))
+        return np.array(columns).T
+
+    def step(
+        self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None
+    ) -> tuple[Array, Array]:
+        """Return (q1, p1) of the compiled step; raises as :meth:`Stepper.step`."""
+        stepper = stepper or self.stepper
+        return stepper.step(state.q, state.p, state.h, state.t, self.parameters, options=options)
+
+    def ends(self, state: State, stepper: Stepper | None = None, options: SolverOptions | None = None) -> Array:
+        """Return the end of a step as one vector (2m,)."""
+        return np.concatenate(self.step(state, stepper, options))
+
+    def scales(self, state: State) -> Array:
+        """Return (2m,) the size of q and of p: of the state or, if larger, of its change in a step.
+
+        All coordinates have the same size. The size of a momentum is its change for a common change of the velocities,
+        whatever its mass.
+        """
+        m = len(state.q)
+        try:
+            end = np.concatenate(self.stepper.step(state.q, state.p, state.h, state.t, self.stepper.defaults))
+        except StepFailedError:
+            end = state.z
+        change = end - state.z
+        sizes = [max(_rms(state.z[part]), _rms(change[part])) or 1.0 for part in (slice(m), slice(m, None))]
+        return np.concatenate([np.full(m, sizes[0]), self._momentum_sizes(state, sizes[1])])
+
+    def _momentum_sizes(self, state: State, size: float) -> Array:
+        """Return (m,) changes of the momenta for a change of velocity by its mean; ``size`` for those without."""
+        m = len(state.q)
+        try:
+            v = self.stepper.velocity(state.q, state.p, state.t)
+            moved = 0.1 * (_rms(v) or 1.0) * np.eye(m)
+            changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
+        except StateError:
+            return np.full(m, size)
+        own: Array = 10.0 * np.abs(np.diag(np.array(changes)))
+        return np.where(own > 0.0, own, size)
+
+    def linearised(self, state: State) -> Jacobian | None:
+        """Return the Jacobian of the step at a state, by finite differences."""
+        m = len(state.q)
+
+        def step(z: Array) -> Array:
+            return self.ends(State(z[:m], z[m:], state.t, state.h))
+
+        return linearised(step, state.z, self.scales(state))
+
+    def rounding(self, state: State) -> Array:
+        """Return (2m,) bounds on the change of the end by one rounding of each number that enters a step."""
+        end, around = self.ends(state), self.linearised(state)
+        propagated = np.abs(state.z) if around is None else around.propagated(state.z)
+        time_change = 1e-6 * state.h
+        later = self.ends(State(state.q, state.p, state.t + time_change, state.h))
+        drift = np.abs(later - end) / abs(time_change) * (abs(state.t) + abs(state.h))
+        longer = self.ends(State(state.q, state.p, state.t, state.h + time_change))
+        step_change = np.abs(longer - end) / abs(time_change) * abs(state.h)
+        total: Array = EPSILON * (propagated + np.abs(end) + np.abs(end - state.z) + drift + step_change)
+        return total + np.finfo(float).tiny
+
+    def derived(self, method: Method | None = None, system: MechanicalSystem | None = None) -> DerivedStep:
+        """Return the equations of the step in 60 digits, optionally of another method or system.
+
+        Raises:
+            StateError: if there are too many unknowns.
+        """
+        result = derived_step(system or self.motion.system, method or self.method)
+        if result.unknowns > MAX_UNKNOWNS:
+            raise StateError(f"{result.unknowns} unknowns per step exceed the limit of {MAX_UNKNOWNS} in 60 digits")
+        return result
+
+    @cached_property
+    def _solved(self) -> dict[int, SolvedStep]:
+        return {}
+
+    def solved(self, index: int) -> SolvedStep:
+        """Return the step from a state of :attr:`states` in 60 digits; raises as :meth:`derived` and its solution."""
+        if index not in self._solved:
+            state, derived = self.states[index], self.derived()
+            known = state.q, state.p, state.h, state.t
+            if not self._solved and (whole := REFERENCE_STEPS * derived.seconds(*known)) > ANNOUNCED_SECONDS:
+                tell(f"{derived.unknowns} unknowns per step are solved in 60 digits, which takes about {whole:.0f} s")
+            self._solved[index] = derived(*known)
+        return self._solved[index]
+
+    def roundings(self) -> Iterator[tuple[int, State, Array]]:
+        """Yield each state with its index and rounding error."""
+        for index, state in enumerate(self.states):
+            yield index, state, self.rounding(state)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,217 @@
+/* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
+ * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: increments.h, add_forces,
+ * evaluate_constraints, constraint_matrix.h, indexed_iteration.h, PARTS of a step, PART and their ends, PART_END. */
+
+#define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */
+
+/* Parts of `work`: magnitudes for rounding errors; forces; increments of positions and momenta; constraint forces;
+ * trial increments, and the positions they lead to. */
+typedef struct {
+  double *X, *F, *dq, *dp, *R, *D, *Y;
+} parts_of_work;
+
+static parts_of_work divide(const run_memory *run, long long n)
+{
+  double *work = run->work;
+  const parts_of_work parts = {work, work + n, work + 2 * n, work + 3 * n, work + 4 * n, work + 5 * n, work + 6 * n};
+  return parts;
+}
+
+/* Data shared by the substeps. */
+typedef struct {
+  run_memory *run;
+  const problem *given;
+  parts_of_work parts;
+  held held;
+  long long n;
+  const solver_options *options;
+  solver_report *report;
+} constrained_run;
+
+static constrained_run constrained_run_of(run_memory *run, const problem *given, const solver_options *options,
+    solver_report *report)
+{
+  const long long n = NAME(coordinates)(given);
+  const constrained_run of = {run, given, divide(run, n), constraint_arrays(run, n), n, options, report};
+  return of;
+}
+
+/* x = G^T lambda. */
+static void compute_constraint_forces(const held *held, const double *lambda, double *x, long long n)
+{
+  memset(x, 0, sizeof(double) * (size_t)n);
+  for (long long k = 0; k < held->count; k++)
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      x[held->of.place[e]] += held->slope[e] * lambda[k];
+}
+
+static void find_forces(const constrained_run *of, const double *X, double t, double *F)
+{
+  memset(F, 0, sizeof(double) * (size_t)of->n);
+  add_forces(of->run, of->given, X, t, 1.0, F);
+}
+
+/* Computes forces, constraint derivatives and their matrix at the state. */
+static int begin(const constrained_run *of)
+{
+  find_forces(of, of->run->q, of->run->t, of->parts.F);
+  evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.slope);
+  return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
+}
+
+/* Computes the trial increments due to the constraint forces, the positions, and the magnitudes of their terms; returns
+ * the squared size of the coordinates. */
+static double trial_increments(const constrained_run *of, double h)
+{
+  const run_memory *run = of->run;
+  const parts_of_work *parts = &of->parts;
+  double size = 0.0;
+  for (long long i = 0; i < of->n; i++) {
+    const double p = run->p[i] + parts->dp[i], pushed = h / 2 * parts->R[i];
+    const double drift = h * (run->inverse_mass[i] * (p + pushed));
+    parts->D[i] = parts->dq[i] + drift;
+    parts->Y[i] = run->q[i] + parts->D[i];
+    parts->X[i] = fabs(run->q[i]) + fabs(h * run->inverse_mass[i]) * (fabs(p) + fabs(pushed));
+    size += parts->X[i] * parts->X[i];
+  }
+  return size;
+}
+
+/* x += by y; returns the squared size of M^-1 y. */
+static double push(double *x, const double *y, double by, const double *inverse_mass, long long n)
+{
+  double size = 0.0;
+  for (long long i = 0; i < n; i++) {
+    const double moved = inverse_mass[i] * y[i];
+    x[i] += by * y[i];
+    size += moved * moved;
+  }
+  return size;
+}
+
+/* Status of a finished iteration. Constraints that are violated at converged positions contradict each other:
+ * SINGULAR. */
+static int end_of_iteration(const iteration *now, const held *held)
+{
+  const double left = product_of(held->right, held->right, held->count);
+  const double rounding = product_of(held->rounding, held->rounding, held->count);
+  if (now->status < 0)
+    return failure_of(now);
+  return left <= ROUNDING_MULTIPLE * ROUNDING_MULTIPLE * rounding ? OK : SINGULAR;
+}
+
+/* Solves for the multipliers at the start that give g = 0 at the end; leaves trial increments and the derivatives
+ * there. */
+static int solve_positions(const constrained_run *of, double h, double t, double *size)
+{
+  const held *held = &of->held;
+  const parts_of_work *parts = &of->parts;
+  iteration now = new_iteration();
+  compute_constraint_forces(held, held->lambda, parts->R, of->n);
+  for (;;) {
+    int status;
+    double moved;
+    *size = trial_increments(of, h);
+    evaluate_constraints(of->given, parts->Y, t, held->g, held->rate, held->next);
+    for (long long k = 0; k < held->count; k++)
+      held->right[k] = -2.0 / (h * h) * held->g[k];
+    compute_rounding(held, held->next, parts->X, 2.0 / (h * h));
+    if (now.status)
+      return end_of_iteration(&now, held);
+    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
+    if (status != OK)
+      return status;
+    add_to(held->lambda, held->change, 1.0, held->count);
+    compute_constraint_forces(held, held->change, parts->F, of->n);
+    moved = h * h / 2 * (h * h / 2) * push(parts->R, parts->F, 1.0, of->run->inverse_mass, of->n);
+    record_change(&now, changes_of_all(moved, *size, of->options), of->options, of->report);
+  }
+}
+
+/* right = -scale (rate + G x). */
+static void find_right(const held *held, const double *rate, const double *x, double scale)
+{
+  for (long long k = 0; k < held->count; k++) {
+    double sum = rate[k];
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      sum += held->slope[e] * x[held->of.place[e]];
+    held->right[k] = -scale * sum;
+  }
+}
+
+/* Projects the momenta onto G M^-1 p + g_t = 0 by constraint forces of weight `by`; the change of the velocities times
+ * `unit` is compared with `size`. X contains the magnitudes of their terms. */
+static int project_momenta(const constrained_run *of, double by, double unit, double size)
+{
+  const held *held = &of->held;
+  const run_memory *run = of->run;
+  iteration now = new_iteration();
+  for (;;) {
+    int status;
+    double moved;
+    for (long long i = 0; i < of->n; i++)
+      of->parts.D[i] = run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]);
+    find_right(held, held->rate, of->parts.D, 1.0 / by);
+    compute_rounding(held, held->slope, of->parts.X, 1.0 / by);
+    if (now.status)
+      return now.status < 0 ? failure_of(&now) : OK;
+    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
+    if (status != OK)
+      return status;
+    compute_constraint_forces(held, held->change, of->parts.R, of->n);
+    moved = unit * by * (unit * by) * push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
+    record_change(&now, changes_of_all(moved, size, of->options), of->options, of->report);
+  }
+}
+
+/* Performs one substep of size h that ends at t. */
+static int constrained_substep(const constrained_run *of, double h, double t)
+{
+  const parts_of_work *parts = &of->parts;
+  const held *held = &of->held;
+  const run_memory *run = of->run;
+  double size;
+  int status;
+  add_to(parts->dp, parts->F, h / 2, of->n);
+  status = solve_positions(of, h, t, &size);
+  if (status != OK)
+    return status;
+  add_to(parts->dp, parts->R, h / 2, of->n);
+  memcpy(parts->dq, parts->D, sizeof(double) * (size_t)of->n);
+  memcpy(held->slope, held->next, sizeof(double) * (size_t)held->entries);
+  if (!assemble(held, run->inverse_mass))
+    return SINGULAR;
+  find_forces(of, parts->Y, t, parts->F);
+  compute_constraint_forces(held, held->lambda, parts->R, of->n);
+  for (long long i = 0; i < of->n; i++) {
+    parts->dp[i] += h / 2 * (parts->F[i] + parts->R[i]);
+    parts->X[i] = run->inverse_mass[i] *
+        (fabs(run->p[i] + parts->dp[i]) + fabs(h / 2) * (fabs(parts->F[i]) + fabs(parts->R[i])));
+  }
+  return project_momenta(of, h / 2, h, size);
+}
+
+/* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state
+ * unchanged and discards the predictor. */
+static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+    solver_report *report)
+{
+  const constrained_run of = constrained_run_of(run, given, options, report);
+  int status = OK;
+  run->error = NAN;
+  if (!run->guess) {
+    memset(of.held.lambda, 0, sizeof(double) * (size_t)of.held.count);
+    status = begin(&of);
+  }
+  run->guess = 0;
+  memcpy(of.parts.dq, run->carry_q, sizeof(double) * (size_t)n);
+  memcpy(of.parts.dp, run->carry_p, sizeof(double) * (size_t)n);
+  for (int k = 0; status == OK && k < PARTS; k++)
+    status = constrained_substep(&of, run->h * PART[k], run->t + run->h * PART_END[k]);
+  if (status != OK)
+    return status;
+  add_all(run->q, of.parts.dq, run->carry_q, n);
+  add_all(run->p, of.parts.dp, run->carry_p, n);
+  run->guess = 1;
+  return OK;
+}

@@ -1,0 +1,202 @@
+/* Systems with the constraint matrix G M^-1 G^T by conjugate gradients, preconditioned by the incomplete factorisation
+ * L D L^T without fill (J. A. Meijerink & H. A. van der Vorst, Math. Comp. 31, 1977). For a chain or a tree whose
+ * constraints are ordered from an end the factors are exact. Redundant constraints make the matrix singular, which is
+ * an error. Requires: constraint_pattern.h. */
+
+#define LEAST_PIVOT 1e-3 /* relative to the diagonal: a smaller pivot was lost by the incomplete factorisation */
+#define DEPENDENT 1e-13 /* of the matrix relative to L D L^T: curvature that counts as 0 */
+#define ROUNDING_MULTIPLE 4096.0 /* multiple of the rounding error that may remain at converged positions */
+#define SPARE_PRODUCTS 100 /* iterations beyond the number of constraints, to allow for rounding */
+
+/* Arrays of the constraints: one number per constraint (g, g_t, multipliers; right-hand side and residual, solution,
+ * three directions of a system, rounding error, diagonal of the matrix and inverted D), per entry (derivatives at the
+ * state and at another one), and per pair (the matrix, L). */
+typedef struct {
+  pattern of;
+  long long count, entries;
+  double *g, *rate, *lambda, *right, *change, *preconditioned, *direction, *image, *rounding, *diagonal, *pivot;
+  double *slope, *next;
+  double *entry, *factor;
+} held;
+
+static held constraint_arrays(const run_memory *run, long long n)
+{
+  held found = {.of = pattern_of(run, n), .count = run->constraints, .entries = run->entries};
+  double **const each[] = {&found.g, &found.rate, &found.lambda, &found.right, &found.change, &found.preconditioned,
+      &found.direction,
+      &found.image, &found.rounding, &found.diagonal, &found.pivot};
+  double *numbers = run->held;
+  for (size_t k = 0; k < sizeof each / sizeof *each; k++, numbers += found.count)
+    *each[k] = numbers;
+  found.slope = numbers;
+  found.next = found.slope + found.entries;
+  found.entry = found.next + found.entries;
+  found.factor = found.entry + run->pairs;
+  return found;
+}
+
+/* Computes the row of a constraint: products of derivatives with respect to the same coordinates. */
+static void find_products(const held *held, const double *inverse_mass, int k)
+{
+  const pattern *of = &held->of;
+  held->diagonal[k] = 0.0;
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    of->where[of->column[m]] = m;
+    held->entry[m] = 0.0;
+  }
+  for (int e = of->first[k]; e < of->first[k + 1]; e++) {
+    const int i = of->place[e];
+    const double weight = held->slope[e] * inverse_mass[i];
+    for (int m = of->at[i]; m < of->at[i + 1]; m++) {
+      const int f = of->list[m], l = of->owner[f];
+      if (l > k)
+        break;
+      if (l == k)
+        held->diagonal[k] += weight * held->slope[f];
+      else
+        held->entry[of->where[l]] += weight * held->slope[f];
+    }
+  }
+}
+
+/* Computes a row of L from the rows above; returns 0 if the diagonal is not positive. */
+static int factorise_row(const held *held, int k)
+{
+  const pattern *of = &held->of;
+  double left = held->diagonal[k];
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    const int l = of->column[m];
+    double product = held->entry[m], inverse = held->pivot[l];
+    for (int j = of->row[l]; j < of->row[l + 1]; j++) {
+      const int there = of->where[of->column[j]];
+      if (there >= 0)
+        product -= held->factor[there] * held->factor[j];
+    }
+    held->factor[m] = product; /* of L D */
+    left -= product * product * inverse;
+  }
+  for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+    held->factor[m] *= held->pivot[of->column[m]];
+    of->where[of->column[m]] = -1;
+  }
+  held->pivot[k] = 1.0 / (left > LEAST_PIVOT * held->diagonal[k] ? left : held->diagonal[k]);
+  return held->diagonal[k] > 0.0 && held->diagonal[k] < INFINITY;
+}
+
+/* Assembles and factorises the matrix of the derivatives at the state; returns 0 if a constraint has none. */
+static int assemble(const held *held, const double *inverse_mass)
+{
+  int sound = 1;
+  for (int k = 0; k < held->count; k++) {
+    find_products(held, inverse_mass, k);
+    sound &= factorise_row(held, k);
+  }
+  return sound;
+}
+
+/* y = G M^-1 G^T x. */
+static void multiply(const held *held, const double *x, double *y)
+{
+  const pattern *of = &held->of;
+  for (int k = 0; k < held->count; k++) {
+    double sum = held->diagonal[k] * x[k];
+    for (int m = of->row[k]; m < of->row[k + 1]; m++) {
+      sum += held->entry[m] * x[of->column[m]];
+      y[of->column[m]] += held->entry[m] * x[k];
+    }
+    y[k] = sum;
+  }
+}
+
+/* y = (L D L^T)^-1 x. */
+static void precondition(const held *held, const double *x, double *y)
+{
+  const pattern *of = &held->of;
+  for (int k = 0; k < held->count; k++) {
+    y[k] = x[k];
+    for (int m = of->row[k]; m < of->row[k + 1]; m++)
+      y[k] -= held->factor[m] * y[of->column[m]];
+  }
+  for (int k = 0; k < held->count; k++)
+    y[k] *= held->pivot[k];
+  for (int k = (int)held->count - 1; k >= 0; k--)
+    for (int m = of->row[k]; m < of->row[k + 1]; m++)
+      y[of->column[m]] -= held->factor[m] * y[k];
+}
+
+/* Inner product in four independent sums, which do not wait for each other. */
+static double product_of(const double *x, const double *y, long long n)
+{
+  double sum[4] = {0.0, 0.0, 0.0, 0.0};
+  long long i = 0;
+  for (; i + 4 <= n; i += 4)
+    for (int k = 0; k < 4; k++)
+      sum[k] += x[i + k] * y[i + k];
+  for (; i < n; i++)
+    sum[0] += x[i] * y[i];
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* Bound of the rounding error of scale G x, per constraint. */
+static void compute_rounding(const held *held, const double *slope, const double *x, double scale)
+{
+  for (long long k = 0; k < held->count; k++) {
+    double terms = 0.0;
+    for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
+      terms += fabs(slope[e] * x[held->of.place[e]]);
+    held->rounding[k] = DBL_EPSILON * fabs(scale) * terms;
+  }
+}
+
+/* Returns 1 if some residual exceeds its rounding error. */
+static int exceeds_rounding(const held *held)
+{
+  int found = 0;
+  for (long long k = 0; k < held->count; k++)
+    found |= !(fabs(held->right[k]) <= held->rounding[k]);
+  return found;
+}
+
+/* change += step way, right -= step image; returns the squared norm of the residual. */
+static double move_on(const held *held, double step)
+{
+  for (long long k = 0; k < held->count; k++) {
+    held->change[k] += step * held->direction[k];
+    held->right[k] -= step * held->image[k];
+  }
+  return product_of(held->right, held->right, held->count);
+}
+
+/* Solves (G M^-1 G^T) change = right to the relative tolerance or to rounding. Returns OK, NOT_CONVERGED, SINGULAR or
+ * NOT_FINITE. */
+static int solve_constraint_system(const held *held, double tolerance, solver_report *report)
+{
+  const long long n = held->count;
+  double size = product_of(held->right, held->right, n), slope, length; /* squared length of the search direction in the
+                                                                         * metric of L D L^T */
+  const double least = tolerance * tolerance * size;
+  memset(held->change, 0, sizeof(double) * (size_t)n);
+  if (!(size < INFINITY))
+    return NOT_FINITE;
+  precondition(held, held->right, held->preconditioned);
+  memcpy(held->direction, held->preconditioned, sizeof(double) * (size_t)n);
+  length = slope = product_of(held->right, held->preconditioned, n);
+  for (long long k = 0; size > least && exceeds_rounding(held); k++) {
+    double curve, again, last = slope;
+    if (k >= n + SPARE_PRODUCTS)
+      return NOT_CONVERGED;
+    multiply(held, held->direction, held->image);
+    report->products++;
+    curve = product_of(held->direction, held->image, n);
+    if (!(curve > DEPENDENT * length))
+      return SINGULAR;
+    size = move_on(held, slope / curve);
+    precondition(held, held->right, held->preconditioned);
+    slope = product_of(held->right, held->preconditioned, n);
+    again = slope / last;
+    length = slope + again * again * length; /* the residual is orthogonal to the direction */
+    for (long long i = 0; i < n; i++)
+      held->direction[i] = held->preconditioned[i] + again * held->direction[i];
+  }
+  return OK;
+}

@@ -1,0 +1,111 @@
+/* Projection onto the constraints, their values, and their Lagrange multipliers. Requires: constrained_step.h,
+ * indexed_run.h. */
+
+#define REFINEMENTS 3
+#define REFINED 1e-6 /* reduction of the residual per refinement */
+
+/* Projects the positions onto g = 0: the nearest state in the metric of the masses, q0 + M^-1 G^T lambda with G
+ * there. */
+static int project_positions(const constrained_run *of)
+{
+  const held *held = &of->held;
+  const parts_of_work *parts = &of->parts;
+  const run_memory *run = of->run;
+  iteration now = new_iteration();
+  memset(held->lambda, 0, sizeof(double) * (size_t)held->count);
+  memcpy(parts->Y, run->q, sizeof(double) * (size_t)of->n);
+  for (;;) {
+    double moved = 0.0, size = 0.0;
+    int status;
+    evaluate_constraints(of->given, parts->Y, run->t, held->g, held->rate, held->slope);
+    if (!assemble(held, run->inverse_mass))
+      return SINGULAR;
+    compute_constraint_forces(held, held->lambda, parts->R, of->n);
+    for (long long i = 0; i < of->n; i++)
+      parts->D[i] = (run->q[i] - parts->Y[i]) + run->inverse_mass[i] * parts->R[i];
+    for (long long i = 0; i < of->n; i++)
+      parts->X[i] = fabs(run->q[i]) + fabs(parts->Y[i]);
+    find_right(held, held->g, parts->D, 1.0);
+    compute_rounding(held, held->slope, parts->X, 1.0);
+    if (now.status)
+      return end_of_iteration(&now, held);
+    status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
+    if (status != OK)
+      return status;
+    add_to(held->lambda, held->change, 1.0, held->count);
+    compute_constraint_forces(held, held->lambda, parts->R, of->n);
+    for (long long i = 0; i < of->n; i++) {
+      const double to = run->q[i] + run->inverse_mass[i] * parts->R[i], move = to - parts->Y[i];
+      moved += move * move;
+      size += to * to;
+      parts->Y[i] = to;
+    }
+    record_change(&now, changes_of_all(moved, size, of->options), of->options, of->report);
+  }
+}
+
+int NAME(project)(run_memory *run, const problem *given, const solver_options *options, solver_report *report)
+{
+  const solver_options standard = NAME(default_options)();
+  const constrained_run of = constrained_run_of(run, given, options ? options : &standard, report);
+  double size = 0.0;
+  int status;
+  memset(report, 0, sizeof *report);
+  report->t = run->t;
+  run->guess = 0;
+  status = project_positions(&of);
+  if (status != OK)
+    return status;
+  memset(of.parts.dp, 0, sizeof(double) * (size_t)of.n);
+  for (long long i = 0; i < of.n; i++) {
+    of.parts.X[i] = fabs(run->inverse_mass[i] * run->p[i]);
+    size += of.parts.X[i] * of.parts.X[i];
+  }
+  status = project_momenta(&of, 1.0, 1.0, size);
+  if (status != OK)
+    return status;
+  memcpy(run->q, of.parts.Y, sizeof(double) * (size_t)of.n);
+  add_to(run->p, of.parts.dp, 1.0, of.n);
+  return OK;
+}
+
+void NAME(constraint_values)(run_memory *run, const problem *given, double *g, double *rate)
+{
+  const constrained_run of = constrained_run_of(run, given, NULL, NULL);
+  evaluate_constraints(given, run->q, run->t, g, rate, of.held.next);
+  for (long long k = 0; k < of.held.count; k++)
+    for (int e = of.held.of.first[k]; e < of.held.of.first[k + 1]; e++) {
+      const int i = of.held.of.place[e];
+      rate[k] += of.held.next[e] * (run->inverse_mass[i] * run->p[i]);
+    }
+}
+
+/* Multipliers from G M^-1 (F + G^T lambda) = -d^2 g / dt^2 at constant velocity. The predictor of the next step is not
+ * changed. */
+int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
+{
+  solver_report report = {0};
+  const constrained_run of = constrained_run_of(run, given, NULL, &report);
+  const held *held = &of.held;
+  double *F = of.parts.D, *pulled = of.parts.Y;
+  int status = run->guess ? OK : begin(&of);
+  if (status != OK)
+    return status;
+  for (long long i = 0; i < of.n; i++)
+    pulled[i] = run->inverse_mass[i] * run->p[i];
+  compute_second_derivatives(given, run->q, pulled, run->t, held->g);
+  find_forces(&of, run->q, run->t, F);
+  memset(lambda, 0, sizeof(double) * (size_t)held->count);
+  for (int round = 0; status == OK && round < REFINEMENTS; round++) {
+    compute_constraint_forces(held, lambda, of.parts.R, of.n);
+    for (long long i = 0; i < of.n; i++)
+      pulled[i] = run->inverse_mass[i] * (F[i] + of.parts.R[i]);
+    find_right(held, held->g, pulled, 1.0);
+    for (long long i = 0; i < of.n; i++)
+      pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.parts.R[i]));
+    compute_rounding(held, held->slope, pulled, 1.0);
+    status = solve_constraint_system(held, REFINED, &report);
+    add_to(lambda, held->change, 1.0, held->count);
+  }
+  return status;
+}

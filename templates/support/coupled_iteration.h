@@ -1,0 +1,104 @@
+/* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
+ * require, point_weights.h, a mass, point_arguments.h, velocity corrections, the tables, the kernel point_lanes. */
+
+/* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
+ * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
+ * On failure the increments are undefined. */
+HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq, number *dp,
+    const solver_options *options, solver_report *report)
+{
+  coordinates own[GROUPS], *z = kept(past, own);
+  lanes u[2 * M], value[GROUPS][VALUES], scaled[GROUPS][M], impulse[GROUPS][M], r[GROUPS][M], mass[GROUPS][MASS];
+  number inverse_size[M] = {0.0};
+  progress now = before_iterations();
+  int status = OK;
+  if (*steps > 0)
+    continue_curve(step, past, *steps, z);
+  else
+    status = start_velocities(step, z);
+  if (status != OK)
+    return status;
+  for (int k = 0; needs_iteration(&now); k++) {
+    lanes change = lanes_of(0.0);
+    scale(data->position_weight, z, scaled);
+    if (!DIAGONAL)
+      memset(mass, 0, sizeof mass);
+    for (int n = 0; n < GROUPS; n++) {
+      place(step, n, scaled, z, u);
+      point_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value[n], mass[n]);
+#ifdef DAMPED
+      grow(&data->damping, n, VALUES, value[n]);
+      grow(&data->damping, n, MASS, mass[n]);
+#endif
+      for (int i = 0; i < M; i++)
+        impulse[n][i] = data->momentum_weight[n] * value[n][i];
+    }
+#ifdef PROJECTED
+    {
+      lanes momentum[GROUPS][M], residual[GROUPS][M];
+      for (int n = 0; n < GROUPS; n++)
+        memcpy(momentum[n], value[n] + M, sizeof momentum[n]);
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++) {
+          const lanes P = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i));
+          residual[n][i] = P - apply(PROJECTION, n, momentum, i);
+        }
+      for (int n = 0; n < GROUPS; n++) {
+        for (int i = 0; i < M; i++)
+          r[n][i] = apply(VELOCITY, n, residual, i);
+        factor_mass(mass[n]);
+        solve_mass(mass[n], r[n]);
+      }
+      memcpy(residual, r, sizeof r);
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++) {
+          r[n][i] = apply(PROJECTION, n, residual, i);
+          z[n][i] += r[n][i];
+        }
+    }
+#else
+    for (int n = 0; n < GROUPS; n++) {
+      for (int i = 0; i < M; i++)
+        r[n][i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, impulse, i)) - value[n][M + i];
+      factor_mass(mass[n]);
+    }
+    correct(data, value, mass, r);
+    for (int n = 0; n < GROUPS; n++)
+      for (int i = 0; i < M; i++)
+        z[n][i] += r[n][i];
+#endif
+    if (k == 0) {
+      for (int i = 0; i < M; i++)
+        inverse_size[i] = magnitude(at_start(z, i)) + magnitude(at_end(z, i));
+      invert_sizes(options, fabs(step->h), inverse_size);
+    }
+    for (int n = 0; n < GROUPS; n++)
+      for (int i = 0; i < M; i++) {
+        const lanes moved = r[n][i] * inverse_size[i];
+        change += moved * moved;
+      }
+    take_change(&now, total_change(change), options, k, report);
+    if (must_amplify(&now, options, k))
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++)
+          z[n][i] += AMPLIFICATION * r[n][i];
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  converged_forces(step, data, value, z, r, impulse);
+  scale(data->momentum_weight, impulse, impulse);
+  scale(data->position_weight, z, scaled);
+  for (int i = 0; i < M; i++) {
+    dq[i] = weigh(POINT_END_POSITION, scaled, i);
+    dp[i] = weigh(POINT_END_MOMENTUM, impulse, i);
+#ifdef DAMPED
+    dp[i] = data->damping.shrunk * dp[i] + data->damping.loss * (step->p0[i] + step->carry_p[i]);
+#endif
+  }
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+  remember_curve(z, past);
+  *steps = next_guess(*steps, &now, report);
+  return OK;
+}

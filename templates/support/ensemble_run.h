@@ -1,0 +1,120 @@
+/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, time.h, and
+ * prepare_iteration and sweep of a solver, which compute the increments of a step. */
+
+void NAME(start)(block_memory *block, double t, double h)
+{
+  memset(block, 0, sizeof *block);
+  block->t = t;
+  block->h = h;
+}
+
+void NAME(set)(block_memory *block, int lane, const double *q, const double *p, const double *v,
+    const double *parameters)
+{
+  for (int i = 0; i < M; i++) {
+    block->q[i][lane] = q[i];
+    block->p[i][lane] = p[i];
+    for (int n = 0; STATUS(NEEDS_VELOCITIES) && n < S; n++)
+      block->memory[0][n][i][lane] = block->memory[1][n][i][lane] = v[i];
+  }
+  for (int i = 0; i < P; i++)
+    block->parameters[i][lane] = parameters[i];
+  block->active[lane] = 1.0;
+}
+
+/* The part of the state that a step changes, in local memory during a call. */
+typedef struct {
+  lanes q[M], p[M], carry_q[M], carry_p[M];
+} state;
+
+static void load_state(const block_memory *block, state *now)
+{
+  memcpy(now->q, block->q, sizeof now->q);
+  memcpy(now->p, block->p, sizeof now->p);
+  memcpy(now->carry_q, block->carry_q, sizeof now->carry_q);
+  memcpy(now->carry_p, block->carry_p, sizeof now->carry_p);
+}
+
+static void save_state(const state *now, block_memory *block)
+{
+  memcpy(block->q, now->q, sizeof now->q);
+  memcpy(block->p, now->p, sizeof now->p);
+  memcpy(block->carry_q, now->carry_q, sizeof now->carry_q);
+  memcpy(block->carry_p, now->carry_p, sizeof now->carry_p);
+}
+
+/* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
+static void add_compensated(lanes *x, lanes *carry, const lanes *increment, const double *active)
+{
+  for (int i = 0; i < M; i++) {
+    const lane_view old = {x[i]}, old_carry = {carry[i]};
+    const lanes sum = x[i] + increment[i], part = sum - x[i];
+    const lanes rest = ((x[i] - (sum - part)) + (increment[i] - part)) + (carry[i] + increment[M + i]);
+    lane_view new_x = {sum + rest}, new_carry = {rest - ((sum + rest) - sum)};
+    for (int j = 0; j < LANES; j++) {
+      new_x.lane[j] = active[j] > 0.0 ? new_x.lane[j] : old.lane[j];
+      new_carry.lane[j] = active[j] > 0.0 ? new_carry.lane[j] : old_carry.lane[j];
+    }
+    x[i] = new_x.all;
+    carry[i] = new_carry.all;
+  }
+}
+
+/* Deactivates lanes whose next state is not finite. */
+static void drop_infinite(const state *now, const lanes *dq, const lanes *dp, double *active)
+{
+  lane_view sum = {lanes_of(0.0)};
+  for (int i = 0; i < M; i++)
+    sum.all += 0.0 * (now->q[i] + dq[i]) + 0.0 * (now->p[i] + dp[i]);
+  for (int j = 0; j < LANES; j++)
+    active[j] = sum.lane[j] == 0.0 ? active[j] : 0.0;
+}
+
+/* Stores the states of the first `count` trajectories, one row each. */
+static void store_states(const state *now, int count, double *q, double *p)
+{
+  for (int i = 0; i < M; i++) {
+    const lane_view position = {now->q[i]}, momentum = {now->p[i]};
+    for (int j = 0; j < count; j++) {
+      q[j * M + i] = position.lane[j];
+      p[j * M + i] = momentum.lane[j];
+    }
+  }
+}
+
+void NAME(advance)(block_memory *block, int count, long long steps, long long every, const solver_options *options,
+    double *q, double *p, long long row_length)
+{
+  const solver_options standard = {TOLERANCE, MAX_ITERATIONS, 0};
+  state now;
+  iteration_data data;
+  solver_report report = {block->active, 0};
+  lanes parameters[P + 1], memory[2][S][M];
+  lanes dq[2 * M] = {{0.0}}, dp[2 * M] = {{0.0}}; /* increments, then their low words */
+  step_data step = {block->t, block->h, now.q, now.p, now.carry_q, now.carry_p, parameters};
+  load_state(block, &now);
+  memcpy(parameters, block->parameters, sizeof(lanes) * P);
+  memcpy(memory, block->memory, sizeof memory);
+  prepare_iteration(&step, &data);
+  for (long long k = 0, stored = 0; k < steps; k++) {
+    const long long parity = block->step % 2;
+    const history past = {memory[1 - parity], memory[parity]};
+    step.t = block->t;
+    sweep(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
+    drop_infinite(&now, dq, dp, block->active);
+    add_compensated(now.q, now.carry_q, dq, block->active);
+    add_compensated(now.p, now.carry_p, dp, block->active);
+    block->step++;
+    add_to_time(&block->t, &block->t_low, block->h);
+    for (int j = 0; j < count; j++)
+      if (block->active[j] > 0.0)
+        block->last_step[j] = block->step;
+    if (block->step % every == 0) {
+      store_states(&now, count, q + stored * row_length, p + stored * row_length);
+      stored++;
+    }
+  }
+  block->sweeps += report.sweeps;
+  save_state(&now, block);
+  memcpy(block->memory, memory, sizeof memory);
+}

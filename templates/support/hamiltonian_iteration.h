@@ -1,0 +1,105 @@
+/* Fixed-point iteration of a step for any Hamiltonian (Li, Wu & Leok, eq. (35)). Requires: one_trajectory.h,
+ * point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
+
+/* Positions at the points of the curve with velocities z. */
+static inline void place(const step_data *step, const iteration_data *data, lanes (*z)[M], lanes (*u)[2 * M])
+{
+  lanes scaled[GROUPS][M];
+  scale(data->position_weight, z, scaled);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      u[n][i] = step->q0[i] + (step->carry_q[i] + apply(POSITION, n, scaled, i));
+}
+
+/* Momenta at the points from the forces. */
+static inline void push(const step_data *step, const iteration_data *data, lanes (*force)[M], lanes (*u)[2 * M])
+{
+  lanes scaled[GROUPS][M];
+  scale(data->momentum_weight, force, scaled);
+  for (int n = 0; n < GROUPS; n++)
+    for (int i = 0; i < M; i++)
+      u[n][M + i] = step->p0[i] + (step->carry_p[i] + apply(MOMENTUM, n, scaled, i));
+}
+
+/* 1 / the size of x at both ends of the step, which makes its changes relative, or `absolute`. */
+static inline void measure_ends(lanes (*x)[M], const solver_options *options, double absolute, double *inverse_size)
+{
+  for (int i = 0; i < M; i++)
+    inverse_size[i] = fabs(at_start(x, i)) + fabs(at_end(x, i));
+  invert_sizes(options, absolute, inverse_size);
+}
+
+/* Forces at the points. */
+static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*force)[M])
+{
+  for (int n = 0; n < GROUPS; n++)
+    force_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, force[n]);
+}
+
+/* Computes the increments of one step: forces, momenta and velocities are updated in turn until momenta and velocities
+ * converge; the increments follow from the forces there. Velocities and forces are stored for the predictor. On failure
+ * the increments are undefined. */
+HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq, double *dp,
+    const solver_options *options, solver_report *report)
+{
+  lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[GROUPS][M], momentum[GROUPS][M];
+  double velocity_size[M], momentum_size[M];
+  progress now = before_iterations();
+  int status = OK;
+  if (*steps > 0) {
+    continue_curve(step, past, *steps, z);
+    continue_curve(step, past + 2 * M * POINTS, *steps, force);
+  } else {
+    status = start_velocities(step, z);
+    memset(force, 0, sizeof force);
+  }
+  if (status != OK)
+    return status;
+  push(step, data, force, u);
+  for (int k = 0; needs_iteration(&now); k++) {
+    lanes change = lanes_of(0.0), before[GROUPS][M];
+    for (int n = 0; n < GROUPS; n++)
+      memcpy(before[n], u[n] + M, sizeof before[n]);
+    place(step, data, z, u);
+    forces(step, u, force);
+    push(step, data, force, u);
+    for (int n = 0; n < GROUPS; n++) {
+      velocity_lanes(u[n], step->t + step->h * ABSCISSA[n], step->parameters, value[n]);
+      memcpy(momentum[n], u[n] + M, sizeof momentum[n]);
+    }
+    if (k == 0) {
+      measure_ends(value, options, fabs(step->h), velocity_size);
+      measure_ends(momentum, options, 1.0, momentum_size);
+    }
+    for (int n = 0; n < GROUPS; n++)
+      for (int i = 0; i < M; i++) {
+        const lanes correction = value[n][i] - z[n][i], moved = correction * velocity_size[i];
+        const lanes pushed = (momentum[n][i] - before[n][i]) * momentum_size[i];
+        change += moved * moved + pushed * pushed;
+        z[n][i] = value[n][i];
+        value[n][i] = correction;
+      }
+    take_change(&now, total_change(change), options, k, report);
+    if (must_amplify(&now, options, k))
+      for (int n = 0; n < GROUPS; n++)
+        for (int i = 0; i < M; i++)
+          z[n][i] += AMPLIFICATION * value[n][i];
+  }
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  place(step, data, z, u);
+  forces(step, u, force);
+  scale(data->position_weight, z, value);
+  scale(data->momentum_weight, force, momentum);
+  for (int i = 0; i < M; i++) {
+    dq[i] = weigh(POINT_END_POSITION, value, i);
+    dp[i] = weigh(POINT_END_MOMENTUM, momentum, i);
+  }
+  if (!accept(step, dq, dp, report))
+    return NOT_FINITE;
+  remember_curve(z, past);
+  remember_curve(force, past + 2 * M * POINTS);
+  *steps = next_guess(*steps, &now, report);
+  return OK;
+}

@@ -1,0 +1,38 @@
+/* Step by fixed-point iteration, with a fallback. Requires: a sweep, and fall_back. */
+typedef iteration_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_iteration(step, data);
+}
+
+/* Computes the increments by fixed-point iteration from the straight line, else by fall_back. */
+static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, double *memory,
+    long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = 0;
+  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  if (status != OK) {
+    status = fall_back(status, step, dq, dp, options, report, workspace);
+    if (status == OK && !reaches(step, dq, dp))
+      status = NOT_FINITE;
+    steps = 0;
+  }
+  if (status == OK)
+    *guess = steps;
+  return status;
+}
+
+/* Computes the increments by fixed-point iteration from the curve extrapolated from *guess former steps, or from the
+ * straight line if there are none or it fails. On success *guess is the number of steps for the next predictor. On
+ * failure the increments are undefined. */
+HOT int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+    const solver_options *options, solver_report *report, double *workspace)
+{
+  long long steps = *guess;
+  if (steps > 0 && sweep(step, data, memory, &steps, dq, dp, options, report) == OK) {
+    *guess = steps;
+    return OK;
+  }
+  return solve_afresh(step, data, memory, guess, dq, dp, options, report, workspace);
+}

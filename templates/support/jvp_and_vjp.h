@@ -1,0 +1,185 @@
+/* Derivative of a step (JVP) and its transpose (VJP) by implicit differentiation of the stage equations. Requires:
+ * newton_from_line.h, spurious_solutions.h, linear_maps.h, and STAGE_GROUPS, the stage groups; linearised.h; if
+ * DAMPED, growth_wide, from inputs to gamma h; end_time, the derivative of the time at the end. */
+
+static linearised_step linearised_in(const step_data *step, real *workspace)
+{
+  linearised_step at;
+  at.step = step;
+  at.data = newton_in(workspace + SCRATCH);
+  at.shape = band_of(SITES, B);
+  at.slopes = workspace + WORKSPACE;
+  at.v = (wide *)(at.slopes + DERIVATIVES);
+  at.dz = at.v + STEP_INPUTS;
+  at.rows = at.dz + N;
+  at.x = at.rows + SITES * (B + 1);
+  at.points = at.x + N;
+#ifdef DAMPED
+  at.growth = growth_of(step);
+  at.grown = at.points + MOST_AT_POINTS;
+#else
+  at.growth = 0;
+  at.grown = NULL;
+#endif
+  return at;
+}
+
+/* Solves the step as the fallback does, factorises its equations and evaluates the derivatives at the points. */
+static int linearise_step(linearised_step *at, const solver_options *options, real *q1, real *p1,
+    solver_report *report)
+{
+  const step_data *step = at->step;
+  const long long before = report->iterations;
+  real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *slopes = at->slopes;
+  int keep = 0, status = newton_from_line(step, &at->data, dp, &keep, options, report);
+  if (status != OK)
+    return status;
+  gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
+  if (is_spurious(step, at->data.z, dq, report->iterations - before))
+    return STATUS(STRAYED);
+  evaluate(step, at->data.z, at->data.rows, size_p, size_q, at->data.factors, &at->shape);
+  if (!factorise(at->data.factors, &at->shape, at->data.pivot))
+    return SINGULAR;
+  for (int f = 0; f < COUNT_OF_GROUPS; f++)
+    slopes = derivatives_of_group(STAGE_GROUPS + f, step, at->data.z, slopes);
+  for (int i = 0; i < M; i++)
+    at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
+  for (int i = 0; q1 && i < M; i++) {
+    q1[i] = step->q0[i] + dq[i];
+    p1[i] = at->p1[i];
+  }
+  return OK;
+}
+
+/* From v (back: to it) to all rows, or from dz to the last one, that of p1, through all points. */
+static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
+{
+  const step_change by = {at->step->h, at->growth, at->grown};
+  const real *slopes = at->slopes;
+  for (int f = 0; f < COUNT_OF_GROUPS; f++)
+    slopes = through_group(STAGE_GROUPS + f, &by, back, slopes, at->points, v, dz, at->rows);
+}
+
+/* dz = -(matrix)^-1 rows, without the last row of each site. */
+static void solve_forward(const linearised_step *at)
+{
+  for (int i = 0; i < N; i++)
+    at->x[POSITION_IN_MATRIX[i / B] * B + i % B] = at->rows[i / B * (B + 1) + i % B];
+  solve_wide(at->data.factors, &at->shape, at->data.pivot, 0, at->x);
+  memset(at->dz, 0, sizeof(wide) * N);
+  for (int i = 0; i < N; i++)
+    flow(0, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
+}
+
+/* rows = -(transposed matrix)^-1 dz. */
+static void solve_back(const linearised_step *at)
+{
+  memset(at->x, 0, sizeof(wide) * N);
+  for (int i = 0; i < N; i++)
+    flow(1, at->dz + i, -1, at->x + POSITION_IN_MATRIX[i / B] * B + i % B);
+  solve_wide(at->data.factors, &at->shape, at->data.pivot, 1, at->x);
+  for (int i = 0; i < N; i++)
+    at->rows[i / B * (B + 1) + i % B] = at->x[POSITION_IN_MATRIX[i / B] * B + i % B];
+}
+
+/* Derivative of q1 with respect to q0, unknowns and h. */
+static void end_position(const linearised_step *at, int back)
+{
+  const real h = at->step->h, *z = at->data.z;
+  for (int i = 0; i < M; i++)
+    for (int b = 0; b < B; b++) {
+      flow(back, at->v + i, h * END_POSITION[b], at->dz + i * B + b);
+      flow(back, at->v + i, END_POSITION[b] * z[i * B + b], at->v + INPUT_H);
+    }
+}
+
+/* Derivative of the rows with respect to p0. */
+static void momentum_rows(const linearised_step *at, int back)
+{
+  for (int i = 0; i < M; i++)
+    for (int r = 0; r < B; r++)
+      flow(back, at->rows + i * (B + 1) + r, MOMENTUM_ROW[r], at->v + M + i);
+}
+
+/* Derivative of p1 with respect to p0, the rows of its increment, and damping. */
+static void end_momentum(const linearised_step *at, int back)
+{
+#ifdef DAMPED
+  const real factor = MATH(exp)(-at->growth);
+#endif
+  for (int i = 0; i < M; i++) {
+    wide *p = at->v + M + i;
+    if (!back)
+      flow(0, p, 1, at->rows + i * (B + 1) + B);
+#ifdef DAMPED
+    if (back)
+      flow(1, p, -at->p1[i], at->grown);
+    for (int j = 0; j < WIDTH; j++)
+      p->lane[j] *= factor;
+    if (!back)
+      flow(0, p, -at->p1[i], at->grown);
+#endif
+    if (back)
+      flow(1, p, 1, at->rows + i * (B + 1) + B);
+  }
+}
+
+/* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
+static void jvp_step(const linearised_step *at)
+{
+  memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+#ifdef DAMPED
+  memset(at->grown, 0, sizeof(wide));
+  growth_wide(at->step, 0, at->v, at->grown);
+#endif
+  momentum_rows(at, 0);
+  through_points(at, 0, at->v, NULL);
+  solve_forward(at);
+  through_points(at, 0, NULL, at->dz);
+  end_time(at, 0);
+  end_position(at, 0);
+  end_momentum(at, 0);
+}
+
+/* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). dz
+ * contains the adjoint variables of the unknowns. */
+static void vjp_with_unknowns(const linearised_step *at)
+{
+  memset(at->rows, 0, sizeof(wide) * SITES * (B + 1));
+#ifdef DAMPED
+  memset(at->grown, 0, sizeof(wide));
+#endif
+  end_momentum(at, 1);
+  end_position(at, 1);
+  end_time(at, 1);
+  through_points(at, 1, NULL, at->dz);
+  solve_back(at);
+  through_points(at, 1, at->v, NULL);
+  momentum_rows(at, 1);
+#ifdef DAMPED
+  growth_wide(at->step, 1, at->v, at->grown);
+#endif
+}
+
+static void vjp_step(const linearised_step *at)
+{
+  memset(at->dz, 0, sizeof(wide) * N);
+  vjp_with_unknowns(at);
+}
+
+/* Adds to the vectors `to` the JVPs (back: VJPs) of `from`, WIDTH at a time. */
+static int propagate_vectors(const linearised_step *at, int back, int count, const real *from, real *to)
+{
+  for (int first = 0; first < count; first += WIDTH) {
+    const int own = least(WIDTH, count - first);
+    memset(at->v, 0, sizeof(wide) * STEP_INPUTS);
+    for (int j = 0; j < own; j++)
+      for (int i = 0; i < STEP_INPUTS; i++)
+        at->v[i].lane[j] = from[(first + j) * STEP_INPUTS + i];
+    (back ? vjp_step : jvp_step)(at);
+    for (int j = 0; j < own; j++)
+      for (int i = 0; i < STEP_INPUTS; i++)
+        to[(first + j) * STEP_INPUTS + i] += at->v[i].lane[j];
+  }
+  return all_finite(to, count * STEP_INPUTS) ? OK : NOT_FINITE;
+}

@@ -1,0 +1,232 @@
+/* Derivatives of a step solved by separable_iteration.h and their transpose, by fixed-point iteration. With D = X - q0,
+ * the derivatives K = F_q at the points, s = h^2 / m and P the table PRODUCT, the variations x of the points and the
+ * adjoint variables y of the forces are the fixed points of
+ *   x = x0 + s P (K x),      y = y0 + s P^T (K^T y),
+ * which converge at the rate of the step itself. The derivatives are those of the exact solution of the stage
+ * equations. Requires: separable_iteration.h, vector_convergence.h, PRODUCT_BACK, the transposed table,
+ * point_derivatives and derivative_product, TRANSPOSED_PRODUCT, POINT_INPUTS and input_derivatives, MASS_INPUTS and
+ * mass_by_inputs. */
+
+enum {
+  STORED_OF_STEP = M * (POINTS + 2), /* numbers: D, then the increments of q and p */
+  INPUT_T = STEP_INPUTS - 2
+};
+
+/* Linearisation of a solved step: displacements D of its points from q0, the increments, and the derivatives of its
+ * forces behind memory for M variations. */
+typedef struct {
+  const step_data *step;
+  const iteration_data *data;
+  const double *dq, *dp;
+  double scale[M], mass[M];
+#ifdef VARIABLE_MASSES
+  double mass_derivative[MASS_DERIVATIVES];
+#endif
+  lanes D[GROUPS][M], u[GROUPS][M + POINT_DERIVATIVES], given[GROUPS][INPUT_DERIVATIVES];
+} iterated_step;
+
+/* Stores the displacements and increments of a step, from which linearise_points linearises it. */
+static void store_step(const step_data *step, const iteration_data *data, const double *memory, const double *dq,
+    const double *dp, double *to)
+{
+  lanes F[GROUPS][M], D[GROUPS][M];
+  lanes_load(memory, F);
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      D[n][i] = DRIFT[n] * (step->h * (data->inverse_mass[i] * step->p0[i])) +
+          (data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i);
+  lanes_store(D, to);
+  memcpy(to + M * POINTS, dq, sizeof(double) * M);
+  memcpy(to + M * (POINTS + 1), dp, sizeof(double) * M);
+}
+
+static __attribute__((noinline)) void linearise_points(const step_data *step, const iteration_data *data,
+    const double *told, iterated_step *at)
+{
+  lanes X[GROUPS][M];
+  at->step = step;
+  at->data = data;
+  at->dq = told + M * POINTS;
+  at->dp = at->dq + M;
+  lanes_load(told, at->D);
+  for (int i = 0; i < M; i++) {
+    at->scale[i] = data->square * data->inverse_mass[i];
+    at->mass[i] = fabs(1.0 / data->inverse_mass[i]);
+  }
+  for (int n = 0; n < GROUPS; n++) {
+    const lanes t = step->t + step->h * ABSCISSA[n];
+    for (int i = 0; i < M; i++)
+      X[n][i] = step->q0[i] + at->D[n][i];
+    point_derivatives(X[n], t, step->parameters, at->u[n] + M);
+    input_derivatives(X[n], t, step->parameters, at->given[n]);
+  }
+#ifdef VARIABLE_MASSES
+  mass_by_inputs(NULL, step->t, step->parameters, at->mass_derivative);
+#endif
+}
+
+/* f = K x; back: K^T x. */
+static inline void apply_derivatives(iterated_step *at, int back, lanes (*f)[M])
+{
+  const step_data *step = at->step;
+  for (int n = 0; n < GROUPS; n++)
+    (back ? TRANSPOSED_PRODUCT : derivative_product)(at->u[n], lanes_of(step->t), step->parameters, f[n]);
+}
+
+/* The next iterate of x, whose constant term is x0. */
+static inline lanes next_change(const iterated_step *at, const lanes *table, lanes (*x0)[M], lanes (*f)[M], int n,
+    int i)
+{
+  return x0[n][i] + at->scale[i] * apply(table, n, f, i);
+}
+
+/* Solves for the x in u, which starts as x0, and f = K x; back: the transpose. The change is measured in the metric of
+ * the masses, independent of the units of the coordinates. */
+static inline int solve_vectors(iterated_step *at, int back, lanes (*f)[M], int *look)
+{
+  const lanes *table = back ? PRODUCT_BACK : PRODUCT;
+  lanes(*x)[M + POINT_DERIVATIVES] = at->u, x0[GROUPS][M];
+  vector_changes past = {INFINITY, INFINITY};
+  int status = 0;
+  for (int n = 0; n < GROUPS; n++)
+    memcpy(x0[n], x[n], sizeof x0[n]);
+  apply_derivatives(at, back, f);
+  for (int k = 0; status == 0; k++) {
+    if (k < *look) {
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++)
+          x[n][i] = next_change(at, table, x0, f, n, i);
+    } else {
+      lanes moved[GROUPS] = {{0.0}}, size[GROUPS] = {{0.0}};
+      for (int i = 0; i < M; i++)
+        for (int n = 0; n < GROUPS; n++) {
+          const lanes next = next_change(at, table, x0, f, n, i), change = next - x[n][i];
+          moved[n] += at->mass[i] * (change * change);
+          size[n] += at->mass[i] * (next * next);
+          x[n][i] = next;
+        }
+      status = vectors_status(points_total(moved), points_total(size), &past, k, look);
+    }
+    apply_derivatives(at, back, f);
+  }
+  return status == 1 ? OK : NOT_CONVERGED;
+}
+
+/* Variations of the masses. */
+static inline void vary_masses(iterated_step *at, const double *v, double *dm)
+{
+  memset(dm, 0, sizeof(double) * M);
+#ifdef VARIABLE_MASSES
+  for (int e = 0; e < MASS_DERIVATIVES; e++)
+    dm[MASS_INPUTS[e][0]] += at->mass_derivative[e] * v[2 * M + MASS_INPUTS[e][1]];
+#else
+  (void)at, (void)v;
+#endif
+}
+
+/* Variations of the forces at fixed points. */
+static inline void vary_forces(iterated_step *at, const double *v, lanes (*F)[M])
+{
+  memset(F, 0, sizeof(lanes) * GROUPS * M);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
+      const int from = 2 * M + POINT_INPUTS[e][1];
+      const lanes by = from == INPUT_T ? v[INPUT_T] + v[INPUT_T + 1] * ABSCISSA[n] : lanes_of(v[from]);
+      F[n][POINT_INPUTS[e][0]] += at->given[n][e] * by;
+    }
+}
+
+/* Returns 1 if only q0 and p0 vary. */
+static inline int is_of_state(const double *v)
+{
+  int none = 1;
+  for (int j = 2 * M; j < STEP_INPUTS; j++)
+    none &= v[j] == 0.0;
+  return none;
+}
+
+/* Replaces v, variations of (q0, p0, parameters, t, h), by those of (q1, p1, parameters, t + h, h) (JVP). */
+static __attribute__((noinline)) int jvp_by_iteration(iterated_step *at, double *v, int *look)
+{
+  const iteration_data *data = at->data;
+  const double h = at->step->h, dh = v[INPUT_T + 1] / h;
+  const int of_state = is_of_state(v);
+  double dm[M];
+  lanes f[GROUPS][M], F[GROUPS][M];
+  vary_masses(at, v, dm);
+  vary_forces(at, v, F);
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = v[i] + DRIFT[n] * drift + by_length * at->D[n][i];
+    for (int n = 0; !of_state && n < GROUPS; n++)
+      at->u[n][i] += at->scale[i] * apply(PRODUCT, n, F, i);
+  }
+  if (solve_vectors(at, 0, f, look) != OK)
+    return NOT_CONVERGED;
+  for (int i = 0; i < M; i++) {
+    const double by_length = 2.0 * dh - data->inverse_mass[i] * dm[i];
+    const double drift = h * data->inverse_mass[i] * (v[M + i] - dh * at->step->p0[i]);
+    for (int n = 0; n < GROUPS; n++)
+      F[n][i] += f[n][i];
+    v[i] += drift + by_length * at->dq[i] + at->scale[i] * weigh(POINT_END_POSITION, F, i);
+    v[M + i] += dh * at->dp[i] + weigh(data->kick, F, i);
+  }
+  v[INPUT_T] += v[INPUT_T + 1];
+  return OK;
+}
+
+/* Adds to v the gradient with respect to parameters and time from the adjoint variables of the forces in u. */
+static inline void add_input_gradient(iterated_step *at, double *v)
+{
+  lanes by[STEP_INPUTS - 2 * M][GROUPS];
+  memset(by, 0, sizeof by);
+  for (int n = 0; n < GROUPS; n++)
+    for (int e = 0; e < INPUT_DERIVATIVES; e++) {
+      const int to = POINT_INPUTS[e][1];
+      const lanes part = at->given[n][e] * at->u[n][POINT_INPUTS[e][0]];
+      by[to][n] += part;
+      if (to == INPUT_T - 2 * M)
+        by[to + 1][n] += ABSCISSA[n] * part;
+    }
+  for (int j = 0; j < STEP_INPUTS - 2 * M; j++)
+    v[2 * M + j] += points_total(by[j]);
+}
+
+/* Replaces v, adjoint variables of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h) (VJP). */
+static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double *v, int *look)
+{
+  const iteration_data *data = at->data;
+  const double h = at->step->h;
+  double by_length[M], by_h = 0.0;
+  lanes f[GROUPS][M];
+  for (int i = 0; i < M; i++)
+    for (int n = 0; n < GROUPS; n++)
+      at->u[n][i] = POINT_END_POSITION[n] * (at->scale[i] * v[i]) + data->kick[n] * v[M + i];
+  if (solve_vectors(at, 1, f, look) != OK)
+    return NOT_CONVERGED;
+  v[INPUT_T + 1] += v[INPUT_T];
+  add_input_gradient(at, v);
+  for (int i = 0; i < M; i++) {
+    lanes part[GROUPS], turned[GROUPS], drifted[GROUPS];
+    for (int n = 0; n < GROUPS; n++) {
+      part[n] = f[n][i];
+      turned[n] = f[n][i] * at->D[n][i];
+      drifted[n] = f[n][i] * DRIFT[n];
+    }
+    const double drift = h * data->inverse_mass[i] * (v[i] + points_total(drifted));
+    by_length[i] = v[i] * at->dq[i] + points_total(turned);
+    by_h += 2.0 * by_length[i] - drift * at->step->p0[i] + v[M + i] * at->dp[i];
+    v[i] += points_total(part);
+    v[M + i] += drift;
+  }
+  v[INPUT_T + 1] += by_h / h;
+#ifdef VARIABLE_MASSES
+  for (int e = 0; e < MASS_DERIVATIVES; e++) {
+    const int i = MASS_INPUTS[e][0];
+    v[2 * M + MASS_INPUTS[e][1]] -= data->inverse_mass[i] * at->mass_derivative[e] * by_length[i];
+  }
+#endif
+  return OK;
+}

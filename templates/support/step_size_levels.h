@@ -1,0 +1,90 @@
+/* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a level (rung), and the error estimate
+ * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
+ * ERROR_POWER. Include before a trial of a step and trials.h. */
+enum {
+  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* levels per factor of two */
+  MOST_UP = 4 * OCTAVE, /* levels, while the first step size is determined */
+  MOST_DOWN = 2 * OCTAVE, /* after a step whose error was too large, or a first step that failed */
+  DOWN_FAILED = OCTAVE, /* after a step whose iteration failed */
+  AVOIDED = 32 /* steps after it that stay below its size */
+};
+
+#define USED_PART REAL(0.5) /* of the admissible error: predicted error of an increased step */
+#define FEW_POWERS REAL(4.5) /* growth of the error estimate over a factor of two, in powers of 2, for a curve of two
+                              * coefficients or one */
+#define LITTLE REAL(0.5) /* of the error below which a step may be two levels larger: smaller errors are not
+                          * distinguished */
+#define LAST_STEP REAL(1e-6) /* relative to the step: a step that ends so near t_end ends at t_end */
+#define FIRST_STEP REAL_EPSILON /* of the whole span: first trial step size */
+#define ROUNDOFF_ERROR (REAL(0.03125) * REAL_EPSILON) /* of a step: the sum over a million steps is of the size of
+                                                       * rounding errors */
+#define LEAST_UNRESOLVED (REAL(65536.0) * REAL_EPSILON * REAL_EPSILON) /* of a curve: smaller values are rounding
+                                                                        * errors */
+#ifndef ITERATION_PART
+#define ITERATION_PART REAL(0.00390625) /* tolerance of the stage equations relative to that of a step */
+#endif
+
+/* Limits of the error estimate: a step above `most` is rejected; below `few` the next step may be one level larger,
+ * below `fewer` two. */
+typedef struct {
+  real most, few, fewer;
+  real decay; /* ratio of successive coefficients of a curve whose error is just admissible */
+} error_limits;
+
+/* If the leading coefficient is the second one that contributes to the curvature, the error is proportional to its
+ * fourth power, since the lower one, which is small for short steps, is the only other one. With more coefficients the
+ * smallest decay is assumed. */
+static error_limits limits_of(real tolerance)
+{
+  const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
+  const real power = (real)OCTAVE * MATH(log2)(GROWTH);
+  const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
+      MATH(exp2)(MATH(log2)(most) / (power > FEW_POWERS ? power - 2 : power))};
+  return limits;
+}
+
+static real size_of_level(long long grid_level)
+{
+  const long long octave = grid_level >= 0 ? grid_level / OCTAVE : -((OCTAVE - 1 - grid_level) / OCTAVE);
+  return MATH(ldexp)(MANTISSA[grid_level - octave * OCTAVE], (int)octave);
+}
+
+/* Largest level whose step size does not exceed h > 0. */
+static long long level_below(real h)
+{
+  int exponent;
+  long long grid_level;
+  MATH(frexp)(h, &exponent);
+  for (grid_level = (long long)exponent * OCTAVE; size_of_level(grid_level) > h; grid_level--)
+    ;
+  return grid_level;
+}
+
+/* Error estimate if the step size were `rungs` levels larger. */
+static inline real error_at(real error, int rungs)
+{
+  for (; rungs > 0; rungs--)
+    error *= GROWTH;
+  for (; rungs < 0; rungs++)
+    error /= GROWTH;
+  return error;
+}
+
+/* Change of level for the next step, down by a factor of two at most. The error is expected to continue its growth; a
+ * decrease is only partly trusted. */
+static int next_change(real error, real before, const error_limits *limits)
+{
+  const real expected =
+      before > 0 && error > before ? error * (error / before) : larger(error, before / (GROWTH * GROWTH));
+  int change = expected < limits->fewer ? 2 : expected < limits->few;
+  while (change > -OCTAVE && error_at(expected, change) > limits->most)
+    change--;
+  return change;
+}
+
+/* Size of the next step, or the remaining interval if that is hardly longer; *last is then 1. */
+static real next_size(real length, real rest, int *last)
+{
+  *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
+  return *last ? rest : MATH(copysign)(length, rest);
+}

@@ -1,0 +1,33 @@
+/* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors. Requires: convergence.h. */
+
+#define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
+#define LEFT_TO_COME (DBL_EPSILON * DBL_EPSILON / 16.0) /* squared: relative change still to come that is accepted */
+
+#define LEAST_SIZE 1e-250 /* squared size below which vectors underflow */
+
+/* Squared relative changes of the last two iterations; infinite if there were none. */
+typedef struct {
+  double last, before;
+} vector_changes;
+
+/* Returns 1 if the iteration has converged after a change `moved` of vectors of size `size` (both squared), 0 if it
+ * must continue, -1 if it does not converge or the squares overflow or underflow. Convergence is tested from iteration
+ * *look on: one before the last iteration of the previous call, since successive steps of a run are similar. */
+static inline int vectors_status(double moved, double size, vector_changes *past, int k, int *look)
+{
+  const double last = past->last, before = past->before, relative = size > 0.0 ? moved / size : moved;
+  const int first = !(last < INFINITY), finite = size < INFINITY && (size > LEAST_SIZE || moved == 0.0);
+  const int small = relative <= (first ? MOVED_BY_ROUNDING : LEFT_TO_COME);
+  const int last_but_one = !first && relative * relative <= LEFT_TO_COME * last &&
+      relative * SUDDEN_CONVERGENCE * last <= LEFT_TO_COME * before;
+  const int stopped = !first && relative >= last &&
+      (relative < CERTAIN_ROUNDING || (relative < ROUNDING_LEVEL && relative >= STAGNATION * before));
+  const int shrinks = first || relative < 0.5 * last || relative < STAGNATION * before || relative < PROGRESS_LEVEL;
+  past->before = last;
+  past->last = relative;
+  if (finite && (small || last_but_one || stopped)) {
+    *look = k - 1;
+    return 1;
+  }
+  return finite && relative < INFINITY && k < MAX_ITERATIONS && shrinks ? 0 : -1;
+}
