@@ -80,7 +80,7 @@ class Part:
 
 def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the positions after all steps, and the number of iterations."""
-    (a, b, c), sweeps, turn = tables(), 0, 0
+    (a, b, c), iterations, turn = tables(), 0, 0
     for _ in range(STEPS):
         straight = q + H * c[:, None] * v
         x, change = straight, np.inf
@@ -88,13 +88,13 @@ def run(part: Part, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, int]:
             f = forces(x, *part.neighbours(x, turn))
             moved = straight + H * H * (a @ a @ f) - x
             x, before, change = x + moved, change, part.total(moved, turn)
-            sweeps, turn = sweeps + 1, 1 - turn
+            iterations, turn = iterations + 1, 1 - turn
             if change == 0.0 or (change >= before and change < 1e-24 * q.size):
                 break
         f = forces(x, *part.neighbours(x, turn))
         turn = 1 - turn
         q, v = q + H * v + H * H * (b @ a @ f), v + H * (b @ f)
-    return q, sweeps
+    return q, iterations
 
 
 def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.ndarray) -> None:
@@ -103,9 +103,9 @@ def work(part: Part, q: np.ndarray, v: np.ndarray, end: np.ndarray, numbers: np.
     places = slice(part.rank * len(q) // part.count, (part.rank + 1) * len(q) // part.count)
     part.meet()
     began, busy = time.perf_counter(), time.process_time()
-    end[places], sweeps = run(part, q[places], v[places])
+    end[places], iterations = run(part, q[places], v[places])
     took = time.perf_counter() - began
-    numbers[part.rank] = took, sweeps, took - (time.process_time() - busy)
+    numbers[part.rank] = took, iterations, took - (time.process_time() - busy)
 
 
 def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float, float]:
@@ -125,12 +125,12 @@ def on_processes(count: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, 
     for process in processes:
         process.join()
         assert process.exitcode == 0
-    end, (seconds, sweeps, waited) = arrays["end"].copy(), arrays["numbers"].max(axis=0)
+    end, (seconds, iterations, waited) = arrays["end"].copy(), arrays["numbers"].max(axis=0)
     del arrays, arrived, parts, given, processes
     for memory in (*shared.values(), meetings):
         memory.close()
         memory.unlink()
-    return end, seconds / sweeps, waited / seconds
+    return end, seconds / iterations, waited / seconds
 
 
 def best(count: int, size: int) -> tuple[np.ndarray, float, float]:
@@ -157,12 +157,12 @@ def main() -> None:
     sizes = (1600, 8000, 32_000)
     measured = {count: np.array([best(count, size)[1:] for size in sizes]) for count in (1, 2)}
     times, waited = ({count: found[:, k] for count, found in measured.items()} for k in (0, 1))
-    slope = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
-    alone = times[1][0] - slope * sizes[0]
-    meeting = max(0.0, times[2][0] - alone - slope * sizes[0] / 2)
-    print(f"c = {1e9 * slope:.0f} ns a place and sweep; a halo and a reduction: {1e6 * meeting:.0f} us")
+    derivative = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
+    alone = times[1][0] - derivative * sizes[0]
+    meeting = max(0.0, times[2][0] - alone - derivative * sizes[0] / 2)
+    print(f"c = {1e9 * derivative:.0f} ns a place and sweep; a halo and a reduction: {1e6 * meeting:.0f} us")
     for size, seconds in zip(sizes, times[2], strict=True):
-        model = alone + slope * size / 2 + meeting
+        model = alone + derivative * size / 2 + meeting
         print(f"{size} places on two: {1e3 * seconds:.3f} ms a sweep, by the model {1e3 * model:.3f}")
     if (most := max(map(np.max, waited.values()))) > 0.1:
         print(f"others had the cores for up to {100 * most:.0f} % of these times: they say nothing of the model")

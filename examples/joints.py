@@ -53,9 +53,9 @@ def angle(a: Point, b: Point, c: Point, cosine: str) -> str:
     return f"({a[0]} - {b[0]})*({c[0]} - {b[0]}) + ({a[1]} - {b[1]})*({c[1]} - {b[1]}) = {cosine}"
 
 
-def slide(a: Point, slope: str) -> str:
+def slide(a: Point, derivative: str) -> str:
     """Return a constraint of a point to a line through the origin."""
-    return f"{a[0]}*sin({slope}) = {a[1]}*cos({slope})"
+    return f"{a[0]}*sin({derivative}) = {a[1]}*cos({derivative})"
 
 
 def weld(one: tuple[str, str, str], other: tuple[str, str, str], along: str, turned: str) -> list[str]:
@@ -103,8 +103,8 @@ def pendulum_on_a_slide() -> Mechanism:
         name="pendulum on a slide",
         coordinates=[*point(1), *point(2)],
         lagrangian=falling({1: "M", 2: "m"}),
-        parameters={"M": 2.0, "m": 1.0, "l": 0.5, "slope": -0.4, "g": GRAVITY},
-        constraints=[slide(point(1), "slope"), rod(point(1), point(2), "l")],
+        parameters={"M": 2.0, "m": 1.0, "l": 0.5, "derivative": -0.4, "g": GRAVITY},
+        constraints=[slide(point(1), "derivative"), rod(point(1), point(2), "l")],
     )
     return Mechanism(system, [0.0, 0.0, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0])
 

@@ -107,13 +107,13 @@ static void quadrature_value(const double *u, double t, const double *parameters
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
  * inverse_root_5, 4 neg. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
+static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   value[2] = u[2];
   value[3] = u[3];
-  slope[4] = 1.0;
-  slope[5] = 1.0;
+  derivative[4] = 1.0;
+  derivative[5] = 1.0;
   const double w0 = u[0] * u[0];
   const double w1 = u[1] * u[1];
   const double w2 = w0 + w1;
@@ -122,11 +122,11 @@ static void quadrature_slope(const double *u, double t, const double *parameters
   value[1] = -(w3 * u[1]);
   const double w4 = 3.0 * parameters[0];
   const double w5 = inverse_root_5(w2);
-  slope[0] = -(w3 - w4 * w0 * w5);
-  slope[3] = -(w3 - w4 * w1 * w5);
+  derivative[0] = -(w3 - w4 * w0 * w5);
+  derivative[3] = -(w3 - w4 * w1 * w5);
   const double w6 = w4 * w5 * u[0] * u[1];
-  slope[1] = w6;
-  slope[2] = w6;
+  derivative[1] = w6;
+  derivative[2] = w6;
 }
 
 /* Derivatives of lambda . E at u = (q, v, a, lambda). Operations: 21 *, 3 +, 4 -, 1 inverse_root_3, 1 inverse_root_5.
@@ -153,17 +153,17 @@ static void node_value(const double *u, double t, const double *parameters, doub
 
 /* The same, and the nonzero derivatives with respect to u = (q, v, a, lambda). Operations: 55 *, 6 +, 12 -, 1
  * inverse_root_3, 1 inverse_root_5, 1 inverse_root_7, 1 neg. */
-static void node_slope(const double *u, double t, const double *parameters, double *value, double *slope)
+static void node_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   value[2] = 0.0;
   value[3] = 0.0;
   value[4] = u[6];
   value[5] = u[7];
-  slope[8] = 1.0;
-  slope[9] = 1.0;
-  slope[14] = 1.0;
-  slope[15] = 1.0;
+  derivative[8] = 1.0;
+  derivative[9] = 1.0;
+  derivative[14] = 1.0;
+  derivative[15] = 1.0;
   const double w0 = u[0] * u[0];
   const double w1 = u[1] * u[1];
   const double w2 = w0 + w1;
@@ -183,34 +183,34 @@ static void node_slope(const double *u, double t, const double *parameters, doub
   const double w12 = 5.0 * parameters[0];
   const double w13 = inverse_root_7(w2);
   const double w14 = w12 * w0 * w13;
-  slope[0] = (-3.0) * (w10 + w11 * u[1] * u[7] - w12 * (w0 * u[0]) * w13 * u[6] - w14 * u[1] * u[7]);
+  derivative[0] = (-3.0) * (w10 + w11 * u[1] * u[7] - w12 * (w0 * u[0]) * w13 * u[6] - w14 * u[1] * u[7]);
   const double w15 = w11 * u[6];
   const double w16 = w12 * w1 * w13;
-  slope[3] = (-3.0) * (w15 * u[0] + w7 * u[1] * u[7] - w12 * w13 * (w1 * u[1]) * u[7] - w16 * u[6] * u[0]);
+  derivative[3] = (-3.0) * (w15 * u[0] + w7 * u[1] * u[7] - w12 * w13 * (w1 * u[1]) * u[7] - w16 * u[6] * u[0]);
   const double w17 = (-3.0) * (w11 * u[0] * u[7] + w15 * u[1] - w16 * u[0] * u[7] - w14 * u[6] * u[1]);
-  slope[1] = w17;
-  slope[2] = w17;
+  derivative[1] = w17;
+  derivative[2] = w17;
   const double w18 = w3 - w6;
-  slope[4] = w18;
-  slope[10] = w18;
+  derivative[4] = w18;
+  derivative[10] = w18;
   const double w19 = -w8;
-  slope[5] = w19;
-  slope[6] = w19;
-  slope[11] = w19;
-  slope[12] = w19;
+  derivative[5] = w19;
+  derivative[6] = w19;
+  derivative[11] = w19;
+  derivative[12] = w19;
   const double w20 = w3 - w9;
-  slope[7] = w20;
-  slope[13] = w20;
+  derivative[7] = w20;
+  derivative[13] = w20;
 }
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
-static void legendre(const double *u, double t, const double *parameters, double *value, double *slope)
+static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t, (void)parameters;
   value[0] = u[2];
   value[1] = u[3];
-  slope[0] = 1.0;
-  slope[1] = 1.0;
+  derivative[0] = 1.0;
+  derivative[1] = 1.0;
 }
 
 /* L at u = (q, v). Operations: 7 *, 3 +, 1 inverse_root_1. */
@@ -241,13 +241,13 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
     const band *shape)
 {
   const double h = step->h;
-  double *u = step->scratch, *value = u + 8, *slope = value + 8;
+  double *u = step->scratch, *value = u + 8, *derivative = value + 8;
   gather(QUADRATURE_GATHER_0[0], 2, h, z, 2, u + 0, 4, 1);
   offset(step, 2, u + 0, 4);
   gather(QUADRATURE_GATHER_1[0], 2, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
-      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, slope + n * 6);
+      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
@@ -256,9 +256,9 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   if (!jacobian)
     return;
   scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 2, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
-      4, &slope[0], 6, jacobian, shape);
+      4, &derivative[0], 6, jacobian, shape);
   scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 2, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      &slope[4], 6, jacobian, shape);
+      &derivative[4], 6, jacobian, shape);
 }
 
 /* Node points: adds their part of the rows, and of the Jacobian unless it is NULL. */
@@ -266,7 +266,7 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
     const band *shape)
 {
   const double h = step->h;
-  double *u = step->scratch, *value = u + 16, *slope = value + 16;
+  double *u = step->scratch, *value = u + 16, *derivative = value + 16;
   gather(NODE_GATHER_0[0], 2, h, z, 2, u + 0, 8, 1);
   offset(step, 2, u + 0, 8);
   gather(NODE_GATHER_1[0], 2, 1, z, 2, u + 2, 8, 1);
@@ -274,7 +274,7 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
   gather(NODE_GATHER_3[0], 2, 1, z, 2, u + 6, 8, 1);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
-      node_slope(u + n * 8, step->t, step->parameters, value + n * 8, slope + n * 16);
+      node_slope(u + n * 8, step->t, step->parameters, value + n * 8, derivative + n * 16);
     else
       node_value(u + n * 8, step->t, step->parameters, value + n * 8);
   }
@@ -284,16 +284,16 @@ static void add_node(const step_data *step, const double *z, double *rows, doubl
   scatter(NODE_SCATTER_3[0], 2, NODE_WEIGHT, h, value + 6, 8, 2, rows, size);
   if (!jacobian)
     return;
-  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, &slope[0], 16,
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h * h, NODE_SLOPE_0, 4, &derivative[0],
+      16, jacobian, shape);
+  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_1, 4, &derivative[4], 16,
       jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_0[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_1, 4, &slope[4], 16,
+  scatter_derivatives(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_2, 2, &derivative[8], 16,
       jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_2[0], NODE_GATHER_3[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_2, 2, &slope[8], 16, jacobian,
-      shape);
-  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_3, 4, &slope[10], 16,
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_0[0], 2, NODE_WEIGHT, h * h, NODE_SLOPE_3, 4, &derivative[10], 16,
       jacobian, shape);
-  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_4, 2, &slope[14], 16, jacobian,
-      shape);
+  scatter_derivatives(NODE_SCATTER_3[0], NODE_GATHER_2[0], 2, NODE_WEIGHT, 1, NODE_SLOPE_4, 2, &derivative[14], 16,
+      jacobian, shape);
 }
 
 /* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before
@@ -358,13 +358,13 @@ static const lanes BEFORE[POINTS * GROUPS] = {-1.0, -4.0, 4.0, 15.0};
 
 /* E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m). Operations: 19 *, 3 +, 4 -, 1
  * inverse_root_3, 1 inverse_root_5. */
-static inline void node_lanes(const lanes *u, lanes t, const double *parameters, lanes *value, lanes *slope)
+static inline void node_lanes(const lanes *u, lanes t, const double *parameters, lanes *value, lanes *derivative)
 {
   (void)t;
   value[4] = lanes_of(0.0);
   value[5] = lanes_of(0.0);
-  slope[0] = lanes_of(1.0);
-  slope[1] = lanes_of(1.0);
+  derivative[0] = lanes_of(1.0);
+  derivative[1] = lanes_of(1.0);
   const lanes w0 = u[0] * u[0];
   const lanes w1 = u[1] * u[1];
   const lanes w2 = w0 + w1;

@@ -92,13 +92,13 @@ static void quadrature_value(const double *u, double t, const double *parameters
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 13 *, 1 +, 2 -, 1 inverse_root_3, 1
  * inverse_root_5, 4 neg. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
+static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   value[2] = u[2];
   value[3] = u[3];
-  slope[4] = 1.0;
-  slope[5] = 1.0;
+  derivative[4] = 1.0;
+  derivative[5] = 1.0;
   const double w0 = u[0] * u[0];
   const double w1 = u[1] * u[1];
   const double w2 = w0 + w1;
@@ -107,21 +107,21 @@ static void quadrature_slope(const double *u, double t, const double *parameters
   value[1] = -(w3 * u[1]);
   const double w4 = 3.0 * parameters[0];
   const double w5 = inverse_root_5(w2);
-  slope[0] = -(w3 - w4 * w0 * w5);
-  slope[3] = -(w3 - w4 * w1 * w5);
+  derivative[0] = -(w3 - w4 * w0 * w5);
+  derivative[3] = -(w3 - w4 * w1 * w5);
   const double w6 = w4 * w5 * u[0] * u[1];
-  slope[1] = w6;
-  slope[2] = w6;
+  derivative[1] = w6;
+  derivative[2] = w6;
 }
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: constants. */
-static void legendre(const double *u, double t, const double *parameters, double *value, double *slope)
+static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t, (void)parameters;
   value[0] = u[2];
   value[1] = u[3];
-  slope[0] = 1.0;
-  slope[1] = 1.0;
+  derivative[0] = 1.0;
+  derivative[1] = 1.0;
 }
 
 /* L at u = (q, v). Operations: 7 *, 3 +, 1 inverse_root_1. */
@@ -152,13 +152,13 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
     const band *shape)
 {
   const double h = step->h;
-  double *u = step->scratch, *value = u + 16, *slope = value + 16;
+  double *u = step->scratch, *value = u + 16, *derivative = value + 16;
   gather(QUADRATURE_GATHER_0[0], 4, h, z, 2, u + 0, 4, 1);
   offset(step, 4, u + 0, 4);
   gather(QUADRATURE_GATHER_1[0], 4, 1, z, 2, u + 2, 4, 1);
   for (int n = 0; n < 4; n++) {
     if (jacobian)
-      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, slope + n * 6);
+      quadrature_slope(u + n * 4, step->t, step->parameters, value + n * 4, derivative + n * 6);
     else
       quadrature_value(u + n * 4, step->t, step->parameters, value + n * 4);
   }
@@ -167,9 +167,9 @@ static void add_quadrature(const step_data *step, const double *z, double *rows,
   if (!jacobian)
     return;
   scatter_derivatives(QUADRATURE_SCATTER_0[0], QUADRATURE_GATHER_0[0], 4, QUADRATURE_WEIGHT, h * h, QUADRATURE_SLOPE_0,
-      4, &slope[0], 6, jacobian, shape);
+      4, &derivative[0], 6, jacobian, shape);
   scatter_derivatives(QUADRATURE_SCATTER_1[0], QUADRATURE_GATHER_1[0], 4, QUADRATURE_WEIGHT, 1, QUADRATURE_SLOPE_1, 2,
-      &slope[4], 6, jacobian, shape);
+      &derivative[4], 6, jacobian, shape);
 }
 
 /* Evaluates the stage equations: for every coordinate B residuals and p1 - p0 in rows; the sizes of p1 and q1 before

@@ -30,12 +30,12 @@ static const int POSITION_IN_MATRIX[M] = {0};
 static const int MASS_ENTRY[1][2] = {{0, 0}};
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */
-static void legendre(const double *u, double t, const double *parameters, double *value, double *slope)
+static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   const double w0 = parameters[0] * (parameters[1] * parameters[1]);
   value[0] = w0 * u[1];
-  slope[0] = w0;
+  derivative[0] = w0;
 }
 
 /* L at u = (q, v). Operations: 9 *, 1 +, 1 cos. */

@@ -55,24 +55,24 @@ static void quadrature_value(const double *u, double t, const double *parameters
 }
 
 /* The same, and the nonzero derivatives with respect to u = (q, v). Operations: 7 *, 1 cos, 2 neg, 1 sin. */
-static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *slope)
+static void quadrature_slope(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   const double w0 = parameters[2] * parameters[1] * parameters[0];
   value[0] = -(w0 * sin(u[0]));
-  slope[0] = -(w0 * cos(u[0]));
+  derivative[0] = -(w0 * cos(u[0]));
   const double w1 = parameters[0] * (parameters[1] * parameters[1]);
   value[1] = w1 * u[1];
-  slope[1] = w1;
+  derivative[1] = w1;
 }
 
 /* Momenta L_v and mass matrix L_vv at u = (q, v). Operations: 3 *. */
-static void legendre(const double *u, double t, const double *parameters, double *value, double *slope)
+static void legendre(const double *u, double t, const double *parameters, double *value, double *derivative)
 {
   (void)t;
   const double w0 = parameters[0] * (parameters[1] * parameters[1]);
   value[0] = w0 * u[1];
-  slope[0] = w0;
+  derivative[0] = w0;
 }
 
 /* L at u = (q, v). Operations: 9 *, 1 +, 1 cos. */
@@ -108,11 +108,11 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
     double *jacobian, const band *shape)
 {
   const double h = step->h;
-  double u[4], value[4], slope[4];
+  double u[4], value[4], derivative[4];
   quadrature_points(step, z, u);
   for (int n = 0; n < 2; n++) {
     if (jacobian)
-      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, slope + n * 2);
+      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, derivative + n * 2);
     else
       quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
   }
@@ -128,8 +128,9 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
   if (!jacobian)
     return;
   memset(jacobian, 0, sizeof(double) * band_size(shape));
-  *entry(jacobian, shape, 0, 0, 0, 0) = 0.7886751345948129 * (0.5 * (h * h) * slope[0] * 0.21132486540518713) +
-      0.21132486540518713 * (0.5 * (h * h) * slope[2] * 0.7886751345948129) + (-0.5 * slope[1] - 0.5 * slope[3]);
+  *entry(jacobian, shape, 0, 0, 0, 0) = 0.7886751345948129 * (0.5 * (h * h) * derivative[0] * 0.21132486540518713) +
+      0.21132486540518713 * (0.5 * (h * h) * derivative[2] * 0.7886751345948129) +
+      (-0.5 * derivative[1] - 0.5 * derivative[3]);
 }
 
 #include "support/newton.h"

@@ -161,7 +161,7 @@ class _Sources:
     @property
     def uses_fallback_library(self) -> bool:
         """Return whether Newton's iteration comes from a separate fallback library."""
-        return self.solver == "auto" and self.program().sweep is not None and not self.program().newton
+        return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
 
     def integrator(self) -> str:
         """Return the C source and its interface as JSON."""
@@ -199,14 +199,18 @@ class _Sources:
 
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
-        twin, sweep = equivalent_lagrangian(self.system), self.program().sweep
+        twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
         varied = (
-            with_tangent_vectors(twin, count) if twin and sweep and sweep.serves_many and sweep.constant_mass else None
+            with_tangent_vectors(twin, count)
+            if twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass
+            else None
         )
         if varied is None:
             return None
         stages, prefix = discretise(varied, self.method), self.program().prefix
-        program = lower(varied, self.method, stages, prefix=prefix, sweep=iteration_of(varied, stages), newton=False)
+        program = lower(
+            varied, self.method, stages, prefix=prefix, fixed_point=iteration_of(varied, stages), newton=False
+        )
         return render_ensemble(program)
 
     def _rendered(self, control: Control | None = None) -> Source:
@@ -315,16 +319,16 @@ def _program(
     explicit = solver in ("auto", "explicit") and not system.integrands
     splitting = splitting_of(system, method) if explicit else None
     use_fixed_point = lanes and solver in ("auto", "fixed-point") and splitting is None
-    sweep = iteration_of(system, stages) if use_fixed_point else None
-    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else sweep)
-    alone = sweep is not None and not fallback and not system.integrands
+    fixed_point = iteration_of(system, stages) if use_fixed_point else None
+    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
+    alone = fixed_point is not None and not fallback and not system.integrands
     newton = solver in ("auto", "newton") and splitting is None and not alone
     return lower(
         system,
         method,
         stages,
         prefix=prefix,
-        sweep=sweep,
+        fixed_point=fixed_point,
         splitting=splitting,
         newton=newton,
         rattle=rattle_of(system, stages) if solver == "auto" else None,
@@ -356,7 +360,7 @@ def describe(
         map_names=tuple(each.name for each in program.momentum_maps),
         map_formulas=tuple(each.formula for each in program.momentum_maps),
         map_exact=tuple(each.exact for each in program.momentum_maps),
-        has_fallback=uses_fallback_library or (program.newton and program.sweep is not None),
+        has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         monitor="" if monitor is None else str(monitor),
         exchange_names=program.exchanges,
@@ -372,7 +376,7 @@ def _solver_of(program: Program) -> str:
     """Return the name of the solver that is tried first."""
     if program.splitting:
         return "explicit"
-    return "rattle" if program.rattle else "fixed-point" if program.sweep else "newton"
+    return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
 
 
 def c_identifier(name: str) -> str:

@@ -47,18 +47,18 @@ def collocated_step(motion, stages, degree, texts):
     """Return a function from (x, derivatives, inputs, h) to the next x, residuals, and formulas with integrals."""
     m, (A, b, c) = motion.system.dimension, gauss_tableau(stages)
     called = motion.called(ca, texts)
-    x0, slopes, h = ca.SX.sym("x", 2 * m), ca.SX.sym("k", 2 * m, stages), ca.SX.sym("h")
+    x0, partials, h = ca.SX.sym("x", 2 * m), ca.SX.sym("k", 2 * m, stages), ca.SX.sym("h")
     u = ca.SX.sym("u", len(motion.system.inputs), degree + 1)
     residuals, along = [], []
     for line, place, at in zip(A, c, range(stages), strict=True):
-        x = x0 + h * (slopes @ line)
+        x = x0 + h * (partials @ line)
         basis = BPoly(np.eye(degree + 1)[:, np.newaxis], [0, 1])(place)
         found = called(ca.vertsplit(x[:m]), ca.vertsplit(x[m:]), ca.vertsplit(u @ basis))
-        residuals.append(slopes[:, at] - ca.vertcat(x[m:], *found[:m]))
+        residuals.append(partials[:, at] - ca.vertcat(x[m:], *found[:m]))
         along.append(ca.vertcat(*found[m:]))
     along = ca.horzcat(*along)
-    found = [x0 + h * (slopes @ b), ca.vertcat(*residuals), along, h * along @ b]
-    return ca.Function("step", [x0, slopes, u, h], found)
+    found = [x0 + h * (partials @ b), ca.vertcat(*residuals), along, h * along @ b]
+    return ca.Function("step", [x0, partials, u, h], found)
 
 
 def collocated(system, stages, *, steps, duration, start, end, cost, guess, bounds=None, degree=0):
@@ -66,20 +66,20 @@ def collocated(system, stages, *, steps, duration, start, end, cost, guess, boun
     motion, bounds, m, k = Motion(system), bounds or {}, system.dimension, len(system.inputs)
     between = [text for text in bounds if text not in system.inputs]
     step = collocated_step(motion, stages, degree, [cost, *between])
-    x, slopes = ca.MX.sym("x", 2 * m, steps + 1), ca.MX.sym("slopes", 2 * m, stages * steps)
+    x, partials = ca.MX.sym("x", 2 * m, steps + 1), ca.MX.sym("partials", 2 * m, stages * steps)
     u, lasting = ca.MX.sym("u", k, steps * (degree + 1)), ca.MX.sym("duration")
-    reached, residuals, along, integrals = step.map(steps)(x[:, :-1], slopes, u, ca.repmat(lasting / steps, 1, steps))
+    reached, residuals, along, integrals = step.map(steps)(x[:, :-1], partials, u, ca.repmat(lasting / steps, 1, steps))
     constraints = [(x[:, 1:] - reached, 0, 0), (residuals, 0, 0)]
     for column, conditions in ((x[:, 0], start), (x[:, -1], end)):
         constraints += [(column[motion.names.index(name)], value, value) for name, value in conditions.items()]
     constraints += [(along[row, :], *limits(bounds[text])) for row, text in enumerate(between, 1)]
 
-    unknowns = ca.veccat(x, slopes, u, lasting)
+    unknowns = ca.veccat(x, partials, u, lasting)
     program = {"x": unknowns, "f": ca.sum2(integrals[0, :]), "g": ca.veccat(*(each for each, _, _ in constraints))}
     solver = ca.nlpsol("collocation", "ipopt", program, QUIET)
     pushes = np.array([limits(bounds.get(name, (None, None))) for name in system.inputs])
     lasts = np.broadcast_to(duration, 2)
-    free = np.full(x.numel() + slopes.numel(), np.inf)
+    free = np.full(x.numel() + partials.numel(), np.inf)
     lowest, highest = (
         np.concatenate([sign * free, np.tile(pushes[:, side], steps * (degree + 1)), lasts[[side]]])
         for side, sign in ((0, -1), (1, 1))
@@ -113,5 +113,5 @@ def first_guess(system, stages, steps, guess, duration):
     given = [np.atleast_1d(guess[q.name]) for q in system.coordinates]
     q = np.array([np.interp(fractions, np.linspace(0, 1, len(own)), own) for own in given])
     x = np.concatenate([q, np.gradient(q, fractions * duration, axis=1)])
-    slopes = np.diff(x) * steps / duration
-    return x.ravel("F"), np.repeat(slopes, stages, axis=1).ravel("F")
+    partials = np.diff(x) * steps / duration
+    return x.ravel("F"), np.repeat(partials, stages, axis=1).ravel("F")

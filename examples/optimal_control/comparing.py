@@ -19,11 +19,11 @@ def truly(system, x, t, inputs):
     for begin, end in pairwise(t):
         edge = 1e-12 * (end - begin)  # an input may jump at breakpoints
 
-        def slopes(now, x, first=begin + edge, last=end - edge):
+        def partials(now, x, first=begin + edge, last=end - edge):
             pushes = [float(inputs[name](min(max(now, first), last))) for name in system.inputs]
             return np.concatenate([x[m:], called(x[:m], x[m:], pushes)])
 
-        x = solve_ivp(slopes, (begin, end), x, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+        x = solve_ivp(partials, (begin, end), x, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     return x
 
 

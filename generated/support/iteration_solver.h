@@ -1,4 +1,4 @@
-/* Step by fixed-point iteration, with a fallback. Requires: a sweep, and fall_back. */
+/* Step by fixed-point iteration, with a fallback. Requires: a fixed-point iteration, and fall_back. */
 typedef iteration_data solver_data;
 
 static void prepare(const step_data *step, solver_data *data)
@@ -11,7 +11,7 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
     long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
 {
   long long steps = 0;
-  int status = sweep(step, data, memory, &steps, dq, dp, options, report);
+  int status = fixed_point(step, data, memory, &steps, dq, dp, options, report);
   if (status != OK) {
     status = fall_back(status, step, dq, dp, options, report, workspace);
     if (status == OK && !reaches(step, dq, dp))
@@ -30,7 +30,7 @@ HOT int solve(const step_data *step, const solver_data *data, double *memory, lo
     const solver_options *options, solver_report *report, double *workspace)
 {
   long long steps = *guess;
-  if (steps > 0 && sweep(step, data, memory, &steps, dq, dp, options, report) == OK) {
+  if (steps > 0 && fixed_point(step, data, memory, &steps, dq, dp, options, report) == OK) {
     *guess = steps;
     return OK;
   }

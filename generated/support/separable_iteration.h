@@ -50,7 +50,8 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
  * more with double-double coefficients; the forces are stored for the predictor. Rounding of the coefficients would
  * displace the points to the same side in every step, and the last iteration alone would leave a part of that, so that
  * all iterations include the low words, with the first forces. On failure the increments are undefined. */
-HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq, number *dp,
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp,
     const solver_options *options, solver_report *report)
 {
   coordinates X[GROUPS], base[GROUPS], rests[GROUPS], own[GROUPS], *F = kept(past, own);

@@ -17,7 +17,7 @@ from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["DRIFTS", "fitted_slope", "run_drift"]
+__all__ = ["DRIFTS", "fitted_rate", "run_drift"]
 
 DRIFTS = {"kepler:0.2": (0.5, 0.35, 0.2), "kepler:0.5": (0.2, 0.15, 0.1)}
 """Three step sizes for each case, from the largest without a visible truncation error down."""
@@ -73,12 +73,12 @@ def drift_rows(chosen: Case, h: float, steps: int, *, with_heyoka: bool) -> list
 def _energy_entries(stepper: Stepper, q: Array, p: Array) -> dict[str, float]:
     energy = stepper.energy(q, p)
     error = (energy - energy[0]) / abs(energy[0])
-    drift, uncertainty = fitted_slope(error)
+    drift, uncertainty = fitted_rate(error)
     largest = float(np.abs(error).max())
     return {"at_the_end": float(error[-1]), "largest": largest, "drift": drift, "uncertainty": uncertainty}
 
 
-def fitted_slope(error: Array) -> tuple[float, float]:
+def fitted_rate(error: Array) -> tuple[float, float]:
     """Return the slope of a line fitted to equidistant samples, times their length, and its standard error.
 
     Round-off makes the energy a random walk, so the residuals of the fit are correlated and the usual error is too
@@ -86,6 +86,6 @@ def fitted_slope(error: Array) -> tuple[float, float]:
     blocks, with the variance 6/5 of the slope of a walk of unit variance.
     """
     t = np.linspace(-0.5, 0.5, len(error))
-    slope = float(t @ error / (t @ t))
+    derivative = float(t @ error / (t @ t))
     gains = np.diff(error[np.linspace(0, len(error) - 1, BLOCKS + 1).astype(int)])
-    return slope, float(np.sqrt(1.2 * BLOCKS * np.var(gains, ddof=1)))
+    return derivative, float(np.sqrt(1.2 * BLOCKS * np.var(gains, ddof=1)))

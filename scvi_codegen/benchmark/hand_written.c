@@ -89,7 +89,7 @@ long hand_written(double *q, double *v, double strength, double h, long steps, l
   const lanes hb = h * B;
   lanes aa[S], hb_low, x[M], f[M], before[M], base[M];
   double drift[M], drift_low[M], cut_q[M] = {0}, cut_v[M] = {0}, first = 1.0;
-  long sweeps = 0;
+  long iterations = 0;
   for (int n = 0; n < S; n++) {
     aa[n] = h2 * AA[n];
     hb_low[n] = fma(h, B[n], -hb[n]) + h * B_LOW[n];
@@ -140,10 +140,10 @@ long hand_written(double *q, double *v, double strength, double h, long steps, l
       add(q + i, cut_q + i, both, cut + (drift_low[i] + h2_low * sum));
       add(v + i, cut_v + i, total(hb * f[i] + hb_low * f[i]), 0.0);
     }
-    sweeps += count;
+    iterations += count;
     if (step % every == 0)
       for (int i = 0; i < M; i++)
         *out++ = q[i];
   }
-  return sweeps;
+  return iterations;
 }

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.drift import fitted_slope
+from scvi_codegen.benchmark.drift import fitted_rate
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, breather, cloth, field, ring, waves
 from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
@@ -77,7 +77,7 @@ def _row(each: Lattice, method: str, h: float, steps: int) -> dict[str, Any]:
     )
     seconds = time.process_time() - began
     error = (run.energy() - run.energy()[0]) / run.energies[:, 0].max()
-    drift, uncertainty = fitted_slope(error)
+    drift, uncertainty = fitted_rate(error)
     return {
         "problem": each.name,
         "coordinates": each.q.size,

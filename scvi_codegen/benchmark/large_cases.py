@@ -181,7 +181,7 @@ def waves(count: int, span: float) -> Lattice:
 def breather(count: int, span: float) -> Lattice:
     """Return the breather of the sine-Gordon equation, 4 atan(k sin(w t) / (w cosh(k x))), k^2 = 1 - w^2, on a ring."""
     dx, frequency = 0.1, 0.8
-    slope = np.sqrt(1.0 - frequency**2)
+    derivative = np.sqrt(1.0 - frequency**2)
 
     def accelerations(u: Array) -> Array:
         result: Array = (np.roll(u, -1) - 2.0 * u + np.roll(u, 1)) / dx**2 - np.sin(u)
@@ -197,7 +197,7 @@ def breather(count: int, span: float) -> Lattice:
             lagrangian="sum(i in N, u_dot[i]**2/2 + cos(u[i])) - w*sum(i in N periodic, (u[i+1] - u[i])**2/2)",
         ),
         q=np.zeros(count),
-        v=4.0 * slope / np.cosh(slope * x),
+        v=4.0 * derivative / np.cosh(derivative * x),
         span=span,
         longest=0.06,
         accelerations=accelerations,

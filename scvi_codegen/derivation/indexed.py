@@ -38,9 +38,9 @@ def _text(system: IndexedSystem) -> Iterator[str]:
     yield str(system)
     yield ""
     yield "Terms of -H, and their derivatives:" if system.momenta else "Terms of -V, and what each adds to the forces:"
-    for term, slopes in system.kernels:
+    for term, partials in system.kernels:
         yield f"  {term}"
-        yield from (f"    by {name}: {slope}" for name, slope in slopes.items())
+        yield from (f"    by {name}: {derivative}" for name, derivative in partials.items())
     if not system.momenta:
         yield "Masses:"
         yield from (f"  {_loops_text(mass.loops, mass.formula)} at {mass.access}" for mass in system.masses)
@@ -52,7 +52,7 @@ def _text(system: IndexedSystem) -> Iterator[str]:
     for term in system.constraints:
         yield f"  {constraint_text(term)}"
         pushed = constraint_force_terms(term, system.coordinates, system.time)
-        yield from (f"    on {access}: lambda*({slope})" for access, slope in pushed)
+        yield from (f"    on {access}: lambda*({derivative})" for access, derivative in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
     yield f"Conserved: {', '.join(conserved) or 'nothing that is known'}"
@@ -65,11 +65,11 @@ def _loops_text(loops: Sequence[object], formula: Expr) -> str:
 def _latex(system: IndexedSystem) -> Iterator[str]:
     """Yield one line each, in display mode."""
     yield rf"\[ {system.latex} \]"
-    for term, slopes in system.kernels:
+    for term, partials in system.kernels:
         entries = {slot: latex_entry(access) for slot, access in term.slots}
-        for name, slope in slopes.items():
+        for name, derivative in partials.items():
             by = rf"\frac{{\partial}}{{\partial {entries[symbol(name)]}}}"
-            yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(slope, symbol_names=entries)} \]"
+            yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)} \]"
 
 
 def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
@@ -78,14 +78,14 @@ def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
         yield from _held(program.held)
     elif program.splitting:
         yield from _splitting(program.splitting)
-    elif isinstance(program.sweep, SeparableIteration):
-        yield from _separable(program.sweep)
-    elif program.sweep:
-        yield from _hamiltonian(program.sweep)
+    elif isinstance(program.fixed_point, SeparableIteration):
+        yield from _separable(program.fixed_point)
+    elif program.fixed_point:
+        yield from _hamiltonian(program.fixed_point)
 
 
 def _held(of: ConstrainedSteps) -> Iterator[str]:
-    yield "(m its mass, F the force on it, G the slopes of the constraints g, q, p going on from part to part):"
+    yield "(m its mass, F the force on it, G the Jacobian of the constraints g, q, p going on from part to part):"
     for part in of.parts:
         yield f"  p = p + {_number(part)}*h/2 (F + G^T lambda),  q = q + {_number(part)}*h p/m  with  g(q) = 0"
         yield f"  p = p + {_number(part)}*h/2 (F + G^T mu)  with  G p/m + g_t = 0"

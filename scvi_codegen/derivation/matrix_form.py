@@ -57,8 +57,8 @@ def matrix_form(
         time, step: t_k and h.
     """
     size = method.degree
-    slopes = differentiation_matrix(method.node_set.points)
-    full = sympy.Matrix(size, size + 1, lambda i, j: 2 * _number(slopes[i + 1][j]) / step)
+    partials = differentiation_matrix(method.node_set.points)
+    full = sympy.Matrix(size, size + 1, lambda i, j: 2 * _number(partials[i + 1][j]) / step)
     times = [time + _number(c) * step for c in method.node_set.abscissae[1:]]
     form = _position_form if method.form == "position" else _phase_space_form
     return form(system, full[:, 1:], full[:, :1], times, unknowns, state)

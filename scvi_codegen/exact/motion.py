@@ -288,7 +288,7 @@ class ExactMotion:
 
 
 def _saddle(mass: Numbers, derivatives: Numbers) -> Numbers:
-    """Return the saddle-point matrix [mass, -slopes^T; slopes, 0]."""
+    """Return the saddle-point matrix [M, -G^T; G, 0]."""
     count, m = derivatives.shape
     matrix = numbers(np.zeros((m + count, m + count)))
     matrix[:m, :m], matrix[:m, m:], matrix[m:, :m] = mass, -derivatives.T, derivatives

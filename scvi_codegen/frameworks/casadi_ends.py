@@ -82,7 +82,7 @@ class EndConditions:
         arguments = self.legendre.sx_in()
         residual = self.legendre(*arguments)
         results = [residual, *(self.ca.jacobian(residual, arguments[place]) for place in (1, 2))]
-        return self.ca.Function("slopes", arguments, results, self.legendre.name_in(), ["residual", "by_v", "by_p"])
+        return self.ca.Function("partials", arguments, results, self.legendre.name_in(), ["residual", "by_v", "by_p"])
 
     def _function(self, expressions: Sequence[Expr]) -> Any:
         m, ca = self.system.dimension, self.ca

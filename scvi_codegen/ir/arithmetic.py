@@ -211,10 +211,10 @@ def lower_kernel(
     time: sympy.Symbol,
     parameters: Sequence[sympy.Symbol],
     values: Sequence[sympy.Expr],
-    slopes: Sequence[sympy.Expr] = (),
+    partials: Sequence[sympy.Expr] = (),
     constants: int = 0,
 ) -> Kernel:
-    """Return the kernel of ``values`` and ``slopes`` with common subexpressions shared.
+    """Return the kernel of ``values`` and ``partials`` with common subexpressions shared.
 
     The last ``constants`` arguments are constant.
     """
@@ -222,7 +222,7 @@ def lower_kernel(
     loads |= {symbol: Load("parameters", i) for i, symbol in enumerate(parameters)}
     loads[time] = Load("t", -1)
     graph = _Graph(loads, (*parameters, *arguments[len(arguments) - constants :]))
-    roots = [graph.read(expression) for expression in (*values, *slopes)]
+    roots = [graph.read(expression) for expression in (*values, *partials)]
     temporaries, results = _linearise(graph, roots)
     return Kernel(
         name=name,
@@ -231,7 +231,7 @@ def lower_kernel(
         results=results,
         values=len(values),
         symbols=tuple(arguments),
-        formulas=(*values, *slopes),
+        formulas=(*values, *partials),
     )
 
 

@@ -53,7 +53,7 @@ class PointDerivatives:
         steps: number of steps that are solved before vectors are propagated over them.
     """
 
-    slopes: Kernel
+    partials: Kernel
     beside: int
     products: tuple[Kernel, Kernel]
     given: InputDerivatives
@@ -63,7 +63,7 @@ class PointDerivatives:
     @property
     def count(self) -> int:
         """Number of distinct derivatives."""
-        return self.slopes.values - self.beside
+        return self.partials.values - self.beside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +87,7 @@ class Derivatives:
     curvatures: tuple[Kernel | None, ...] = ()
     damping: InputDerivatives | None = None
     clock: TimeDerivatives | None = None
-    swept: PointDerivatives | None = None
+    iterated: PointDerivatives | None = None
     lanes: int = 8
 
     @property
@@ -101,17 +101,17 @@ class Derivatives:
         """Kernels that the program lacks."""
         given: tuple[InputDerivatives, ...] = (*self.by_given, *((self.damping,) if self.damping else ()))
         clock = (self.clock.kernel, self.clock.level) if self.clock else ()
-        given += (self.swept.masses,) if self.swept and self.swept.masses else ()
-        return tuple(each for each in (*(slopes.kernel for slopes in given), *self.curvatures, *clock) if each)
+        given += (self.iterated.masses,) if self.iterated and self.iterated.masses else ()
+        return tuple(each for each in (*(partials.kernel for partials in given), *self.curvatures, *clock) if each)
 
     @property
     def lane_kernels(self) -> tuple[Kernel, ...]:
         """Kernels on lanes that its fixed-point iteration lacks."""
-        kernels = (self.swept.slopes, self.swept.given.kernel, *self.swept.products) if self.swept else ()
+        kernels = (self.iterated.partials, self.iterated.given.kernel, *self.iterated.products) if self.iterated else ()
         return tuple(dict.fromkeys(kernel for kernel in kernels if kernel))
 
     @property
-    def bent(self) -> tuple[int, int]:
+    def curvature(self) -> tuple[int, int]:
         """Largest numbers of arguments and of values of a kernel of second derivatives; 0 and 0 without any."""
         kernels = [each for each in self.curvatures if each]
         return max((k.arguments for k in kernels), default=0), max((k.values for k in kernels), default=0)
@@ -122,19 +122,26 @@ class Derivatives:
         return 2 * self.program.dimension + len(self.program.parameter_names) + 2
 
     @property
-    def slopes(self) -> int:
+    def partials(self) -> int:
         """Number of derivatives at all points: with respect to h, arguments, parameters and time, a damping."""
         damped = bool(self.damping)
         return sum(
             family.points
-            * (family.slope.arguments + len(family.slope.results) + len(given.entries) + damped * family.slope.values)
+            * (
+                family.derivative.arguments
+                + len(family.derivative.results)
+                + len(given.entries)
+                + damped * family.derivative.values
+            )
             for family, given, _ in self.families
         )
 
     @property
     def at_points(self) -> int:
         """Largest number of arguments and results at the points of a stage group."""
-        return max(family.points * (family.slope.arguments + family.slope.values) for family in self.program.families)
+        return max(
+            family.points * (family.derivative.arguments + family.derivative.values) for family in self.program.families
+        )
 
     @property
     def memory(self) -> int:
@@ -144,16 +151,20 @@ class Derivatives:
         wide += bool(self.damping)  # vectors of gamma h
         if self.curvatures:
             wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
-        return self.slopes + wide * self.lanes + self.places
+        return self.partials + wide * self.lanes + self.places
 
     @property
     def kept(self) -> int:
         """Doubles after these: displacements of the points, and increments, for a block of iterated steps."""
-        sweep = self.program.sweep
-        return self.swept.steps * self.program.dimension * (sweep.lanes + 2) if self.swept and sweep else 0
+        fixed_point = self.program.fixed_point
+        return (
+            self.iterated.steps * self.program.dimension * (fixed_point.lanes + 2)
+            if self.iterated and fixed_point
+            else 0
+        )
 
     @property
     def places(self) -> int:
         """Largest number of arguments of all points of a stage group, if second derivatives are requested."""
         wanted = self.program.families if self.curvatures else ()
-        return max((family.points * family.slope.arguments for family in wanted), default=0)
+        return max((family.points * family.derivative.arguments for family in wanted), default=0)

@@ -92,7 +92,7 @@ class IndexedProgram:
     forces: tuple[LoopedKernel, ...]
     masses: tuple[LoopedKernel, ...]
     constants: tuple[LoopedKernel, ...]
-    sweep: SeparableIteration | HamiltonianIteration | None
+    fixed_point: SeparableIteration | HamiltonianIteration | None
     splitting: Splitting | None
     control: Control | None = None
     held: ConstrainedSteps | None = None
@@ -103,4 +103,8 @@ class IndexedProgram:
     @property
     def error_power(self) -> int:
         """Exponent of h in the error estimate of a curve; 0 if there is no estimate."""
-        return 0 if self.sweep is None or (self.velocities and self.sweep.points == 1) else self.sweep.error_power
+        return (
+            0
+            if self.fixed_point is None or (self.velocities and self.fixed_point.points == 1)
+            else self.fixed_point.error_power
+        )

@@ -54,7 +54,7 @@ class Kernel:
         name: C identifier.
         arguments: length of ``u``.
         temporaries, results: expressions.
-        values: number of results that are values; the rest are derivatives (slopes).
+        values: number of results that are values; the rest are derivatives.
         symbols: of the elements of ``u``, as in the formulas.
         formulas: the results as expressions.
         purpose: one sentence on what it computes.
@@ -101,10 +101,10 @@ class Kernel:
         return self.uses("parameters")
 
     def uses(self, array: str) -> bool:
-        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``slope``."""
+        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``value`` or ``derivative``."""
         if array == "value" or (self.sums and array == "u"):
             return True
-        if array == "slope":
+        if array == "derivative":
             return len(self.results) > self.values
         if any(each.term.uses(array) for each in self.sums):
             return True
@@ -122,7 +122,7 @@ class Kernel:
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
-        """Yield ("w", "value" or "slope", index, expression): each result right after its last temporary."""
+        """Yield ("w", "value" or "derivative", index, expression): each result right after its last temporary."""
         due: list[list[int]] = [[] for _ in range(len(self.temporaries) + 1)]
         for k, expression in enumerate(self.results):
             due[1 + _last_temporary(expression)].append(k)
@@ -130,8 +130,8 @@ class Kernel:
             if k > 0:
                 yield "w", k - 1, self.temporaries[k - 1]
             for number in ready:
-                slope = number >= self.values
-                yield "slope" if slope else "value", number - slope * self.values, self.results[number]
+                derivative = number >= self.values
+                yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
 
     def __str__(self) -> str:
         """Return the kernel as readable text, one assignment per line."""

@@ -20,7 +20,7 @@ LARGEST_PART = 1000
 """Largest number of operations of one C function."""
 
 Statement: TypeAlias = tuple[str, int, Expression]
-"""(kind, index, expression): ``w`` is a temporary of the part, ``kept``, ``value`` and ``slope`` are arrays."""
+"""(kind, index, expression): ``w`` is a temporary of the part, ``kept``, ``value`` and ``derivative`` are arrays."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +36,7 @@ class Part:
     statements: tuple[Statement, ...]
 
     def uses(self, array: str) -> bool:
-        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``kept``, ``value`` or ``slope``."""
+        """Return whether it reads or writes ``u``, ``t``, ``parameters``, ``kept``, ``value`` or ``derivative``."""
         return any(
             kind == array or any(load.source == array for load in loads(expression))
             for kind, _, expression in self.statements

@@ -139,7 +139,7 @@ class Program:
     hamiltonian: bool
     momentum_maps: tuple[MomentumMap, ...]
     momentum_kernel: Kernel | None
-    sweep: FixedPointIteration | None
+    fixed_point: FixedPointIteration | None
     splitting: Splitting | None
     newton: bool
     acts: bool
@@ -169,14 +169,16 @@ class Program:
         """Exponent of h in the recorded error estimate of a run; 0 if there is no estimate."""
         if not self.polynomial_curves:
             return 0
-        if self.sweep:
-            return self.sweep.error_power
+        if self.fixed_point:
+            return self.fixed_point.error_power
         return self.stage_curve.power if self.stage_curve else 0
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """All kernels, in the order of emission."""
-        pairs = [kernel for family in self.families for kernel in (family.value, family.slope)] if self.newton else []
+        pairs = (
+            [kernel for family in self.families for kernel in (family.value, family.derivative)] if self.newton else []
+        )
         along = [family.integrand for family in self.families if self.newton and family.integrand]
         sums = {kernel.name: kernel for kernel in along}
         maps = (self.momentum_kernel,) if self.momentum_kernel else ()
@@ -217,7 +219,7 @@ class Program:
         """Numbers that a run stores of its last steps to predict the next."""
         if self.splitting:
             return self.dimension
-        points = self.sweep.memory(self.dimension) if self.sweep else 0
+        points = self.fixed_point.memory(self.dimension) if self.fixed_point else 0
         return max(points, self.unknowns + self.point if self.newton else 0)
 
     @property

@@ -41,7 +41,7 @@ class ScatterLoop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DerivativeBlock:
-    """Nonzero derivatives of a scatter by a gather: ``slope[first + e]`` is d value[i_e] / d u[j_e], i and j sites."""
+    """Nonzero derivatives of a scatter by a gather: ``derivative[first + e]`` is d value[i_e] / d u[j_e]."""
 
     scatter: int
     gather: int
@@ -67,7 +67,7 @@ class LoweredStageGroup:
     gathers: tuple[GatherLoop, ...]
     scatters: tuple[ScatterLoop, ...]
     value: Kernel
-    slope: Kernel
+    derivative: Kernel
     blocks: tuple[DerivativeBlock, ...]
     integrand: Kernel | None
     integrand_power: int
@@ -80,7 +80,7 @@ class LoweredStageGroup:
     @property
     def uses_time(self) -> bool:
         """True if the kernel depends on time explicitly, in its values or derivatives."""
-        return self.value.uses_time or self.slope.uses_time
+        return self.value.uses_time or self.derivative.uses_time
 
     @property
     def uses_step(self) -> bool:
@@ -91,4 +91,4 @@ class LoweredStageGroup:
     @property
     def scratch(self) -> int:
         """Number of arguments, values and derivatives at all points."""
-        return self.points * (self.slope.arguments + len(self.slope.results))
+        return self.points * (self.derivative.arguments + len(self.derivative.results))

@@ -20,7 +20,7 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
     """Return the kernels of the constraints of a system, ``None`` if it has none."""
     if not system.constraints:
         return None
-    slopes, rates = constraint_jacobian(system), constraint_rates(system)
+    partials, rates = constraint_jacobian(system), constraint_rates(system)
     return Constraints(
         formulas=tuple(map(system.text_of, system.constraints)),
         kernel=system_kernel(
@@ -28,10 +28,10 @@ def lowered_constraints(system: MechanicalSystem) -> Constraints | None:
             "constraints",
             holonomic_expressions(system),
             of=system.coordinates,
-            slopes=slopes.values(),
+            partials=partials.values(),
             purpose="The constraints g of positions, and their nonzero derivatives G, at u = q.",
         ),
-        entries=tuple(slopes),
+        entries=tuple(partials),
         motion=system_kernel(
             system,
             "constrained_motion",

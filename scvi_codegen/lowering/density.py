@@ -37,7 +37,7 @@ def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
         rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
     rates[system.time] = sympy.S.One
     variables = list(rates)
-    change = sympy.Add(*(slope * rates[variables[i]] for i, slope in gradient(g, variables).items()))
+    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(g, variables).items()))
     kernel = system_kernel(
         system,
         "density",

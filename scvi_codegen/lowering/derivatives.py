@@ -36,7 +36,7 @@ def derivatives_of(
         curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
         clock=_time_derivatives(system, stages.families[0].arguments) if system.clock else None,
-        swept=point_derivatives_of(system, program.sweep) if program.sweep else None,
+        iterated=point_derivatives_of(system, program.fixed_point) if program.fixed_point else None,
     )
 
 
@@ -59,15 +59,15 @@ def _input_derivatives(
 def _time_derivatives(system: MechanicalSystem, arguments: Sequence[Symbol]) -> TimeDerivatives:
     assert system.clock is not None
     rate = system.clock.rate
-    slopes = gradient(rate, (*arguments, *system.parameters))
+    partials = gradient(rate, (*arguments, *system.parameters))
     return TimeDerivatives(
-        entries=tuple(slopes),
+        entries=tuple(partials),
         kernel=system_kernel(
             system,
             "rate_derivatives",
             (rate,),
             of=arguments,
-            slopes=slopes.values(),
+            partials=partials.values(),
             purpose="The rate of time and its nonzero derivatives with respect to arguments and parameters.",
         ),
         level=_energy_derivatives(system),
@@ -78,15 +78,15 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
     """Kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE is the change of K / rate."""
     assert system.clock is not None
     m, energy = system.dimension, system.clock.energy
-    slopes = gradient(system.formula, (*system.coordinates, *system.parameters))
+    partials = gradient(system.formula, (*system.coordinates, *system.parameters))
     sign = 1 if system.auxiliaries else -1
-    by_others = [sign * slopes.get(j, S.Zero) for j in range(m + len(system.parameters))]
+    by_others = [sign * partials.get(j, S.Zero) for j in range(m + len(system.parameters))]
     by_others[m + system.parameters.index(energy)] = S.Zero
     by_p = forms_of(system).legendre if system.auxiliaries else system.velocities
     return system_kernel(
         system,
         "energy_derivatives",
-        [slope / system.clock.rate for slope in (*by_others[:m], *by_p, *by_others[m:])],
+        [derivative / system.clock.rate for derivative in (*by_others[:m], *by_p, *by_others[m:])],
         of=forms_of(system).legendre_arguments,
         purpose="Gradient of the energy with respect to q, p and parameters at "
         f"u = (q, {'p' if system.auxiliaries else 'v'}).",
@@ -100,13 +100,13 @@ def _curvature(system: MechanicalSystem, family: StageGroup) -> Kernel | None:
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]
     entries = jacobian(family.results, depends)
     along = Add(*(Mul(multipliers[i], entry, changes[j]) for (i, j), entry in entries.items()))
-    slopes = gradient(along, depends)
-    if not slopes:
+    partials = gradient(along, depends)
+    if not partials:
         return None
     return system_kernel(
         system,
         f"{family.name}_curvature",
-        [slopes.get(j, S.Zero) for j in range(len(depends))],
+        [partials.get(j, S.Zero) for j in range(len(depends))],
         of=(*family.arguments, *multipliers, *changes),
         purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )

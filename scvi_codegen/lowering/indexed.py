@@ -77,12 +77,12 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
             "Newton's method for indexed systems requires a Lagrangian with a potential that is not linear, forces of "
             "positions and time, no constraints, and an implicit method: leave out solver='newton'"
         )
-    sweep = None if splitting or held else _sweep(one, method, velocities=bool(system.velocities))
+    fixed_point = None if splitting or held else _fixed_point(one, method, velocities=bool(system.velocities))
     return IndexedProgram(
         prefix=prefix,
         title=comment_text(f"{system.name}: {method.title}"),
         notes=notes_of(method, one),
-        order=method.order or (sweep.points if sweep else 0),
+        order=method.order or (fixed_point.points if fixed_point else 0),
         sizes=system.sizes,
         coordinates=system.coordinates,
         momenta=system.momenta,
@@ -94,7 +94,7 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
         forces=forces,
         masses=tuple(_mass(system, term, number) for number, term in enumerate(system.masses)),
         constants=tuple(_constant(system, term, number) for number, term in enumerate(system.energy_offsets)),
-        sweep=sweep,
+        fixed_point=fixed_point,
         splitting=splitting,
         held=held,
         products=products,
@@ -105,12 +105,14 @@ def lower_indexed(system: IndexedSystem, method: Method, prefix: str, *, newton:
 
 def with_control(program: IndexedProgram) -> IndexedProgram | None:
     """Return the program with adaptive steps; ``None`` if there is no error estimate."""
-    if program.sweep is None or not program.error_power:
+    if program.fixed_point is None or not program.error_power:
         return None
-    return replace(program, control=control_of_iteration(program.sweep))
+    return replace(program, control=control_of_iteration(program.fixed_point))
 
 
-def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> SeparableIteration | HamiltonianIteration:
+def _fixed_point(
+    one: MechanicalSystem, method: Method, *, velocities: bool
+) -> SeparableIteration | HamiltonianIteration:
     stages = discretise(one, method)
     found = (
         separable_iteration(StepProblem(one, stages.shape), velocities=True)
@@ -129,9 +131,9 @@ def _sweep(one: MechanicalSystem, method: Method, *, velocities: bool) -> Separa
 def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
     arrays = dict(term.slots)
     u = [slot for slot, access in term.slots if access.array in system.state]
-    slopes = gradient(term.formula, u)
+    partials = gradient(term.formula, u)
     signs = [-1 if arrays[slot].array in system.momenta else 1 for slot in u]  # of -H: -H_q and H_p
-    values = [signs[place] * slopes.get(place, S.Zero) for place in range(len(u))]
+    values = [signs[place] * partials.get(place, S.Zero) for place in range(len(u))]
     looped = LoopedKernel(
         text=comment_text(str(term)),
         loops=term.loops,
@@ -172,8 +174,8 @@ def _all_forces(system: IndexedSystem) -> Iterator[IndexedForce]:
     """Yield all forces, those of the potentials by their slots."""
     for term in system.potentials:
         moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
-        slopes = gradient(term.formula, [slot for slot, _ in moving])
-        targets = tuple((access, slopes[k]) for k, (_, access) in enumerate(moving) if k in slopes)
+        partials = gradient(term.formula, [slot for slot, _ in moving])
+        targets = tuple((access, partials[k]) for k, (_, access) in enumerate(moving) if k in partials)
         yield IndexedForce(loops=term.loops, slots=term.slots, targets=targets)
     yield from system.forces
 
@@ -185,9 +187,9 @@ def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[L
     rows = [gradient(formula, u) for _, formula in force.targets]
     if not any(rows):
         return None
-    along = [Add(*(slope * w[k] for k, slope in row.items())) for row in rows]
+    along = [Add(*(derivative * w[k] for k, derivative in row.items())) for row in rows]
     own = [
-        Add(*(slope for k, slope in row.items() if moving[k][1] == access))
+        Add(*(derivative for k, derivative in row.items() if moving[k][1] == access))
         for row, (access, _) in zip(rows, force.targets, strict=True)
     ]
     accesses, targets = tuple(access for _, access in moving), tuple(access for access, _ in force.targets)

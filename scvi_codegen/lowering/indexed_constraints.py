@@ -76,8 +76,8 @@ def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel
         held = coordinate_accesses(term, system.coordinates)
         u, accesses = [slot for slot, _ in held], tuple(access for _, access in held)
         v = tuple(Symbol(f"{slot.name} along", real=True) for slot in u)
-        *slopes, rate = constraint_gradient(term, system.coordinates, system.time)
-        values = [term.formula, rate, *slopes]
+        *partials, rate = constraint_gradient(term, system.coordinates, system.time)
+        values = [term.formula, rate, *partials]
         condition = LoopedKernel(
             text=comment_text(constraint_text(term)),
             loops=term.loops,
@@ -88,5 +88,5 @@ def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel
         )
         both = [*term.slots, *zip(v, accesses, strict=True)]
         second = [constraint_second_rate(term, system.coordinates, system.time, v)]
-        bend = kernel_of(system, f"bend_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
-        yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=bend)
+        curvature = kernel_of(system, f"bend_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
+        yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=curvature)

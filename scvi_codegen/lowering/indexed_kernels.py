@@ -35,6 +35,6 @@ def kernel_of(
         time=system.time,
         parameters=(*system.parameters, *(slot for slot, _ in slots if slot not in u)),
         values=tuple(values),
-        slopes=(),
+        partials=(),
     )
     return replace(kernel, purpose=purpose)

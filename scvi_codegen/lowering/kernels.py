@@ -36,7 +36,7 @@ def system_kernel(
     values: Iterable[Expr],
     *,
     of: Iterable[Symbol],
-    slopes: Iterable[Expr] = (),
+    partials: Iterable[Expr] = (),
     purpose: str = "",
 ) -> Kernel:
     """Return the kernel ``name`` as a function of the time and parameters of a system.
@@ -54,6 +54,6 @@ def system_kernel(
         time=system.time,
         parameters=system.parameters,
         values=tuple(values),
-        slopes=tuple(slopes),
+        partials=tuple(partials),
     )
     return replace(kernel, purpose=purpose)

@@ -24,9 +24,9 @@ NOTHING: Entries = {(0, 0): S.Zero}
 """Replacement for an empty set of entries: C has no empty arrays."""
 
 
-def point_derivatives_of(system: MechanicalSystem, sweep: FixedPointIteration) -> PointDerivatives | None:
+def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIteration) -> PointDerivatives | None:
     """Return the kernels for a system whose steps are solved by the iteration; ``None`` if unsupported or too large."""
-    twin, make = equivalent_lagrangian(system), MAKERS.get(sweep.derivatives_part)
+    twin, make = equivalent_lagrangian(system), MAKERS.get(fixed_point.derivatives_part)
     found = make(twin) if twin and make else None
     return found if found and found.count + len(found.given.entries) <= MOST_DERIVATIVES else None
 
@@ -34,17 +34,17 @@ def point_derivatives_of(system: MechanicalSystem, sweep: FixedPointIteration) -
 def _separable(system: LagrangianSystem) -> PointDerivatives:
     """Return the derivatives of forces at u = q, and those of constant masses with respect to parameters."""
     forms, q = forms_of(system), tuple(system.coordinates)
-    slopes = jacobian(forms.force, q) or NOTHING
-    different = tuple(dict.fromkeys(slopes.values()))
+    partials = jacobian(forms.force, q) or NOTHING
+    different = tuple(dict.fromkeys(partials.values()))
     masses = jacobian(tuple(forms.mass.values()), system.parameters)
     purpose = "Derivatives of the constant masses with respect to parameters."
     kernel = system_kernel(system, "mass_by_inputs", masses.values(), of=(), purpose=purpose)
     return PointDerivatives(
-        slopes=system_kernel(
+        partials=system_kernel(
             system, "point_derivatives", different, of=q, purpose="The distinct entries of L_qq at all points."
         ),
         beside=0,
-        products=_products(system, slopes, different, size=len(q)),
+        products=_products(system, partials, different, size=len(q)),
         given=_by_inputs(system, forms.force, q),
         masses=InputDerivatives(entries=tuple(masses), kernel=kernel) if masses else None,
     )
@@ -54,23 +54,23 @@ def _coupled(system: LagrangianSystem) -> PointDerivatives:
     """Return the derivatives of (L_q, -L_v) at u = (q, v); those of L_v with respect to v, the mass, separately."""
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     m = system.dimension
-    slopes = jacobian(forms.force, of)
+    partials = jacobian(forms.force, of)
     by_position = jacobian(forms.momentum, system.coordinates)
-    slopes |= {(m + i, j): Mul(S.NegativeOne, value) for (i, j), value in by_position.items()}
-    slopes = slopes or NOTHING
-    different = tuple(dict.fromkeys(slopes.values()))
+    partials |= {(m + i, j): Mul(S.NegativeOne, value) for (i, j), value in by_position.items()}
+    partials = partials or NOTHING
+    different = tuple(dict.fromkeys(partials.values()))
     at_points = system_kernel(
         system,
         "point_derivatives",
         (*forms.momentum, *different),
         of=of,
-        slopes=forms.lower_mass.values(),
+        partials=forms.lower_mass.values(),
         purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and the lower triangle of L_vv at all points.",
     )
     return PointDerivatives(
-        slopes=at_points,
+        partials=at_points,
         beside=m,
-        products=_products(system, slopes, different, size=2 * m),
+        products=_products(system, partials, different, size=2 * m),
         given=_by_inputs(system, (*forms.force, *forms.momentum), of),
     )
 
@@ -89,13 +89,13 @@ def _by_inputs(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[S
 
 
 def _products(
-    system: LagrangianSystem, slopes: Entries, different: tuple[Expr, ...], *, size: int
+    system: LagrangianSystem, partials: Entries, different: tuple[Expr, ...], *, size: int
 ) -> tuple[Kernel, Kernel]:
     """Return kernels of the matrix of derivatives times x, and of its transpose; the same kernel if they are equal."""
     number = {value: k for k, value in enumerate(different)}
     x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
-    values = [Symbol(f"slope[{k}]", real=True) for k in range(len(different))]
-    back = {(j, i): value for (i, j), value in slopes.items()}
+    values = [Symbol(f"derivative[{k}]", real=True) for k in range(len(different))]
+    back = {(j, i): value for (i, j), value in partials.items()}
 
     def product(name: str, matrix: Entries, purpose: str) -> Kernel:
         rows: list[list[Expr]] = [[] for _ in x]
@@ -103,6 +103,6 @@ def _products(
             rows[i].append(Mul(values[number[value]], x[j]))
         return system_kernel(system, name, [Add(*row) for row in rows], of=(*x, *values), purpose=purpose)
 
-    forward = product("derivative_product", slopes, "The matrix of derivatives times x, u = (x, its entries).")
-    turned = product("transposed_product", back, "Its transpose times x.") if back != slopes else forward
+    forward = product("derivative_product", partials, "The matrix of derivatives times x, u = (x, its entries).")
+    turned = product("transposed_product", back, "Its transpose times x.") if back != partials else forward
     return forward, turned

@@ -41,7 +41,7 @@ def lower(
     stages: StageSystem,
     *,
     prefix: str,
-    sweep: FixedPointIteration | None = None,
+    fixed_point: FixedPointIteration | None = None,
     splitting: Splitting | None = None,
     newton: bool = True,
     rattle: Rattle | None = None,
@@ -95,7 +95,7 @@ def lower(
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
-        sweep=sweep,
+        fixed_point=fixed_point,
         splitting=splitting,
         newton=newton,
         acts=sites.count == m and has_action(system) and any(family.in_action for family in stages.families),
@@ -203,7 +203,7 @@ def _legendre_kernel(system: MechanicalSystem) -> Kernel:
         "legendre",
         forms.legendre,
         of=forms.legendre_arguments,
-        slopes=forms.legendre_jacobian.values(),
+        partials=forms.legendre_jacobian.values(),
         purpose="H_p and H_pp at u = (q, p)."
         if system.auxiliaries
         else "Momenta L_v and mass matrix L_vv at u = (q, v).",

@@ -23,19 +23,19 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
     """
     forces = tuple(_forces(of, family, number) for number, family in enumerate(of.families))
     energies = tuple(_energy(of, family, number) for number, family in enumerate(of.families))
-    sweep, splitting = program.sweep and program.sweep.with_forces(forces), program.splitting
-    if program.newton or not (sweep or splitting):
+    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(forces), program.splitting
+    if program.newton or not (fixed_point or splitting):
         return None
     return replace(
         program,
         energy=program.energy.with_sums(energies),
-        sweep=sweep,
+        fixed_point=fixed_point,
         splitting=replace(splitting, force=splitting.force.with_sums(forces)) if splitting else None,
     )
 
 
 def _forces(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:
-    return _summed(of, f"pull_{number}", family, family.slopes, ())
+    return _summed(of, f"pull_{number}", family, family.partials, ())
 
 
 def _energy(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:

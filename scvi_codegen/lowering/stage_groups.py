@@ -39,7 +39,7 @@ def has_action(system: MechanicalSystem) -> bool:
 
 def lowered_stage_group(system: MechanicalSystem, family: StageGroup, sites: UnknownLayout) -> LoweredStageGroup:
     """Return a stage group in loops: its kernel with derivatives, and rounded tables."""
-    slopes, blocks = _derivative_blocks(family, sites)
+    partials, blocks = _derivative_blocks(family, sites)
     names = tuple(argument_name(system, gather) for gather in family.gathers)
     u = f"u = ({', '.join(names)})"
     return LoweredStageGroup(
@@ -56,12 +56,12 @@ def lowered_stage_group(system: MechanicalSystem, family: StageGroup, sites: Unk
             of=family.arguments,
             purpose=f"{_results(family, names)} at {u}.",
         ),
-        slope=system_kernel(
+        derivative=system_kernel(
             system,
             f"{family.name}_slope",
             family.results,
             of=family.arguments,
-            slopes=slopes,
+            partials=partials,
             purpose=f"The same, and the nonzero derivatives with respect to {u}.",
         ),
         blocks=blocks,
@@ -78,10 +78,10 @@ def _results(family: StageGroup, names: tuple[str, ...]) -> str:
         return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
     if family.scalar_power:
         return f"Derivatives of d^{family.scalar_power}L/dt^{family.scalar_power}"
-    slopes = [f"L_{name}" for name in names]
+    partials = [f"L_{name}" for name in names]
     if family.forced:
-        slopes[0] += " + f"
-    return " and ".join(slopes) if len(family.scatters) == len(names) else "L_v"
+        partials[0] += " + f"
+    return " and ".join(partials) if len(family.scatters) == len(names) else "L_v"
 
 
 def _integrand(system: MechanicalSystem, family: StageGroup, u: str) -> Kernel | None:
@@ -121,8 +121,8 @@ def _derivative_blocks(
     family: StageGroup, sites: UnknownLayout
 ) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
     """Return the nonzero derivatives, grouped by scatter and gather."""
-    entries = _slopes(family)
-    slopes: list[sympy.Expr] = []
+    entries = _partials(family)
+    partials: list[sympy.Expr] = []
     blocks = []
     for s, scatter in enumerate(family.scatters):
         top = sum(len(other.results) for other in family.scatters[:s])
@@ -133,12 +133,12 @@ def _derivative_blocks(
             if found:
                 row, column = sites.first[len(scatter.results)], sites.first[len(gather.arguments)]
                 pairs = tuple((row + i, column + j) for i, j in found)
-                blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(slopes), entries=pairs))
-                slopes.extend(entries[top + i, left + j] for i, j in found)
-    return tuple(slopes), tuple(blocks)
+                blocks.append(DerivativeBlock(scatter=s, gather=g, first=len(partials), entries=pairs))
+                partials.extend(entries[top + i, left + j] for i, j in found)
+    return tuple(partials), tuple(blocks)
 
 
-def _slopes(family: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
+def _partials(family: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
     """Return the nonzero derivatives of results with respect to arguments; symmetric for a gradient."""
     entries = jacobian(family.results, family.arguments)
     if family.scalar is None or family.forced:

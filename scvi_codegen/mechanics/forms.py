@@ -62,8 +62,8 @@ class Forms:
     @cached_property
     def force(self) -> tuple[Expr, ...]:
         """L_q plus the generalised forces, m expressions."""
-        slopes = self._gradient_tuple(self.system.lagrangian, self.system.coordinates)
-        return tuple(map(sympy.Add, slopes, self.system.forces)) if self.system.forces else slopes
+        partials = self._gradient_tuple(self.system.lagrangian, self.system.coordinates)
+        return tuple(map(sympy.Add, partials, self.system.forces)) if self.system.forces else partials
 
     @cached_property
     def momentum_rate(self) -> tuple[Expr, ...]:
@@ -215,8 +215,8 @@ class Forms:
 
     @staticmethod
     def _gradient_tuple(scalar: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
-        slopes = gradient(scalar, variables)
-        return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))
+        partials = gradient(scalar, variables)
+        return tuple(partials.get(i, sympy.S.Zero) for i in range(len(variables)))
 
 
 @lru_cache(maxsize=64)
@@ -228,6 +228,6 @@ def forms_of(system: MechanicalSystem) -> Forms:
 def _along(expressions: Sequence[Expr], variables: Sequence[Symbol], direction: Sequence[Expr]) -> tuple[Expr, ...]:
     """Return directional derivatives; with the rates of the variables as direction, time derivatives."""
     terms: list[list[Expr]] = [[] for _ in expressions]
-    for (i, j), slope in jacobian(expressions, variables).items():
-        terms[i].append(slope * direction[j])
+    for (i, j), derivative in jacobian(expressions, variables).items():
+        terms[i].append(derivative * direction[j])
     return tuple(sympy.Add(*row) for row in terms)

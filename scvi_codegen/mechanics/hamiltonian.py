@@ -369,5 +369,5 @@ def _default_momenta(coordinates: Sequence[str]) -> tuple[str, ...]:
 
 
 def _gradient_tuple(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
-    slopes = gradient(f, variables)
-    return tuple(slopes.get(i, sympy.S.Zero) for i in range(len(variables)))
+    partials = gradient(f, variables)
+    return tuple(partials.get(i, sympy.S.Zero) for i in range(len(variables)))

@@ -399,9 +399,9 @@ def _degenerate_message(system: LagrangianSystem, velocities: Sequence[Symbol], 
             f"its equations of motion are of first order. {REQUIRED} {pairs if system.dimension > 1 else 'Add '}"
             f"the missing kinetic energy, such as m*{velocities[0]}**2/2"
         )
-    slope = sympy.expand(system.lagrangian.diff(symbol(names[0])))
-    multiplies = slope.has(*system.coordinates) and not slope.has(symbol(names[0]), *system.velocities)
-    bound = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(slope)}'] in its place"
+    derivative = sympy.expand(system.lagrangian.diff(symbol(names[0])))
+    multiplies = derivative.has(*system.coordinates) and not derivative.has(symbol(names[0]), *system.velocities)
+    bound = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(derivative)}'] in its place"
     return (
         f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
         f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{bound if multiplies else ''}; if {names[0]} "

@@ -68,7 +68,7 @@ def _inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequen
 def _inverse_derivative(
     system: MechanicalSystem, derivative: Expr, x: Symbol, y: Symbol, variables: Sequence[Symbol]
 ) -> Expr:
-    """Return the x with y = slope(x), whose branch is checked at random points near the default parameters."""
+    """Return the x with y = L_v(x), whose branch is checked at random points near the default parameters."""
     if derivative.free_symbols & (set(variables) - {x}):
         raise SystemDefinitionError(
             f"the Legendre transform of '{system.name}' requires the solution of coupled nonlinear "

@@ -50,7 +50,7 @@ class TermGroup:
         return replace(self, places=places, values=tuple(values))
 
     @property
-    def slopes(self) -> tuple[Expr, ...]:
+    def partials(self) -> tuple[Expr, ...]:
         """Derivatives of the formula by ``slots``, with common factors extracted, since many share the rest."""
         found = gradient(self.formula, self.slots)
         return tuple(factor_terms(found.get(k, S.Zero)) for k in range(len(self.slots)))

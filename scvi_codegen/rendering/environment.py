@@ -68,19 +68,19 @@ def _pairs(name: str, entries: Sequence[tuple[int, int]]) -> str:
 
 
 @pass_context
-def _kernel_text(context: Context, kernel: Kernel, *, slopes: bool = False) -> str:
-    return kernel_text(kernel, context["target"], slopes=slopes)
+def _kernel_text(context: Context, kernel: Kernel, *, partials: bool = False) -> str:
+    return kernel_text(kernel, context["target"], partials=partials)
 
 
 @pass_context
 def _lane_kernel_text(context: Context, kernel: Kernel) -> str:
-    return lane_kernel_text(kernel, context["program"].sweep, context["sweep"].meaning)
+    return lane_kernel_text(kernel, context["program"].fixed_point, context["fixed_point"].meaning)
 
 
 @pass_context
 def _lane_mass_text(context: Context, kernel: Kernel) -> str:
-    meaning = context["sweep"].meaning
-    return lane_mass_text(kernel, context["program"].sweep, meaning, context["target"])
+    meaning = context["fixed_point"].meaning
+    return lane_mass_text(kernel, context["program"].fixed_point, meaning, context["target"])
 
 
 FUNCTIONS: dict[str, Callable[..., str]] = {

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 __all__ = ["HEADERS", "Fallback"]
 
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
-"""Fallback of a source: ``own``; that of another library (``borrowed``); its own, also for others (``lent``); none."""
+"""Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
 
 HEADERS: dict[Fallback, tuple[str, ...]] = {
     "own": ("newton_fallback",),

@@ -26,7 +26,7 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
     Args:
         derivatives: a source with derivatives of steps.
         version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a source is specific to one version.
-        second: whether to add second derivatives, ``_bend``, which the source must have.
+        second: whether to add second derivatives, ``_curvature``, which the source must have.
     """
     parts = (*XLA_PARTS, *([XLA_SECOND] if second else ()))
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
@@ -49,7 +49,7 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
     declared = f"int {prefix}_flow_rows(int part, {shape}, const double *x, const double *given, {rest});\n"
     if second:
         declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
-        declared += f"const double *slopes, const double *changes, {rest});\n"
+        declared += f"const double *partials, const double *changes, {rest});\n"
     headers = ("flow", "rows_flow", *(("flow_second", "rows_second") if second else ()))
     return _behind(derivatives, "\n", headers, declared)
 

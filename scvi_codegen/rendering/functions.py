@@ -23,39 +23,41 @@ UNFORMATTED = "  /* clang-format off */\n{}\n  /* clang-format on */"
 PART = "static SCVI_NOINLINE"
 
 
-def kernel_text(kernel: Kernel, target: Target, *, slopes: bool = False) -> str:
-    """Return a function of numbers, with its comment; ``slopes``: always with the argument for derivatives."""
+def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> str:
+    """Return a function of numbers, with its comment; ``partials``: always with the argument for derivatives."""
     real = target.scalar
     declared = {name: f"{real} *{name}" for name in ARRAYS}
     declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
     declared["kept"] = f"{real} *restrict kept"
     texts = [_function(PART, part, _used(part, declared), print_statements(part, target)) for part in _parts(kernel)]
     texts += [text for each in kernel.sums for text in (kernel_text(each.term, target), *_tables(each, target))]
-    arguments = _arguments(kernel, declared, slopes=slopes)
+    arguments = _arguments(kernel, declared, partials=partials)
     statements = [*print_statements(kernel, target), *_loops(kernel, real)]
     return "\n\n".join([*texts, _whole("static", kernel, arguments, statements)])
 
 
-def lane_kernel_text(kernel: Kernel, sweep: FixedPointIteration, lanes: Lanes) -> str:
+def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes) -> str:
     """Return a function of vectors."""
     declared = {name: f"lanes *{name}" for name in ARRAYS}
     declared |= {"u": "const lanes *u", "t": f"{lanes.type_of('t')} t", "kept": "lanes *restrict kept"}
     declared["parameters"] = f"const {lanes.type_of('parameters')} *parameters"
     sources = lanes.sources
     texts = [
-        _function(PART, part, _used(part, declared), print_lane_statements(part, sweep, sources))
+        _function(PART, part, _used(part, declared), print_lane_statements(part, fixed_point, sources))
         for part in _parts(kernel)
     ]
     texts += [
-        text for each in kernel.sums for text in (lane_kernel_text(each.term, sweep, lanes), *_tables(each, DOUBLE))
+        text
+        for each in kernel.sums
+        for text in (lane_kernel_text(each.term, fixed_point, lanes), *_tables(each, DOUBLE))
     ]
-    statements = [*print_lane_statements(kernel, sweep, sources), *_loops(kernel, "lanes", sources)]
+    statements = [*print_lane_statements(kernel, fixed_point, sources), *_loops(kernel, "lanes", sources)]
     return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
 
 
-def lane_mass_text(kernel: Kernel, sweep: FixedPointIteration, lanes: Lanes, target: Target) -> str:
+def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lanes, target: Target) -> str:
     """Return the function of constant masses: of numbers for one trajectory, or of vectors for many."""
-    return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, sweep, lanes)
+    return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
 
 
 def _table_name(each: IndexedSum, what: str) -> str:
@@ -117,8 +119,8 @@ def _used(part: Part, declared: Mapping[str, str]) -> list[str]:
     return [declared[name] for name in ARRAYS if part.uses(name)]
 
 
-def _arguments(kernel: Kernel, declared: Mapping[str, str], *, slopes: bool = False) -> list[str]:
-    last = ["slope"] if len(kernel.results) > kernel.values or slopes else []
+def _arguments(kernel: Kernel, declared: Mapping[str, str], *, partials: bool = False) -> list[str]:
+    last = ["derivative"] if len(kernel.results) > kernel.values or partials else []
     return [declared[name] for name in ("u", "t", "parameters", "value", *last)]
 
 

@@ -44,7 +44,7 @@ def render_indexed(program: IndexedProgram) -> Source:
     terms = [(each, each.scalar) for each in program.forces if each.scalar]
     terms += [(each, each.kernel) for each in program.constants]
     scalars = [each.kernel for each in program.masses] + [scalar for _, scalar in terms]
-    if program.sweep is None:
+    if program.fixed_point is None:
         scalars += [each.kernel for each in program.forces]
     if program.held:
         scalars += [each.kernel for each in (*program.held.conditions, *program.held.bends)]
@@ -67,7 +67,7 @@ def render_indexed(program: IndexedProgram) -> Source:
         "inverse_roots": _inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
         "coordinates": " + ".join(map(product_text, program.coordinates)),
-        "sweep": _sweep_text(program),
+        "fixed_point": _iteration_text(program),
         "work": _work(program),
         "iteration_vectors": ITERATION_VECTORS,
         "halves_vectors": HALVES_VECTORS,
@@ -106,23 +106,23 @@ def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
 
 def _work(program: IndexedProgram) -> int:
     """Return the number of doubles of ``work`` per coordinate."""
-    if program.sweep is None:
+    if program.fixed_point is None:
         return CONSTRAINED_VECTORS if program.held else EXPLICIT_VECTORS
     own = 2 * ITERATION_VECTORS if program.momenta else ITERATION_VECTORS + bool(program.velocities)
-    linear = NEWTON_VECTORS + program.sweep.lanes if program.products else 0
-    waves = FOURIER_VECTORS * program.sweep.lanes + roots_per_coordinate(program) if program.reach else 0
-    return (own + linear) * program.sweep.lanes + waves + HALVES_VECTORS
+    linear = NEWTON_VECTORS + program.fixed_point.lanes if program.products else 0
+    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots_per_coordinate(program) if program.reach else 0
+    return (own + linear) * program.fixed_point.lanes + waves + HALVES_VECTORS
 
 
-def _sweep_text(program: IndexedProgram) -> IterationSource | None:
+def _iteration_text(program: IndexedProgram) -> IterationSource | None:
     applied = (*program.forces, *program.products, *program.diagonals)
-    sweep, kernels = program.sweep, [each.kernel for each in applied]
-    return iteration_source(sweep, POINTS, fallback="none", kernels=kernels) if sweep else None
+    fixed_point, kernels = program.fixed_point, [each.kernel for each in applied]
+    return iteration_source(fixed_point, POINTS, fallback="none", kernels=kernels) if fixed_point else None
 
 
 def _vector_functions(program: IndexedProgram) -> list[str]:
     """Return the functions of the vector library that occur in the forces of an explicit method."""
-    kernels = [each.kernel for each in program.forces] if program.sweep is None else []
+    kernels = [each.kernel for each in program.forces] if program.fixed_point is None else []
     return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
 
@@ -133,7 +133,7 @@ def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
 
 def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
-    explicit = program.sweep is None
+    explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
     nest = Nest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
     slots = range(len(looped.targets))

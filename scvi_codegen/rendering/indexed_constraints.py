@@ -39,7 +39,7 @@ def _texts(program: IndexedProgram, held: ConstrainedSteps) -> tuple[list[str], 
     """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
     return (
         [_condition(program, each) for each in held.conditions],
-        [_bend(program, each) for each in held.bends],
+        [_curvature(program, each) for each in held.bends],
         [_places(program, each) for each in held.conditions],
     )
 
@@ -50,13 +50,13 @@ def _condition(program: IndexedProgram, looped: LoopedKernel) -> str:
         f"{name}(u, t, parameters, value);",
         "now->g[now->count] = value[0];",
         "now->rate[now->count++] = value[1];",
-        *(f"now->slope[now->entries++] = value[{k + 2}];" for k in range(count)),
+        *(f"now->derivative[now->entries++] = value[{k + 2}];" for k in range(count)),
     ]
     arguments = ["const problem *given", X, "double t", CURSOR]
     return _function(Nest(program, looped, "double", "X"), f"find_{name}", arguments, lines, count + 2)
 
 
-def _bend(program: IndexedProgram, looped: LoopedKernel) -> str:
+def _curvature(program: IndexedProgram, looped: LoopedKernel) -> str:
     name = looped.kernel.name
     lines = [f"{name}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
     arguments = ["const problem *given", X, f"const double *restrict {DIRECTION}", "double t", CURSOR]

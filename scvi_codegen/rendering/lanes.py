@@ -101,7 +101,7 @@ class IterationSource:
 
 
 def iteration_source(
-    sweep: FixedPointIteration,
+    fixed_point: FixedPointIteration,
     meaning: Lanes,
     *,
     fallback: Fallback,
@@ -117,41 +117,41 @@ def iteration_source(
         kernels: those applied to vectors, if they are not the iteration's own.
         changes: whether it also propagates tangent and adjoint vectors.
     """
-    kernels = tuple(sweep.kernels if kernels is None else kernels)
-    mass = sweep.constant_mass
-    damping = None if meaning.are_points else sweep.damping
+    kernels = tuple(fixed_point.kernels if kernels is None else kernels)
+    mass = fixed_point.constant_mass
+    damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    solver = _solver(sweep, fallback) if meaning.are_points else ()
+    solver = _solver(fixed_point, fallback) if meaning.are_points else ()
     return IterationSource(
-        lanes=sweep.lanes,
-        whole=meaning.are_points and not sweep.in_groups,
+        lanes=fixed_point.lanes,
+        whole=meaning.are_points and not fixed_point.in_groups,
         meaning=meaning,
         defines={
-            "FINAL_ITERATIONS": str(sweep.final_iterations),
-            **{name: str(value) for name, value in sweep.facts.items()},
+            "FINAL_ITERATIONS": str(fixed_point.final_iterations),
+            **{name: str(value) for name, value in fixed_point.facts.items()},
         },
         functions=tuple(map(_function, sorted(functions))),
-        tables=tuple(_tables(sweep, meaning, changes=changes)),
+        tables=tuple(_tables(fixed_point, meaning, changes=changes)),
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "convergence", "inverse_sizes", meaning.memory, *sweep.parts, *solver),
-        error_defines=_kept(sweep),
-        highest=_groups("HIGHEST", sweep.guess.highest),
-        next=_groups("NEXT", sweep.guess.next),
+        support=(*meaning.before, "convergence", "inverse_sizes", meaning.memory, *fixed_point.parts, *solver),
+        error_defines=_kept(fixed_point),
+        highest=_groups("HIGHEST", fixed_point.guess.highest),
+        next=_groups("NEXT", fixed_point.guess.next),
     )
 
 
-def _kept(sweep: FixedPointIteration) -> dict[str, str]:
+def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
     """Return the macros of the error estimate.
 
     Coefficient k of velocities is h / (4k - 2) times coefficient k - 1 of accelerations.
     """
-    velocities, degree = sweep.kept is StoredValues.VELOCITIES, sweep.guess.degree
-    forces = sweep.kept is StoredValues.FORCES
+    velocities, degree = fixed_point.kept is StoredValues.VELOCITIES, fixed_point.guess.degree
+    forces = fixed_point.kept is StoredValues.FORCES
     return {
-        "KEPT": str(len(sweep.guess.abscissae)),
+        "KEPT": str(len(fixed_point.guess.abscissae)),
         "KEPT_VELOCITIES": str(int(velocities)),
         "KEPT_UNIT(i)": "(data->square * data->inverse_mass[i])" if forces else "(step->h)",
         "RESOLVED": f"{4 * degree - 2 if velocities else 1}.0",
@@ -168,18 +168,22 @@ def _function(name: str) -> str:
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
 
 
-def _solver(sweep: FixedPointIteration, fallback: Fallback) -> tuple[str, ...]:
+def _solver(fixed_point: FixedPointIteration, fallback: Fallback) -> tuple[str, ...]:
     """Return the headers of the solver around an iteration whose lanes are points, in order."""
     solver = (*HEADERS[fallback], "iteration_solver")
-    if not sweep.integral_part:
+    if not fixed_point.integral_part:
         return solver
-    return (*solver, sweep.integral_part, f"integrals_after_{'sweep' if fallback == 'none' else 'fallback'}")
+    return (
+        *solver,
+        fixed_point.integral_part,
+        f"integrals_after_{'iteration' if fallback == 'none' else 'fallback'}",
+    )
 
 
-def _tables(sweep: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
-    points = len(sweep.guess.abscissae)
-    vector, matrix = _printers(meaning, points) if sweep.in_groups else (_vector, _columns)
-    for each in (*sweep.tables, *(sweep.derivatives_tables if changes else ())):
+def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
+    points = len(fixed_point.guess.abscissae)
+    vector, matrix = _printers(meaning, points) if fixed_point.in_groups else (_vector, _columns)
+    for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
         print_table: Callable[[str, Any], str] = matrix if each.is_matrix else vector
         yield print_table(each.name, each.numbers)
         if each.in_two_parts:

@@ -19,6 +19,7 @@ __all__ = [
 WIDTH = 120
 CONTINUATION = 4
 OPERATOR = re.compile(r" ([-+*/=]) ")
+SHORT_SUM = re.compile(r"(?<=[-+*/] )\([^(),]{1,50}\)")
 PROTOTYPE = re.compile(r"^\w+ \w+\([^;{]*\);$", re.MULTILINE)
 
 
@@ -50,7 +51,8 @@ def _rows(braced: Sequence[str]) -> list[str]:
 def wrapped(statement: str, indent: int = 2) -> str:
     """Return a statement, continued on further lines if it is too long, after an operator or comma."""
     first = " " * indent
-    joined = OPERATOR.sub("\0\\1 ", statement)  # no break before an operator
+    joined = SHORT_SUM.sub(lambda found: found[0].replace(" ", "\0"), statement)
+    joined = OPERATOR.sub("\0\\1 ", joined)  # no break before an operator
     return "\n".join(_lines(joined, first, first + " " * CONTINUATION)).replace("\0", " ")
 
 

@@ -26,7 +26,7 @@ __all__ = [
 Sources: TypeAlias = tuple[str, ...]
 """Loads that differ between lanes: ``("u", "t")`` for points, ``("u", "parameters")`` for trajectories."""
 
-ARRAYS = ("u", "t", "parameters", "kept", "value", "slope")
+ARRAYS = ("u", "t", "parameters", "kept", "value", "derivative")
 """Arrays that a kernel and its parts may use, in the order of their arguments."""
 
 INVERSE_ROOT = "inverse_root_"
@@ -123,7 +123,7 @@ def print_statements(code: Kernel | Part, target: Target = DOUBLE) -> list[str]:
     ]
 
 
-def print_lane_statements(code: Kernel | Part, sweep: FixedPointIteration, sources: Sources) -> list[str]:
+def print_lane_statements(code: Kernel | Part, fixed_point: FixedPointIteration, sources: Sources) -> list[str]:
     """Return the statements of a kernel of vectors, or of one of its parts.
 
     Variables that are the same in every lane remain numbers; derivatives are stored at their indices in the mass.
@@ -138,7 +138,7 @@ def print_lane_statements(code: Kernel | Part, sweep: FixedPointIteration, sourc
         if kind == "w":
             statements.append(f"const {'lanes' if vector else 'double'} w{k} = {text};")
         else:
-            target = _mass_element(sweep, k) if kind == "slope" else f"{kind}[{k}]"
+            target = _mass_element(fixed_point, k) if kind == "derivative" else f"{kind}[{k}]"
             statements.append(f"{target} = {text};" if vector else f"{target} = lanes_of({text});")
     return statements
 
@@ -148,9 +148,9 @@ def _call(part: Part) -> str:
     return f"{part.name}({', '.join(array for array in ARRAYS if part.uses(array))});"
 
 
-def _mass_element(sweep: FixedPointIteration, k: int) -> str:
-    i, j = sweep.mass_entries[k]
-    return f"slope[{i}]" if sweep.diagonal else f"slope[{i} * M + {j}]"
+def _mass_element(fixed_point: FixedPointIteration, k: int) -> str:
+    i, j = fixed_point.mass_entries[k]
+    return f"derivative[{i}]" if fixed_point.diagonal else f"derivative[{i} * M + {j}]"
 
 
 class _Vectors:

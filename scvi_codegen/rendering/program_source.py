@@ -172,7 +172,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
 def _control_context(program: Program, control: Control | None) -> dict[str, object]:
     """Return the template's context for adaptive steps; the predictor tables are a separate header."""
     name = f"support/{program.prefix}_predictor.h"
-    if not (control and control.predictor and program.sweep):
+    if not (control and control.predictor and program.fixed_point):
         return {"control": control, "own_headers": {}}
     return {"control": control, "own_headers": {name: predictor_text(control.predictor)}}
 
@@ -182,8 +182,8 @@ def render_ensemble(program: Program) -> Source | None:
 
     Also ``None`` with integrals: with a time transformation, trajectories have no common times.
     """
-    sweep = program.sweep
-    if sweep is None or not sweep.serves_many or program.integrals:
+    fixed_point = program.fixed_point
+    if fixed_point is None or not fixed_point.serves_many or program.integrals:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
@@ -192,11 +192,11 @@ def render_ensemble(program: Program) -> Source | None:
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
-        "points": len(sweep.guess.abscissae),
-        "cut": is_divided(sweep.kernels),
-        "needs_velocities": sweep.kept is StoredValues.VELOCITIES,
+        "points": len(fixed_point.guess.abscissae),
+        "cut": is_divided(fixed_point.kernels),
+        "needs_velocities": fixed_point.kept is StoredValues.VELOCITIES,
         "hot": "static",
-        "sweep": iteration_source(sweep, TRAJECTORIES, fallback="none"),
+        "fixed_point": iteration_source(fixed_point, TRAJECTORIES, fallback="none"),
     }
     return _render(prefix, context, "ensemble")
 
@@ -270,7 +270,7 @@ def _context(
         "target": target,
         "real": target.scalar,
         "kernels": kernels,
-        "cut": is_divided((*scalars, *(program.sweep.kernels if program.sweep else ()), *lanes)),
+        "cut": is_divided((*scalars, *(program.fixed_point.kernels if program.fixed_point else ()), *lanes)),
         "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
@@ -295,18 +295,18 @@ def _scalar_kernels(
 
 def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]) -> dict[str, object]:
     """Return the template's context for the fixed-point iteration; ``beside``: kernels of its derivative."""
-    sweep = program.sweep
-    if sweep is None:
-        return {"sweep": None}
-    hot = "static inline __attribute__((always_inline))" if _size(sweep) <= LARGEST_INLINED else "static"
-    kernels = (*sweep.kernels, *beside)
-    text = iteration_source(sweep, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
-    return {"sweep": text, "hot": hot}
+    fixed_point = program.fixed_point
+    if fixed_point is None:
+        return {"fixed_point": None}
+    hot = "static inline __attribute__((always_inline))" if _size(fixed_point) <= LARGEST_INLINED else "static"
+    kernels = (*fixed_point.kernels, *beside)
+    text = iteration_source(fixed_point, POINTS, fallback=fallback, kernels=kernels, changes=bool(beside))
+    return {"fixed_point": text, "hot": hot}
 
 
-def _size(sweep: FixedPointIteration) -> int:
+def _size(fixed_point: FixedPointIteration) -> int:
     """Return the number of operations of all kernels on lanes."""
-    return sum(sum(kernel.operation_counts().values()) for kernel in sweep.kernels)
+    return sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
 
 
 def _inverse_roots(functions: set[str]) -> list[int]:

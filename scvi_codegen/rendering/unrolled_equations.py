@@ -34,8 +34,8 @@ class UnrolledGroup:
     family: LoweredStageGroup
     u: int
     value: int
-    slope: int
-    slopes: int
+    derivative: int
+    partials: int
     points: tuple[str, ...]
     uses_step: bool
 
@@ -71,9 +71,9 @@ class _Statements:
         families = program.families
         self.u = list(accumulate((each.points * each.value.arguments for each in families), initial=0))
         self.value = list(accumulate((each.points * each.value.values for each in families), initial=0))
-        self.slopes = [len(each.slope.results) - each.slope.values for each in families]
-        counts = (each.points * count for each, count in zip(families, self.slopes, strict=True))
-        self.slope = list(accumulate(counts, initial=0))
+        self.partials = [len(each.derivative.results) - each.derivative.values for each in families]
+        counts = (each.points * count for each, count in zip(families, self.partials, strict=True))
+        self.derivative = list(accumulate(counts, initial=0))
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> UnrolledEquations:
         """Return all statements, with the given entries of the Jacobian."""
@@ -81,7 +81,7 @@ class _Statements:
         sites = range(program.sites)
         return UnrolledEquations(
             families=tuple(self._family(k, family) for k, family in enumerate(program.families)),
-            sizes=(self.u[-1], self.value[-1], self.slope[-1]),
+            sizes=(self.u[-1], self.value[-1], self.derivative[-1]),
             residuals=tuple(
                 _statement(f"rows[{s * (blocks + 1) + r}] = {self._sum(self._row(s, r))};")
                 for s in sites
@@ -102,8 +102,8 @@ class _Statements:
             family=family,
             u=self.u[k],
             value=self.value[k],
-            slope=self.slope[k],
-            slopes=self.slopes[k],
+            derivative=self.derivative[k],
+            partials=self.partials[k],
             points=tuple(map(_statement, self._points(family))),
             uses_step=any(loop.power for loop in family.gathers),
         )
@@ -170,8 +170,8 @@ class _Statements:
         """Return the product of weight, h^power, derivative and coefficient; empty if that is 0."""
         if not coefficient:
             return ""
-        slope = f"slope[{self.slope[k] + n * self.slopes[k] + e}]"
-        product = self._product(self.program.families[k].weights[n], power, slope)
+        derivative = f"derivative[{self.derivative[k] + n * self.partials[k] + e}]"
+        product = self._product(self.program.families[k].weights[n], power, derivative)
         return product if coefficient == 1 else f"{product} * {self._signed(coefficient)}"
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:

@@ -131,10 +131,10 @@ class AdaptiveEnsemble:
             threads: number of threads, by default one per core.
         """
 
-        def drive(j: int, check_stop: StopCheck) -> None:
+        def advance(j: int, check_stop: StopCheck) -> None:
             self.saved[j] = self._trajectory(j, check_stop)
 
-        run_jobs(len(self), drive, progress=progress, threads=threads)
+        run_jobs(len(self), advance, progress=progress, threads=threads)
 
     def _trajectory(self, j: int, check_stop: StopCheck) -> SavedLane:
         try:

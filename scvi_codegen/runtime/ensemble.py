@@ -163,7 +163,7 @@ class Ensemble:
         firsts = range(0, self.count, width)
         reached, stop = np.zeros(len(firsts)), threading.Event()
 
-        def drive(number: int) -> None:
+        def advance(number: int) -> None:
             block = make(firsts[number])
             chunk_size = min(FIRST_CHUNK_STEPS, self.steps)
             while reached[number] < self.steps and not stop.is_set():
@@ -175,7 +175,7 @@ class Ensemble:
 
         def take(piece: int) -> None:
             for number in range(piece, len(firsts), MOST_JOBS):
-                drive(number)
+                advance(number)
 
         with ThreadPoolExecutor(workers) as pool:
             try:

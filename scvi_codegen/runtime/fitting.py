@@ -166,8 +166,8 @@ def fit(
     chain, x = chained(measurements, model.known, model.unknown_indices, checked_count(segments, "segments", least=1))
     chain, x, at_bound, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, at_bound, evaluations, known_noise=deviations is not None)
-    if told := _step_size_warning(chain, fitted, x, ~at_bound):
-        warn(told, AccuracyWarning)
+    if determined := _step_size_warning(chain, fitted, x, ~at_bound):
+        warn(determined, AccuracyWarning)
     return fitted
 
 
@@ -305,17 +305,17 @@ def _step_size_warning(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.boo
     """
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
     count, found = len(fitted.names), x.copy()
-    errors, told = np.sqrt(np.diag(fitted.covariance)), free[:count]
+    errors, determined = np.sqrt(np.diag(fitted.covariance)), free[:count]
     noticed = np.maximum(errors, NEGLIGIBLE_CHANGE * chain.typical_unknowns(x)[:count])
     with suppress(StepFailedError):
         for _ in range(REFINEMENT_ITERATIONS):
             scaled, jacobian = finer.evaluated(found)
             found[free] -= np.linalg.pinv(jacobian[:, free]) @ scaled
-            moved = np.abs(found - x)[:count][told]
-            if not (moved > noticed[told]).any():
+            moved = np.abs(found - x)[:count][determined]
+            if not (moved > noticed[determined]).any():
                 return ""
-        ratios = moved / errors[told]
-        name = [name for name, at in zip(fitted.names, told, strict=True) if at][int(np.argmax(ratios))]
+        ratios = moved / errors[determined]
+        name = [name for name, at in zip(fitted.names, determined, strict=True) if at][int(np.argmax(ratios))]
         return (
             f"h is too large for this fit: with half the step size {name} changes by {ratios.max():.1f} standard "
             "errors. Reduce h, or use a method of higher order"
@@ -355,15 +355,15 @@ def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bo
     if singular[-1] > SAME * singular[0]:
         return
     shares = np.abs(directions[-1])
-    told = [free[k] for k in np.flatnonzero(shares > NAMED_FRACTION * shares.max()).tolist() if free[k]]
-    if len(told) < 2:
+    determined = [free[k] for k in np.flatnonzero(shares > NAMED_FRACTION * shares.max()).tolist() if free[k]]
+    if len(determined) < 2:
         raise FitError(
-            f"the measurements do not determine {' '.join(told) or 'the states of segments'}: changed together with "
-            f"states of later segments, it leaves the computed values unchanged. {_as_known([*told, ''])}"
+            f"the measurements do not determine {' '.join(determined) or 'the states of segments'}: changed together "
+            f"with states of later segments, it leaves the computed values unchanged. {_as_known([*determined, ''])}"
         )
     raise FitError(
-        f"the measurements do not determine {', '.join(told[:-1])} and {told[-1]} separately: changed together, they "
-        f"leave the computed values unchanged. {_as_known(told)}"
+        f"the measurements do not determine {', '.join(determined[:-1])} and {determined[-1]} separately: changed "
+        f"together, they leave the computed values unchanged. {_as_known(determined)}"
     )
 
 

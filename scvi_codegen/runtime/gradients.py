@@ -174,17 +174,17 @@ def finite(given: ArrayLike, name: str) -> Array:
 
 def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
     """Return (n, outputs, count) tangent vectors at the states and (count, variables) at the end of the run."""
-    time, told = time_of(states), states.stepper._output_indices
+    time, outputs = time_of(states), states.stepper._output_indices
     states, now = time.states, time.initial_tangents(tangents)
-    found = np.empty((len(states), len(told), len(now)))
-    found[0] = now[:, told].T
+    found = np.empty((len(states), len(outputs), len(now)))
+    found[0] = now[:, outputs].T
     for first, last in pieces(states):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
         vectors[0] = now
         propagate(states, starts, numbers, vectors, back=False)
         saved = np.flatnonzero(numbers[1:] > 0) + 1
-        found[numbers[saved]] = vectors[saved][:, :, told].transpose(0, 2, 1)
+        found[numbers[saved]] = vectors[saved][:, :, outputs].transpose(0, 2, 1)
         now = vectors[-1]
     return time.final_tangents(found, now, tangents)
 

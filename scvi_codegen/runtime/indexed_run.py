@@ -355,7 +355,7 @@ class IndexedRun(OneThread):
         Raises:
             StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
         """
-        found = read_saved(saved, interface, to_a_goal=plan is not None)
+        found = read_saved(saved, interface, to_a_time=plan is not None)
         with damage_as_state_error():
             unset_inputs = tuple(name for name in interface.inputs if name in found["unset_inputs"].tolist())
             problem = IndexedProblem(interface, binding, saved_arrays(found, interface), unset_inputs)

@@ -45,7 +45,7 @@ def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInt
     return file.getvalue()
 
 
-def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) -> dict[str, NDArray[Any]]:
+def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_time: bool) -> dict[str, NDArray[Any]]:
     """Return the arrays of :func:`saved_bytes`.
 
     Raises:
@@ -59,10 +59,10 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_goal: bool) ->
             raise StateError(f"the saved run is one of '{found['integrator']}', not of '{interface.integrator}'")
         if str(found.pop(CHECKSUM)) != _checksum(found):
             raise StateError("invalid saved run: the checksum differs. Save the run again")
-        if bool(found["to a goal"]) == to_a_goal:
+        if bool(found["to a goal"]) == to_a_time:
             return found
     raise StateError(
-        "the saved run has fixed steps: omit t_end" if to_a_goal else "the saved run has adaptive steps: give t_end"
+        "the saved run has fixed steps: omit t_end" if to_a_time else "the saved run has adaptive steps: give t_end"
     )
 
 

@@ -28,7 +28,7 @@ from scvi_codegen.runtime.linearised import LinearisedMethod
 
 __all__ = ["Integrator"]
 
-TOLD = 1e-3
+REPORTED = 1e-3
 """Largest relative difference between a velocity and the velocity recomputed from its momentum."""
 
 
@@ -153,7 +153,7 @@ class Integrator(LinearisedMethod):
                 back = self.velocity(q, p, t, parameters)
             except StateError:
                 back = np.full_like(v, np.nan)
-            dropped &= ~(np.abs(back - v) <= TOLD * np.abs(v).max())
+            dropped &= ~(np.abs(back - v) <= REPORTED * np.abs(v).max())
         if not dropped.any():
             return p
         i = int(np.flatnonzero(dropped)[0])

@@ -48,10 +48,10 @@ class Sensitivity:
         """Construct from (..., outputs, 2m + k + 2) derivatives of outputs with respect to all variables."""
         size = 2 * dimension
         states, times = columns[..., :size, :], columns[..., size:, :]
-        told = cls._of(states, size, stretched=stretched)
+        described = cls._of(states, size, stretched=stretched)
         if not times.shape[-2]:
-            return told
-        return replace(told, times=cls._of(times[..., 0, :], size, stretched=stretched))
+            return described
+        return replace(described, times=cls._of(times[..., 0, :], size, stretched=stretched))
 
     @classmethod
     def _of(cls, columns: Array, size: int, *, stretched: bool) -> Sensitivity:

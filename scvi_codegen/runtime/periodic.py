@@ -241,8 +241,8 @@ class _OrbitSearch:
 
     def _check_energy(self, found: _ClosingEquations, allowed: float) -> None:
         """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
-        away, slopes = float(found.defects[-1]), found.slopes[-1]
-        if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(slopes))):
+        away, partials = float(found.defects[-1]), found.partials[-1]
+        if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(partials))):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
                 "fix fewer entries of the state, or give a better initial guess"
@@ -272,7 +272,7 @@ class _OrbitSearch:
         """
         free = np.delete(np.arange(len(z)), self.held)
         inverse = np.zeros((len(z), len(found.defects)))
-        inverse[free] = np.linalg.pinv(found.slopes[:, free], NULL_SINGULAR_VALUE)
+        inverse[free] = np.linalg.pinv(found.partials[:, free], NULL_SINGULAR_VALUE)
         change = inverse @ found.defects
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
@@ -305,15 +305,15 @@ class _OrbitSearch:
         error = float(np.abs(defects).max())
         left = self._independent_equations(starts, segments)
         rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
-        slopes, wanted = rows.reshape(count * size, -1), defects.ravel()
+        partials, wanted = rows.reshape(count * size, -1), defects.ravel()
         if self.energy is not None:
             first = starts[0]
             energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
             wanted = np.append(wanted, energy - self.energy)
             row = np.zeros(len(z))
             row[:size] = self._integral_gradients(first, self.t)[0]
-            slopes = np.vstack([slopes, row])
-        return _ClosingEquations(segments, error, wanted, slopes)
+            partials = np.vstack([partials, row])
+        return _ClosingEquations(segments, error, wanted, partials)
 
     def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
         """Integrate from the start of step ``first`` to the start of step ``last``."""
@@ -326,14 +326,14 @@ class _OrbitSearch:
         vectors[0, size, -2:] = first / self.steps, 1.0 / self.steps
         vectors[0, size + 1, -2] = 1.0
         q, p = stepper._propagate(starts, vectors, self.parameters, self.options)
-        slopes = vectors[-1, :, :size].T.copy()
+        partials = vectors[-1, :, :size].T.copy()
         return _Segment(
             states=np.column_stack([q, p]),
             start_time=self.t + period * (first / self.steps),
             end_time=self.t + period * (last / self.steps),
-            monodromy=slopes[:, :size],
-            by_period=slopes[:, size],
-            by_time=slopes[:, size + 1],
+            monodromy=partials[:, :size],
+            by_period=partials[:, size],
+            by_time=partials[:, size + 1],
         )
 
     def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
@@ -365,8 +365,8 @@ class _OrbitSearch:
                 self.stepper.momentum_maps(q, p, times, self.parameters).reshape(2 * size, -1),
             ]
         )
-        slopes: Array = (values[:size] - values[size:]).T / (2.0 * width)
-        return slopes
+        partials: Array = (values[:size] - values[size:]).T / (2.0 * width)
+        return partials
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +401,7 @@ class _ClosingEquations:
     segments: Sequence[_Segment]
     error: float
     defects: Array
-    slopes: Array
+    partials: Array
 
     @property
     def motion(self) -> _Segment:

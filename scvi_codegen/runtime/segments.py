@@ -150,9 +150,9 @@ class Chain:
             start = x[self._node(j)]
         moving = np.flatnonzero(tangents.any(axis=1))
         computed, by, end, at_end = part.motion(start, tangents[moving], values[size:])
-        jacobian, slopes_at_end = np.zeros((*computed.shape, len(x))), np.zeros((size, len(x)))
-        jacobian[..., moving], slopes_at_end[:, moving] = by, at_end[:, :size].T
-        return computed, jacobian, end, slopes_at_end
+        jacobian, partials_at_end = np.zeros((*computed.shape, len(x))), np.zeros((size, len(x)))
+        jacobian[..., moving], partials_at_end[:, moving] = by, at_end[:, :size].T
+        return computed, jacobian, end, partials_at_end
 
 
 def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurements], known: Array) -> Array:

@@ -245,8 +245,8 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     def _worst(self) -> str:
         if math.isnan(self.step_error):
             return "unknown: the method has no error estimate here"
-        said = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
-        return f"{said}; h is too large" if self.step_error > TOLERABLE_ERROR else said
+        message = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
+        return f"{message}; h is too large" if self.step_error > TOLERABLE_ERROR else message
 
     def _energies(self, save_every: int) -> Array | None:
         """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""

@@ -138,9 +138,9 @@ def is_nonnegative(polynomial: Polynomial) -> bool:
 
 def odd_factors(polynomial: Polynomial) -> list[Polynomial]:
     """Return the square-free factors of odd multiplicity (Yun's algorithm)."""
-    slope = derivative(polynomial)
-    repeated = common_factor(polynomial, slope)
-    rest, other = divided(polynomial, repeated)[0], divided(slope, repeated)[0]
+    rate = derivative(polynomial)
+    repeated = common_factor(polynomial, rate)
+    rest, other = divided(polynomial, repeated)[0], divided(rate, repeated)[0]
     odd: list[Polynomial] = []
     for multiplicity in range(1, len(polynomial) + 1):
         if len(rest) <= 1:

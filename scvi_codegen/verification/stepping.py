@@ -186,14 +186,14 @@ def _action(tested: SystemUnderTest) -> Finding | None:
     if tested.system.forces or tested.system.damping != 0:
         return None
     state, equations, solved = tested.states[0], tested.derived(), tested.solved(0)
-    slopes = equations.action_gradient(solved, state.q, state.p, state.h, state.t)
-    if slopes is None:
+    partials = equations.action_gradient(solved, state.q, state.p, state.h, state.t)
+    if partials is None:
         return None
     p0, p1 = numbers(state.p), np.array(solved.p, dtype=object)
     row = numbers(equations.stages.end_position.entries[0])
     powers = [mp.mpf(state.h) ** block.power for block in equations.stages.blocks]
     expected = np.array([p1 * (row[b + 1] * power) for b, power in enumerate(powers)], dtype=object)
-    wrong = [*(slopes[0] - p1 * row[0] + p0), *(slopes[1] - expected.ravel())]
+    wrong = [*(partials[0] - p1 * row[0] + p0), *(partials[1] - expected.ravel())]
     size = max(1, *map(abs, p0), *map(abs, p1))
     return Finding(float(max(map(abs, wrong)) / size), STATIONARY)
 
@@ -223,11 +223,11 @@ def _discrete(tested: SystemUnderTest) -> Finding | None:
     arguments = (state.q, q1, state.h, state.t, tested.parameters)
     try:
         p0, end = stepper.discrete_legendre_minus(*arguments)[1], stepper.discrete_legendre_plus(*arguments)[1]
-        slopes = _action_derivatives(tested, state, q1)
+        partials = _action_derivatives(tested, state, q1)
     except StepFailedError as failure:
         raise ViolationError(f"a curve from q0 to q1 exists, but {failure}") from failure
     sizes = tested.scales(state)[len(q1) :]
-    wrong = np.array([*(slopes + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
+    wrong = np.array([*(partials + np.concatenate([state.p, -p1])).reshape(2, -1), p0 - state.p, end - p1])
     return Finding(float(np.max(np.abs(wrong) / sizes)), DERIVATIVE_BOUND, "relative")
 
 

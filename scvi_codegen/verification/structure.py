@@ -109,10 +109,10 @@ def _constraints(tested: SystemUnderTest) -> Finding:
     for k in range(0, len(run), STEPS // SAMPLED_STATES):
         state = State(run.q[k], run.p[k], float(run.t[k]), first.h)
         units = EPSILON * np.maximum(np.abs(state.z), tested.scales(state))
-        slopes = np.abs(tested.constraint_derivatives(state, units / EPSILON)).sum(axis=1) + _by_time(tested, state)
+        partials = np.abs(tested.constraint_derivatives(state, units / EPSILON)).sum(axis=1) + _by_time(tested, state)
         values = np.abs(np.concatenate(stepper.constraint_values(state.q, state.p, state.t, parameters)))
-        message = slopes > 0.0  # a constraint on velocities has no position residual
-        worst = max(worst, float(np.max(values[message] / (EPSILON * slopes[message]))))
+        message = partials > 0.0  # a constraint on velocities has no position residual
+        worst = max(worst, float(np.max(values[message] / (EPSILON * partials[message]))))
     return Finding(worst, ROUNDINGS, f"in units of rounding, steps of {first.h:g}")
 
 

@@ -43,8 +43,8 @@ def time_transformation_derivative_checks(runs_tested: VariableSteps) -> Iterato
 def _derivative(runs_tested: VariableSteps) -> Finding:
     """Compare the directional derivative of the end state and of its time with differences of the exact step."""
     state, direction = _first(runs_tested), _direction(runs_tested)
-    told, scales = runs_tested.stepper._output_indices, np.append(runs_tested.tested.scales(state), state.h)
-    result = _propagated(runs_tested, direction, back=False)[told]
+    outputs, scales = runs_tested.stepper._output_indices, np.append(runs_tested.tested.scales(state), state.h)
+    result = _propagated(runs_tested, direction, back=False)[outputs]
     ends = [_end(runs_tested, direction * (sign * WIDTH)) for sign in (1, -1)]
     exact = ((ends[0] - ends[1]) / (2 * WIDTH)).astype(float)
     difference = np.abs((result - exact) / scales).max() / np.abs(exact / scales).max()

@@ -10,7 +10,7 @@ typedef NAME(block) block_memory;
 /* Which trajectories the iteration still serves, and the number of iterations. */
 typedef struct {
   double *active;
-  long long sweeps;
+  long long iterations;
 } solver_report;
 
 /* Arguments of a step. */

@@ -6,7 +6,7 @@ static const casadi_int NO_JACOBIAN_SHAPE[2 + FLOW_STATE * FLOW_COLUMNS + 1] = {
 static const casadi_int TRANSPOSED_SHAPE[] = {STEP_INPUTS, FLOW_STATE * FLOW_COLUMNS, 1};
 
 /* Derivatives of the adjoint with respect to the inputs (Hessian-vector products of the unit vectors), by columns. */
-static int external_hessian(const double *x, const double *slopes, double *found)
+static int external_hessian(const double *x, const double *partials, double *found)
 {
   enum { VALUES = FLOW_STATE * FLOW_COLUMNS };
   flow_call way = {.steps = FLOW_STEPS, .every = FLOW_EVERY, .count = STEP_INPUTS};
@@ -15,7 +15,7 @@ static int external_hessian(const double *x, const double *slopes, double *found
   int status = FLOW_NO_MEMORY;
   for (int i = 0; same && i < STEP_INPUTS; i++) {
     each[i * STEP_INPUTS + i] = 1;
-    memcpy(same + i * VALUES, slopes, sizeof(double) * VALUES);
+    memcpy(same + i * VALUES, partials, sizeof(double) * VALUES);
   }
   if (same)
     status = hessian_rows(&way, 1, x, same, each, found, &report);

@@ -3,7 +3,8 @@
 
 /* Computes the increments of one step. Each iteration corrects the accelerations at the nodes and, where it is unknown,
  * the initial velocity. On failure the increments are undefined. */
-HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq, double *dp,
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
+    double *dp,
     const solver_options *options, solver_report *report)
 {
   curve_data curve;

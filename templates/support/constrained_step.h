@@ -42,7 +42,7 @@ static void compute_constraint_forces(const held *held, const double *lambda, do
   memset(x, 0, sizeof(double) * (size_t)n);
   for (long long k = 0; k < held->count; k++)
     for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
-      x[held->of.place[e]] += held->slope[e] * lambda[k];
+      x[held->of.place[e]] += held->derivative[e] * lambda[k];
 }
 
 static void find_forces(const constrained_run *of, const double *X, double t, double *F)
@@ -55,7 +55,7 @@ static void find_forces(const constrained_run *of, const double *X, double t, do
 static int begin(const constrained_run *of)
 {
   find_forces(of, of->run->q, of->run->t, of->parts.F);
-  evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.slope);
+  evaluate_constraints(of->given, of->run->q, of->run->t, of->held.g, of->held.rate, of->held.derivative);
   return assemble(&of->held, of->run->inverse_mass) ? OK : SINGULAR;
 }
 
@@ -134,7 +134,7 @@ static void find_right(const held *held, const double *rate, const double *x, do
   for (long long k = 0; k < held->count; k++) {
     double sum = rate[k];
     for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
-      sum += held->slope[e] * x[held->of.place[e]];
+      sum += held->derivative[e] * x[held->of.place[e]];
     held->right[k] = -scale * sum;
   }
 }
@@ -152,7 +152,7 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
     for (long long i = 0; i < of->n; i++)
       of->parts.D[i] = run->inverse_mass[i] * (run->p[i] + of->parts.dp[i]);
     find_right(held, held->rate, of->parts.D, 1.0 / by);
-    compute_rounding(held, held->slope, of->parts.X, 1.0 / by);
+    compute_rounding(held, held->derivative, of->parts.X, 1.0 / by);
     if (now.status)
       return now.status < 0 ? failure_of(&now) : OK;
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
@@ -178,7 +178,7 @@ static int constrained_substep(const constrained_run *of, double h, double t)
     return status;
   add_to(parts->dp, parts->R, h / 2, of->n);
   memcpy(parts->dq, parts->D, sizeof(double) * (size_t)of->n);
-  memcpy(held->slope, held->next, sizeof(double) * (size_t)held->entries);
+  memcpy(held->derivative, held->next, sizeof(double) * (size_t)held->entries);
   if (!assemble(held, run->inverse_mass))
     return SINGULAR;
   find_forces(of, parts->Y, t, parts->F);

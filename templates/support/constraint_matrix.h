@@ -15,7 +15,7 @@ typedef struct {
   pattern of;
   long long count, entries;
   double *g, *rate, *lambda, *right, *change, *preconditioned, *direction, *image, *rounding, *diagonal, *pivot;
-  double *slope, *next;
+  double *derivative, *next;
   double *entry, *factor;
 } held;
 
@@ -28,8 +28,8 @@ static held constraint_arrays(const run_memory *run, long long n)
   double *numbers = run->held;
   for (size_t k = 0; k < sizeof each / sizeof *each; k++, numbers += found.count)
     *each[k] = numbers;
-  found.slope = numbers;
-  found.next = found.slope + found.entries;
+  found.derivative = numbers;
+  found.next = found.derivative + found.entries;
   found.entry = found.next + found.entries;
   found.factor = found.entry + run->pairs;
   return found;
@@ -46,15 +46,15 @@ static void find_products(const held *held, const double *inverse_mass, int k)
   }
   for (int e = of->first[k]; e < of->first[k + 1]; e++) {
     const int i = of->place[e];
-    const double weight = held->slope[e] * inverse_mass[i];
+    const double weight = held->derivative[e] * inverse_mass[i];
     for (int m = of->at[i]; m < of->at[i + 1]; m++) {
       const int f = of->list[m], l = of->owner[f];
       if (l > k)
         break;
       if (l == k)
-        held->diagonal[k] += weight * held->slope[f];
+        held->diagonal[k] += weight * held->derivative[f];
       else
-        held->entry[of->where[l]] += weight * held->slope[f];
+        held->entry[of->where[l]] += weight * held->derivative[f];
     }
   }
 }
@@ -138,12 +138,12 @@ static double product_of(const double *x, const double *y, long long n)
 }
 
 /* Bound of the rounding error of scale G x, per constraint. */
-static void compute_rounding(const held *held, const double *slope, const double *x, double scale)
+static void compute_rounding(const held *held, const double *derivative, const double *x, double scale)
 {
   for (long long k = 0; k < held->count; k++) {
     double terms = 0.0;
     for (int e = held->of.first[k]; e < held->of.first[k + 1]; e++)
-      terms += fabs(slope[e] * x[held->of.place[e]]);
+      terms += fabs(derivative[e] * x[held->of.place[e]]);
     held->rounding[k] = DBL_EPSILON * fabs(scale) * terms;
   }
 }
@@ -172,7 +172,8 @@ static double move_on(const held *held, double step)
 static int solve_constraint_system(const held *held, double tolerance, solver_report *report)
 {
   const long long n = held->count;
-  double size = product_of(held->right, held->right, n), slope, length; /* squared length of the search direction in the
+  double size = product_of(held->right, held->right, n), derivative,
+         length; /* squared length of the search direction in the
                                                                          * metric of L D L^T */
   const double least = tolerance * tolerance * size;
   memset(held->change, 0, sizeof(double) * (size_t)n);
@@ -180,9 +181,9 @@ static int solve_constraint_system(const held *held, double tolerance, solver_re
     return NOT_FINITE;
   precondition(held, held->right, held->preconditioned);
   memcpy(held->direction, held->preconditioned, sizeof(double) * (size_t)n);
-  length = slope = product_of(held->right, held->preconditioned, n);
+  length = derivative = product_of(held->right, held->preconditioned, n);
   for (long long k = 0; size > least && exceeds_rounding(held); k++) {
-    double curve, again, last = slope;
+    double curve, again, last = derivative;
     if (k >= n + SPARE_PRODUCTS)
       return NOT_CONVERGED;
     multiply(held, held->direction, held->image);
@@ -190,11 +191,11 @@ static int solve_constraint_system(const held *held, double tolerance, solver_re
     curve = product_of(held->direction, held->image, n);
     if (!(curve > DEPENDENT * length))
       return SINGULAR;
-    size = move_on(held, slope / curve);
+    size = move_on(held, derivative / curve);
     precondition(held, held->right, held->preconditioned);
-    slope = product_of(held->right, held->preconditioned, n);
-    again = slope / last;
-    length = slope + again * again * length; /* the residual is orthogonal to the direction */
+    derivative = product_of(held->right, held->preconditioned, n);
+    again = derivative / last;
+    length = derivative + again * again * length; /* the residual is orthogonal to the direction */
     for (long long i = 0; i < n; i++)
       held->direction[i] = held->preconditioned[i] + again * held->direction[i];
   }

@@ -3,7 +3,7 @@
 /* Destinations of the next constraint: g, g_t and the derivatives of g, or the index of its first entry and the
  * coordinates of the entries. */
 typedef struct {
-  double *g, *rate, *slope;
+  double *g, *rate, *derivative;
   int *first, *place;
   long long count, entries;
 } condition;

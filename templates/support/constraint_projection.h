@@ -17,7 +17,7 @@ static int project_positions(const constrained_run *of)
   for (;;) {
     double moved = 0.0, size = 0.0;
     int status;
-    evaluate_constraints(of->given, parts->Y, run->t, held->g, held->rate, held->slope);
+    evaluate_constraints(of->given, parts->Y, run->t, held->g, held->rate, held->derivative);
     if (!assemble(held, run->inverse_mass))
       return SINGULAR;
     compute_constraint_forces(held, held->lambda, parts->R, of->n);
@@ -26,7 +26,7 @@ static int project_positions(const constrained_run *of)
     for (long long i = 0; i < of->n; i++)
       parts->X[i] = fabs(run->q[i]) + fabs(parts->Y[i]);
     find_right(held, held->g, parts->D, 1.0);
-    compute_rounding(held, held->slope, parts->X, 1.0);
+    compute_rounding(held, held->derivative, parts->X, 1.0);
     if (now.status)
       return end_of_iteration(&now, held);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
@@ -103,7 +103,7 @@ int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
     find_right(held, held->g, pulled, 1.0);
     for (long long i = 0; i < of.n; i++)
       pulled[i] = run->inverse_mass[i] * (fabs(F[i]) + fabs(of.parts.R[i]));
-    compute_rounding(held, held->slope, pulled, 1.0);
+    compute_rounding(held, held->derivative, pulled, 1.0);
     status = solve_constraint_system(held, REFINED, &report);
     add_to(lambda, held->change, 1.0, held->count);
   }

@@ -29,17 +29,17 @@ static saddle saddle_in(real *workspace)
 static int factorise_saddle(real t, const real *u, const real *parameters, const saddle *at, real *g)
 {
   const band shape = band_of(SITES, 1);
-  real p[M], mass[MASS_ENTRIES], slope[CONSTRAINT_ENTRIES];
+  real p[M], mass[MASS_ENTRIES], derivative[CONSTRAINT_ENTRIES];
   legendre(u, t, parameters, p, mass);
-  constraints(u, t, parameters, g, slope);
+  constraints(u, t, parameters, g, derivative);
   memset(at->matrix, 0, sizeof(real) * band_size(&shape));
   for (int e = 0; e < MASS_ENTRIES; e++)
     at->matrix[shape.first + POSITION_IN_MATRIX[MASS_ENTRY[e][1]] * shape.stride +
         POSITION_IN_MATRIX[MASS_ENTRY[e][0]]] = mass[e];
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
     const int row = POSITION_IN_MATRIX[M + CONSTRAINT_ENTRY[e][0]], column = POSITION_IN_MATRIX[CONSTRAINT_ENTRY[e][1]];
-    at->matrix[shape.first + column * shape.stride + row] = slope[e];
-    at->matrix[shape.first + row * shape.stride + column] = slope[e];
+    at->matrix[shape.first + column * shape.stride + row] = derivative[e];
+    at->matrix[shape.first + row * shape.stride + column] = derivative[e];
   }
   if (!all_finite(g, CONSTRAINTS) || !all_finite(at->matrix, (int)band_size(&shape)))
     return NOT_FINITE;
@@ -73,12 +73,12 @@ static real largest_of(const real *x)
 static int constrained(real t, const real *q, const real *p, const real *parameters, real *u, real *g, real *rate,
     real *workspace)
 {
-  real value[M + 2 * CONSTRAINTS], slope[CONSTRAINT_ENTRIES];
+  real value[M + 2 * CONSTRAINTS], derivative[CONSTRAINT_ENTRIES];
   const int status = NAME(velocity)(t, q, p, parameters, u + M, workspace);
   if (status != OK)
     return status;
   memcpy(u, q, sizeof(real) * M);
-  constraints(u, t, parameters, g, slope);
+  constraints(u, t, parameters, g, derivative);
   constrained_motion(u, t, parameters, value);
   memcpy(rate, value + M, sizeof(real) * CONSTRAINTS);
   return all_finite(g, CONSTRAINTS) && all_finite(rate, CONSTRAINTS) ? OK : NOT_FINITE;
@@ -100,8 +100,8 @@ int NAME(constraint_values)(long long count, const real *t, const real *q, const
 /* Sum of squares of g; infinite if g is not finite. */
 static real misfit(real t, const real *q, const real *parameters, real *g)
 {
-  real slope[CONSTRAINT_ENTRIES], sum = 0;
-  constraints(q, t, parameters, g, slope);
+  real derivative[CONSTRAINT_ENTRIES], sum = 0;
+  constraints(q, t, parameters, g, derivative);
   for (int k = 0; k < CONSTRAINTS; k++)
     sum += g[k] * g[k];
   return all_finite(g, CONSTRAINTS) ? sum : (real)INFINITY;
@@ -146,7 +146,7 @@ static int project_position(real t, real *u, const real *parameters, const saddl
 /* Projects p onto the cotangent space of the constraints. */
 static int project_momentum(real t, const real *q, real *p, const real *parameters, const saddle *at, real *workspace)
 {
-  real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], slope[CONSTRAINT_ENTRIES];
+  real u[2 * M], g[CONSTRAINTS], rate[CONSTRAINTS], y[CONSTRAINTS], update[M], derivative[CONSTRAINT_ENTRIES];
   for (int k = 0; k < MOMENTUM_PROJECTIONS; k++) {
     int status = constrained(t, q, p, parameters, u, g, rate, workspace);
     if (status == OK)
@@ -156,9 +156,9 @@ static int project_momentum(real t, const real *q, real *p, const real *paramete
     for (int j = 0; j < CONSTRAINTS; j++)
       rate[j] = -rate[j];
     solve_saddle(at, NULL, rate, update, y);
-    constraints(u, t, parameters, g, slope);
+    constraints(u, t, parameters, g, derivative);
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-      p[CONSTRAINT_ENTRY[e][1]] -= slope[e] * y[CONSTRAINT_ENTRY[e][0]];
+      p[CONSTRAINT_ENTRY[e][1]] -= derivative[e] * y[CONSTRAINT_ENTRY[e][0]];
   }
   return all_finite(p, M) ? OK : NOT_FINITE;
 }

@@ -1,4 +1,4 @@
-/* Trial of an adaptive step by fixed-point iteration. Requires: run.h, a sweep with curve_error.h, step_size_levels.h,
+/* Trial of an adaptive step by fixed-point iteration. Requires: run.h, curve_error.h, step_size_levels.h,
  * predictor_tables.h. */
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */
 
@@ -11,7 +11,7 @@ static inline double attempt(run_memory *run, step_data *step, const solver_data
   int status;
   step->tables = &tables;
   *guess = afresh || !choose_tables(run, &tables) ? 0 : run->guess;
-  status = sweep(step, data, run->memory, guess, dq, dp, options, report);
+  status = fixed_point(step, data, run->memory, guess, dq, dp, options, report);
   step->tables = NULL;
   if (status != OK)
     return INFINITY;

@@ -35,13 +35,13 @@ static void store_step(const step_data *step, const iteration_data *data, const 
 }
 
 static __attribute__((noinline)) void linearise_points(const step_data *step, const iteration_data *data,
-    const double *told, iterated_step *at)
+    const double *stored, iterated_step *at)
 {
   lanes V[GROUPS][M], value[M + POINT_DERIVATIVES];
   at->step = step;
-  at->dq = told + M * POINTS;
+  at->dq = stored + M * POINTS;
   at->dp = at->dq + M;
-  lanes_load(told, V);
+  lanes_load(stored, V);
   for (int n = 0; n < GROUPS; n++) {
     const lanes t = step->t + step->h * ABSCISSA[n];
     lanes u[2 * M];

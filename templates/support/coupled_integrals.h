@@ -1,7 +1,7 @@
 /* Integrals along a step solved by fixed-point iteration. Requires: coupled_iteration.h, the kernel integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities, which `memory` contains. */
-static inline void integrals_of_sweep(const step_data *step, const iteration_data *data, const double *memory,
+static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
     double *sum)
 {
   lanes z[GROUPS][M], scaled[GROUPS][M], u[2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];

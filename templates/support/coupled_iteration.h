@@ -4,7 +4,8 @@
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
  * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.
  * On failure the increments are undefined. */
-HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq, number *dp,
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp,
     const solver_options *options, solver_report *report)
 {
   coordinates own[GROUPS], *z = kept(past, own);

@@ -100,7 +100,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     const long long parity = block->step % 2;
     const history past = {memory[1 - parity], memory[parity]};
     step.t = block->t;
-    sweep(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
+    fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
     drop_infinite(&now, dq, dp, block->active);
     add_compensated(now.q, now.carry_q, dq, block->active);
     add_compensated(now.p, now.carry_p, dp, block->active);
@@ -114,7 +114,7 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
       stored++;
     }
   }
-  block->sweeps += report.sweeps;
+  block->iterations += report.iterations;
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
 }

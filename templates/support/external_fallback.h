@@ -2,9 +2,9 @@
  * fixed-point iteration fails returns NEEDED, is not performed, and has to be repeated. Requires: fallback.h. */
 static const fallback *library_fallback; /* set once, before the calls that need it are repeated */
 
-void NAME(set_fallback)(const void *lent)
+void NAME(set_fallback)(const void *shared_fallback)
 {
-  library_fallback = lent;
+  library_fallback = shared_fallback;
 }
 
 /* Solves the step by the fallback library, which leaves its error estimate in the workspace. */

@@ -149,11 +149,11 @@ static void store_tangents(const flow_call *way, long long step, const real *vec
       memcpy(changes + state_offset(way, step, c), vectors + c * STEP_INPUTS, sizeof(real) * FLOW_STATE);
 }
 
-static void add_adjoints(const flow_call *way, long long step, const real *slopes, real *vectors)
+static void add_adjoints(const flow_call *way, long long step, const real *partials, real *vectors)
 {
   for (int c = 0; c < way->count; c++)
     for (int i = 0; i < FLOW_STATE && state_offset(way, step, c) >= 0; i++)
-      vectors[c * STEP_INPUTS + i] += slopes[state_offset(way, step, c) + i];
+      vectors[c * STEP_INPUTS + i] += partials[state_offset(way, step, c) + i];
 }
 
 /* From (count, STEP_INPUTS) tangent vectors of the inputs to (count, kept states, FLOW_STATE) tangent vectors of the
@@ -177,7 +177,7 @@ static int jvp_along(const flow_call *way, const real *x, const real *changes, r
 
 /* From (count, kept states, FLOW_STATE) adjoint vectors of the states to (count, STEP_INPUTS) gradients with respect
  * to the inputs. */
-static int vjp_along(const flow_call *way, const real *x, const real *kept, real *slopes, solver_report *report)
+static int vjp_along(const flow_call *way, const real *x, const real *kept, real *partials, solver_report *report)
 {
   const long long across = (long long)way->count * STEP_INPUTS;
   int status = OK, length = 0;
@@ -191,7 +191,7 @@ static int vjp_along(const flow_call *way, const real *x, const real *kept, real
     status = propagate_chunk_of_steps(way, x, end - length, length, 1, report);
   }
   add_adjoints(way, 0, kept, way->vectors);
-  memcpy(slopes, way->vectors, sizeof(real) * (size_t)across);
+  memcpy(partials, way->vectors, sizeof(real) * (size_t)across);
   return status;
 }
 

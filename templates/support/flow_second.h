@@ -8,7 +8,7 @@ static int hessian_along(const flow_call *way, const real *x, const real *kept, 
     real *room, solver_report *report)
 {
   const long long across = (long long)way->count * STEP_INPUTS;
-  real *slopes = room + (way->steps + 1) * across;
+  real *partials = room + (way->steps + 1) * across;
   int status = OK, length = 0;
   memset(room, 0, sizeof(real) * (size_t)((way->steps + 1 + 2 * (FLOW_CHUNK + 1)) * across));
   memcpy(room, changes, sizeof(real) * (size_t)across);
@@ -20,22 +20,22 @@ static int hessian_along(const flow_call *way, const real *x, const real *kept, 
   }
   for (long long end = way->steps; end > 0 && status == OK; end -= length) {
     length = chunk_size_after(way, way->steps - end);
-    memcpy(slopes + 2 * length * across, slopes, sizeof(real) * (size_t)(2 * across));
-    memset(slopes, 0, sizeof(real) * (size_t)(2 * across * length));
+    memcpy(partials + 2 * length * across, partials, sizeof(real) * (size_t)(2 * across));
+    memset(partials, 0, sizeof(real) * (size_t)(2 * across * length));
     for (int k = 1; k <= length; k++)
-      add_adjoints(way, end - length + k, kept, slopes + 2 * k * across);
+      add_adjoints(way, end - length + k, kept, partials + 2 * k * across);
     fill_chunk(way, x, end - length, length);
     status = NAME(second_order)(length, way->t, way->h, way->q, way->p, x + FLOW_STATE, NULL, way->count,
-        room + (end - length) * across, slopes, report, way->workspace);
+        room + (end - length) * across, partials, report, way->workspace);
     if (status != OK)
       report->steps = end - 1 - report->steps;
   }
-  memcpy(found, slopes + across, sizeof(real) * (size_t)across);
+  memcpy(found, partials + across, sizeof(real) * (size_t)across);
   return status;
 }
 
 /* hessian_along for each of `rows` rows x of STEP_INPUTS inputs. */
-static int hessian_rows(flow_call *way, long long rows, const real *x, const real *slopes, const real *changes,
+static int hessian_rows(flow_call *way, long long rows, const real *x, const real *partials, const real *changes,
     real *found, solver_report *report)
 {
   const long long across = (long long)way->count * STEP_INPUTS, values = way->count * kept_states(way) * FLOW_STATE;
@@ -47,7 +47,8 @@ static int hessian_rows(flow_call *way, long long rows, const real *x, const rea
   for (long long row = 0; row < rows && status == OK; row++, x += STEP_INPUTS) {
     status = follow(way, x, 1, way->states, report);
     if (status == OK)
-      status = hessian_along(way, x, slopes + row * values, changes + row * across, found + row * across, room, report);
+      status = hessian_along(way, x, partials + row * values, changes + row * across, found + row * across, room,
+          report);
   }
   free(way->workspace);
   free(room);

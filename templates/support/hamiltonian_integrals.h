@@ -2,7 +2,7 @@
  * integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities and forces, which `memory` contains. */
-static inline void integrals_of_sweep(const step_data *step, const iteration_data *data, const double *memory,
+static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
     double *sum)
 {
   lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];

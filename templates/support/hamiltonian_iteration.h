@@ -39,7 +39,8 @@ static inline void forces(const step_data *step, lanes (*u)[2 * M], lanes (*forc
 /* Computes the increments of one step: forces, momenta and velocities are updated in turn until momenta and velocities
  * converge; the increments follow from the forces there. Velocities and forces are stored for the predictor. On failure
  * the increments are undefined. */
-HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq, double *dp,
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
+    double *dp,
     const solver_options *options, solver_report *report)
 {
   lanes z[GROUPS][M], force[GROUPS][M], u[GROUPS][2 * M], value[GROUPS][M], momentum[GROUPS][M];

@@ -27,13 +27,13 @@ static void extrapolate_rates(const run_memory *run, const parts_of_work *parts,
   for (int g = 0; g < GROUPS; g++)
     for (long long half = 0; half < apart; half += n)
       for (long long i = half + own.first; i < half + own.end; i++) {
-        lanes slope = lanes_of(0.0);
+        lanes derivative = lanes_of(0.0);
         if (guess == 1)
-          slope = contribution_of_points(tables->alone, g, &parts->last[i], apart);
+          derivative = contribution_of_points(tables->alone, g, &parts->last[i], apart);
         else if (guess > 1)
-          slope = contribution_of_points(tables->last, g, &parts->last[i], apart) +
+          derivative = contribution_of_points(tables->last, g, &parts->last[i], apart) +
               contribution_of_points(tables->before, g, &parts->before[i], apart);
-        parts->G[g * apart + i] = slope;
+        parts->G[g * apart + i] = derivative;
       }
 }
 

@@ -70,13 +70,13 @@ static void invert(double (*matrix)[POINTS], double (*inverse)[POINTS])
 }
 
 /* Stores `by` times the inverse of 1 - slope A for a coordinate; a positive (unstable) slope counts as 0. */
-static void keep_inverse(linear_system *of, long long i, double slope, double by)
+static void keep_inverse(linear_system *of, long long i, double derivative, double by)
 {
   double matrix[POINTS][POINTS], inverse[POINTS][POINTS];
-  slope = smaller(slope, 0.0);
+  derivative = smaller(derivative, 0.0);
   for (int j = 0; j < POINTS; j++)
     for (int k = 0; k < POINTS; k++)
-      matrix[j][k] = (j == k) - slope * at_point(&PRODUCT[j * GROUPS], 1, k);
+      matrix[j][k] = (j == k) - derivative * at_point(&PRODUCT[j * GROUPS], 1, k);
   invert(matrix, inverse);
   for (int j = 0; j < POINTS; j++)
     for (int k = 0; k < POINTS; k++)

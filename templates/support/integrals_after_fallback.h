@@ -1,10 +1,10 @@
 /* Integrals along a step solved by fixed-point iteration, or by Newton's method, which leaves guess = 0 and its
- * unknowns in the workspace. Requires: integrals_of_sweep, integrals_along, newton.h. */
+ * unknowns in the workspace. Requires: integrals_of_iteration, integrals_along, newton.h. */
 static void integrals(const step_data *step, const solver_data *data, const double *memory, long long guess,
     double *workspace, double *sum)
 {
   if (guess > 0)
-    integrals_of_sweep(step, data, memory, sum);
+    integrals_of_iteration(step, data, memory, sum);
   else
     integrals_along(step, newton_in(workspace).z, sum);
 }

@@ -8,8 +8,8 @@ static linearised_step linearised_in(const step_data *step, real *workspace)
   at.step = step;
   at.data = newton_in(workspace + SCRATCH);
   at.shape = band_of(SITES, B);
-  at.slopes = workspace + WORKSPACE;
-  at.v = (wide *)(at.slopes + DERIVATIVES);
+  at.partials = workspace + WORKSPACE;
+  at.v = (wide *)(at.partials + DERIVATIVES);
   at.dz = at.v + STEP_INPUTS;
   at.rows = at.dz + N;
   at.x = at.rows + SITES * (B + 1);
@@ -30,7 +30,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
 {
   const step_data *step = at->step;
   const long long before = report->iterations;
-  real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *slopes = at->slopes;
+  real dq[M], dp[2 * M] = {0}, size_p[SITES], size_q[M], *partials = at->partials;
   int keep = 0, status = newton_from_line(step, &at->data, dp, &keep, options, report);
   if (status != OK)
     return status;
@@ -41,7 +41,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
   if (!factorise(at->data.factors, &at->shape, at->data.pivot))
     return SINGULAR;
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
-    slopes = derivatives_of_group(STAGE_GROUPS + f, step, at->data.z, slopes);
+    partials = derivatives_of_group(STAGE_GROUPS + f, step, at->data.z, partials);
   for (int i = 0; i < M; i++)
     at->p1[i] = step->p0[i] + (dp[i] + dp[M + i]);
   for (int i = 0; q1 && i < M; i++) {
@@ -55,9 +55,9 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
 static void through_points(const linearised_step *at, int back, wide *v, wide *dz)
 {
   const step_change by = {at->step->h, at->growth, at->grown};
-  const real *slopes = at->slopes;
+  const real *partials = at->partials;
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
-    slopes = through_group(STAGE_GROUPS + f, &by, back, slopes, at->points, v, dz, at->rows);
+    partials = through_group(STAGE_GROUPS + f, &by, back, partials, at->points, v, dz, at->rows);
 }
 
 /* dz = -(matrix)^-1 rows, without the last row of each site. */

@@ -12,24 +12,24 @@ static void end_time(const linearised_step *at, int back)
   real *place = step->scratch;
   memset(u, 0, sizeof(wide) * (size_t)(f->points * f->arguments));
   if (!back)
-    arguments_wide(f, step->h, back, at->slopes, at->v, at->dz, u);
+    arguments_wide(f, step->h, back, at->partials, at->v, at->dz, u);
   arguments_of(f, step, at->data.z, place);
   for (int n = 0; n < f->points; n++) {
     const real weight = INTEGRAL_WEIGHT[n];
-    real rate, slope[RATE_DERIVATIVES];
-    rate_derivatives(place + n * f->arguments, step->t, step->parameters, &rate, slope);
+    real rate, derivative[RATE_DERIVATIVES];
+    rate_derivatives(place + n * f->arguments, step->t, step->parameters, &rate, derivative);
     for (int e = 0; e < RATE_DERIVATIVES; e++) {
       const int j = RATE_ENTRY[e];
-      flow(back, time, step->h * weight * slope[e],
+      flow(back, time, step->h * weight * derivative[e],
           j < f->arguments ? u + n * f->arguments + j : at->v + 2 * M + j - f->arguments);
     }
     flow(back, time, weight * rate, at->v + INPUT_H);
   }
   if (back)
-    arguments_wide(f, step->h, back, at->slopes, at->v, at->dz, u);
+    arguments_wide(f, step->h, back, at->partials, at->v, at->dz, u);
 }
 
-int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, real *slopes, real *workspace)
+int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, real *partials, real *workspace)
 {
   real u[2 * M];
   int status = OK;
@@ -41,6 +41,6 @@ int NAME(energy_gradient)(const real *q, const real *p, const real *parameters, 
   status = NAME(velocity)(0, q, p, parameters, u + M, workspace);
 #endif
   if (status == OK)
-    energy_derivatives(u, 0, parameters, slopes);
-  return status == OK && !all_finite(slopes, STEP_INPUTS - 2) ? NOT_FINITE : status;
+    energy_derivatives(u, 0, parameters, partials);
+  return status == OK && !all_finite(partials, STEP_INPUTS - 2) ? NOT_FINITE : status;
 }

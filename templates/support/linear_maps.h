@@ -35,7 +35,7 @@ typedef struct {
   int count, first, to, from;
 } derivative_block;
 
-typedef void derivative_kernel(const real *u, real t, const real *parameters, real *value, real *slope);
+typedef void derivative_kernel(const real *u, real t, const real *parameters, real *value, real *derivative);
 typedef void value_kernel(const real *u, real t, const real *parameters, real *value);
 
 /* Stage group: points with the same kernel. Numbers of points, arguments, results and derivatives; sources of arguments
@@ -43,7 +43,7 @@ typedef void value_kernel(const real *u, real t, const real *parameters, real *v
  * to parameters and time: {i, j}, j from the first parameter on; second derivatives, if results are not linear and they
  * are requested. */
 typedef struct {
-  int points, arguments, results, slopes, given, gathers, scatters, blocks;
+  int points, arguments, results, partials, given, gathers, scatters, blocks;
   const linear_loop *gather, *scatter;
   const derivative_block *block;
   const real *weight, *abscissa;
@@ -82,7 +82,7 @@ static real time_of(const stage_group *f, const step_data *step, int n)
  * inputs. */
 static inline long long end_of_derivatives(const stage_group *f)
 {
-  const long long each = f->arguments + f->results + f->slopes + f->given;
+  const long long each = f->arguments + f->results + f->partials + f->given;
 #ifdef DAMPED
   return f->points * (each + f->results);
 #else
@@ -95,12 +95,12 @@ static inline long long end_of_derivatives(const stage_group *f)
 static real *derivatives_of_group(const stage_group *f, const step_data *step, const real *z, real *by_h)
 {
   const real h = step->h;
-  real *value = by_h + f->points * f->arguments, *slope = value + f->points * f->results;
-  real *given = slope + f->points * f->slopes;
+  real *value = by_h + f->points * f->arguments, *derivative = value + f->points * f->results;
+  real *given = derivative + f->points * f->partials;
   arguments_of(f, step, z, by_h);
   for (int n = 0; n < f->points; n++) {
     const real t = time_of(f, step, n), *u = by_h + n * f->arguments;
-    f->kernel(u, t, step->parameters, value + n * f->results, slope + n * f->slopes);
+    f->kernel(u, t, step->parameters, value + n * f->results, derivative + n * f->partials);
     if (f->given)
       f->by_given(u, t, step->parameters, given + n * f->given);
   }
@@ -161,13 +161,13 @@ static void inputs_wide(const stage_group *f, int back, const real *by_h, const 
 }
 
 /* From arguments to results. */
-static void multiply_wide(const stage_group *f, int back, const real *slope, wide *u, wide *value)
+static void multiply_wide(const stage_group *f, int back, const real *derivative, wide *u, wide *value)
 {
   for (int k = 0; k < f->blocks; k++)
     for (int n = 0; n < f->points; n++)
       for (int e = 0; e < f->block[k].count; e++)
         flow(back, value + n * f->results + f->block[k].to + f->block[k].pair[e][0],
-            slope[n * f->slopes + f->block[k].first + e],
+            derivative[n * f->partials + f->block[k].first + e],
             u + n * f->arguments + f->block[k].from + f->block[k].pair[e][1]);
 }
 
@@ -203,28 +203,28 @@ typedef struct {
 
 /* From v to all rows, or from dz to the last ones, through the points of a stage group; back: the transpose. Returns
  * the end of its derivatives. */
-static const real *through_group(const stage_group *f, const step_change *by, int back, const real *slopes,
+static const real *through_group(const stage_group *f, const step_change *by, int back, const real *partials,
     wide *points, wide *v, wide *dz, wide *rows)
 {
   const real h = by->h;
-  const real *by_h = slopes + f->points * f->arguments, *slope = by_h + f->points * f->results;
-  const real *given = slope + f->points * f->slopes;
+  const real *by_h = partials + f->points * f->arguments, *derivative = by_h + f->points * f->results;
+  const real *given = derivative + f->points * f->partials;
   wide *value = points + f->points * f->arguments;
   memset(points, 0, sizeof(wide) * (size_t)(f->points * (f->arguments + f->results)));
   if (back)
     scatter_wide(f, h, by->growth, back, v ? 0 : B, value, rows);
   else
-    arguments_wide(f, h, back, slopes, v, dz, points);
-  multiply_wide(f, back, slope, points, value);
+    arguments_wide(f, h, back, partials, v, dz, points);
+  multiply_wide(f, back, derivative, points, value);
   if (v)
     inputs_wide(f, back, by_h, given, v, value);
   for (int i = 0; v && by->grown && i < f->points * f->results; i++)
     flow(back, value + i, given[f->points * f->given + i], by->grown);
   if (back)
-    arguments_wide(f, h, back, slopes, v, dz, points);
+    arguments_wide(f, h, back, partials, v, dz, points);
   else
     scatter_wide(f, h, by->growth, back, v ? 0 : B, value, rows);
-  return slopes + end_of_derivatives(f);
+  return partials + end_of_derivatives(f);
 }
 
 static void swap_wide(wide *a, wide *b)

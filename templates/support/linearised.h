@@ -9,7 +9,7 @@ typedef struct {
   const step_data *step;
   newton_data data;
   band shape;
-  real *slopes;
+  real *partials;
   wide *v, *dz, *rows, *x, *points;
   wide *grown; /* variations of gamma h; NULL without damping */
   real growth; /* gamma h */

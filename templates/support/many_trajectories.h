@@ -72,7 +72,7 @@ static inline void take_change(progress *now, lanes change, const solver_options
   now->first = k == 0 ? change : now->first;
   now->before = now->last;
   now->last = change;
-  report->sweeps++;
+  report->iterations++;
 }
 
 /* Trajectories whose iteration stagnates are left to the solver of single trajectories. */

@@ -24,6 +24,6 @@ static SELDOM int provided_step(const step_data *step, double *dq, double *dp, c
 
 const void *NAME(provided_fallback)(void)
 {
-  static const fallback lent = {provided_step};
-  return &lent;
+  static const fallback shared_fallback = {provided_step};
+  return &shared_fallback;
 }

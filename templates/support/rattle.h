@@ -12,7 +12,7 @@ enum { DEGREE = B - 1 }; /* of B points; values at point n are n elements after 
 
 /* Positions u at all points but the first; forces L_q and derivatives G at all; multipliers at all but the last. */
 typedef struct {
-  real inverse_mass[M], u[M * DEGREE], force[M * B], slope[CONSTRAINT_ENTRIES * B], lambda[CONSTRAINTS * DEGREE];
+  real inverse_mass[M], u[M * DEGREE], force[M * B], derivative[CONSTRAINT_ENTRIES * B], lambda[CONSTRAINTS * DEGREE];
 } rattle_step;
 
 static band multiplier_shape(int count)
@@ -57,14 +57,14 @@ static void solve_multipliers(const newton_data *data, const real *right, int co
 /* Evaluates the force and the constraint derivatives at point n, at position u, and the constraints g. */
 static void evaluate_point(const step_data *step, int n, const real *u, rattle_step *now, real *g)
 {
-  real force[M], slope[CONSTRAINT_ENTRIES];
+  real force[M], derivative[CONSTRAINT_ENTRIES];
   const real t = step->t + RATTLE_ABSCISSA[n] * step->h;
   constrained_force(u, t, step->parameters, force);
-  constraints(u, t, step->parameters, g, slope);
+  constraints(u, t, step->parameters, g, derivative);
   for (int i = 0; i < M; i++)
     now->force[i * B + n] = force[i];
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    now->slope[e * B + n] = slope[e];
+    now->derivative[e * B + n] = derivative[e];
 }
 
 /* Evaluates all points but the first. */
@@ -84,10 +84,10 @@ static void evaluate_points(const step_data *step, rattle_step *now, real *g)
 static void add_constraint_forces(const rattle_step *now, const real *lambda, real *f)
 {
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
-    const real *slope = now->slope + e * B, *own = lambda + CONSTRAINT_ENTRY[e][0] * DEGREE;
+    const real *derivative = now->derivative + e * B, *own = lambda + CONSTRAINT_ENTRY[e][0] * DEGREE;
     real *at = f + CONSTRAINT_ENTRY[e][1] * DEGREE;
     for (int n = 0; n < DEGREE; n++)
-      at[n] += slope[n] * own[n];
+      at[n] += derivative[n] * own[n];
   }
 }
 
@@ -168,7 +168,7 @@ static int solve_constraints(const step_data *step, rattle_step *now, const newt
 {
   real g[CONSTRAINTS * DEGREE], lambda[CONSTRAINTS * DEGREE], f[M * DEGREE], change[M * DEGREE], last = (real)INFINITY;
   evaluate_points(step, now, g);
-  if (!factorise_multipliers(data, now->slope + 1, now->slope, RATTLE_RESPONSE[0], DEGREE, now->inverse_mass,
+  if (!factorise_multipliers(data, now->derivative + 1, now->derivative, RATTLE_RESPONSE[0], DEGREE, now->inverse_mass,
           step->h * step->h))
     return SINGULAR;
   for (int k = 0; k < least(options->max_iterations, MOST_ITERATIONS); k++) {
@@ -182,7 +182,7 @@ static int solve_constraints(const step_data *step, rattle_step *now, const newt
     for (int e = 0; e < CONSTRAINT_ENTRIES; e++) {
       const int row = CONSTRAINT_ENTRY[e][0] * DEGREE, column = CONSTRAINT_ENTRY[e][1] * DEGREE;
       for (int r = 0; r < DEGREE; r++)
-        g[row + r] += now->slope[e * B + r + 1] * change[column + r];
+        g[row + r] += now->derivative[e * B + r + 1] * change[column + r];
     }
     if (!all_finite(g, CONSTRAINTS * DEGREE))
       return NOT_FINITE;
@@ -235,11 +235,12 @@ static int finish_step(const step_data *step, const rattle_step *now, const newt
   }
   constrained_motion(u, step->t + step->h, step->parameters, value);
   if (!all_finite(value, M + 2 * CONSTRAINTS) ||
-      !factorise_multipliers(data, now->slope + DEGREE, now->slope + DEGREE, own, 1, now->inverse_mass, weight))
+      !factorise_multipliers(data, now->derivative + DEGREE, now->derivative + DEGREE, own, 1, now->inverse_mass,
+          weight))
     return SINGULAR;
   solve_multipliers(data, value + M, 1, lambda);
   for (int e = 0; e < CONSTRAINT_ENTRIES; e++)
-    dp[CONSTRAINT_ENTRY[e][1]] += weight * now->slope[e * B + DEGREE] * lambda[CONSTRAINT_ENTRY[e][0]];
+    dp[CONSTRAINT_ENTRY[e][1]] += weight * now->derivative[e * B + DEGREE] * lambda[CONSTRAINT_ENTRY[e][0]];
   velocities_by(step, now, f, data->z);
   for (int i = 0; i < M; i++)
     data->z[i * B + DEGREE] = (step->p0[i] + dp[i]) * now->inverse_mass[i];

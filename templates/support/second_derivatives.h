@@ -8,7 +8,7 @@
  * respect to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results:
  * tangents, adjoint variables, and tangents of these. Last, the arguments u. */
 typedef struct {
-  wide *change, *dz, *slopes, *adjoint_tangents, *by_given, *by_dz;
+  wide *change, *dz, *partials, *adjoint_tangents, *by_given, *by_dz;
   wide *tangents, *adjoints, *tangents_of_adjoints;
   real *u;
 } second_order_memory;
@@ -17,8 +17,8 @@ static second_order_memory second_order_in(const linearised_step *at)
 {
   second_order_memory to;
   to.change = at->points + MOST_AT_POINTS;
-  to.slopes = to.change + STEP_INPUTS;
-  to.adjoint_tangents = to.slopes + STEP_INPUTS;
+  to.partials = to.change + STEP_INPUTS;
+  to.adjoint_tangents = to.partials + STEP_INPUTS;
   to.by_given = to.adjoint_tangents + STEP_INPUTS;
   to.dz = to.by_given + STEP_INPUTS;
   to.by_dz = to.dz + N;
@@ -102,27 +102,27 @@ static void add_argument_hessian(const stage_group *f, real h, const second_orde
 
 /* Contributions of a stage group. Returns the end of its derivatives. */
 static const real *add_group_hessian(const stage_group *f, const linearised_step *at, const second_order_memory *to,
-    const real *slopes)
+    const real *partials)
 {
-  const real h = at->step->h, *by_h = slopes + f->points * f->arguments, *slope = by_h + f->points * f->results;
-  const real *given = slope + f->points * f->slopes;
+  const real h = at->step->h, *by_h = partials + f->points * f->arguments, *derivative = by_h + f->points * f->results;
+  const real *given = derivative + f->points * f->partials;
   const int first = f->points * f->arguments;
   memset(to->tangents, 0, sizeof(wide) * 3 * MOST_AT_POINTS);
-  arguments_wide(f, h, 0, slopes, to->change, to->dz, to->tangents);
-  multiply_wide(f, 0, slope, to->tangents, to->tangents + first);
+  arguments_wide(f, h, 0, partials, to->change, to->dz, to->tangents);
+  multiply_wide(f, 0, derivative, to->tangents, to->tangents + first);
   inputs_wide(f, 0, by_h, given, to->change, to->tangents + first);
   scatter_wide(f, h, at->growth, 1, 0, to->adjoints + first, at->rows);
-  multiply_wide(f, 1, slope, to->adjoints, to->adjoints + first);
+  multiply_wide(f, 1, derivative, to->adjoints, to->adjoints + first);
   if (f->curvature)
     arguments_of(f, at->step, at->data.z, to->u);
   for (int n = 0; f->curvature && n < f->points; n++)
     for (int j = 0; j < WIDTH; j++)
       add_kernel_hessian(f, at->step, to, n, j);
   add_result_hessian(f, h, to, by_h);
-  multiply_wide(f, 1, slope, to->tangents_of_adjoints, to->tangents_of_adjoints + first);
+  multiply_wide(f, 1, derivative, to->tangents_of_adjoints, to->tangents_of_adjoints + first);
   inputs_wide(f, 1, by_h, given, to->by_given, to->tangents_of_adjoints + first);
-  start_wide(f, 1, slopes, to->by_given, to->tangents_of_adjoints);
-  add_argument_hessian(f, h, to, slopes);
+  start_wide(f, 1, partials, to->by_given, to->tangents_of_adjoints);
+  add_argument_hessian(f, h, to, partials);
   gather_wide(f, h, 1, to->by_dz, to->tangents_of_adjoints);
   return given + f->points * f->given;
 }
@@ -132,26 +132,26 @@ static void add_end_hessian(const second_order_memory *to)
 {
   for (int i = 0; i < M; i++)
     for (int b = 0; b < B; b++) {
-      add_product(to->by_dz + i * B + b, END_POSITION[b], to->slopes + i, to->change + INPUT_H);
-      add_product(to->by_given + INPUT_H, END_POSITION[b], to->slopes + i, to->dz + i * B + b);
+      add_product(to->by_dz + i * B + b, END_POSITION[b], to->partials + i, to->change + INPUT_H);
+      add_product(to->by_given + INPUT_H, END_POSITION[b], to->partials + i, to->dz + i * B + b);
     }
 }
 
 /* Replaces slopes and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
 static void hessian_of_step(const linearised_step *at, const second_order_memory *to)
 {
-  const real *slopes = at->slopes;
+  const real *partials = at->partials;
   memcpy(at->v, to->change, sizeof(wide) * STEP_INPUTS);
   jvp_step(at);
   memcpy(to->dz, at->dz, sizeof(wide) * N);
-  memcpy(at->v, to->slopes, sizeof(wide) * STEP_INPUTS);
+  memcpy(at->v, to->partials, sizeof(wide) * STEP_INPUTS);
   vjp_step(at);
   memset(to->by_given, 0, sizeof(wide) * STEP_INPUTS);
   memset(to->by_dz, 0, sizeof(wide) * N);
   for (int f = 0; f < COUNT_OF_GROUPS; f++)
-    slopes = add_group_hessian(STAGE_GROUPS + f, at, to, slopes);
+    partials = add_group_hessian(STAGE_GROUPS + f, at, to, partials);
   add_end_hessian(to);
-  memcpy(to->slopes, at->v, sizeof(wide) * STEP_INPUTS);
+  memcpy(to->partials, at->v, sizeof(wide) * STEP_INPUTS);
   memcpy(at->v, to->adjoint_tangents, sizeof(wide) * STEP_INPUTS);
   memcpy(at->dz, to->by_dz, sizeof(wide) * N);
   vjp_with_unknowns(at);
@@ -183,10 +183,10 @@ static int hessian_of_vectors(const linearised_step *at, int count, const real *
   for (int first = 0; first < count; first += WIDTH) {
     const int own = least(WIDTH, count - first), here = first * STEP_INPUTS, beside = (count + first) * STEP_INPUTS;
     read_lanes(of.change, own, changes + here);
-    read_lanes(of.slopes, own, from + here);
+    read_lanes(of.partials, own, from + here);
     read_lanes(of.adjoint_tangents, own, from + beside);
     hessian_of_step(at, &of);
-    add_lanes(of.slopes, own, to + here);
+    add_lanes(of.partials, own, to + here);
     add_lanes(of.adjoint_tangents, own, to + beside);
   }
   return all_finite(to, 2 * count * STEP_INPUTS) ? OK : NOT_FINITE;

@@ -41,14 +41,14 @@ static void store_step(const step_data *step, const iteration_data *data, const 
 }
 
 static __attribute__((noinline)) void linearise_points(const step_data *step, const iteration_data *data,
-    const double *told, iterated_step *at)
+    const double *stored, iterated_step *at)
 {
   lanes X[GROUPS][M];
   at->step = step;
   at->data = data;
-  at->dq = told + M * POINTS;
+  at->dq = stored + M * POINTS;
   at->dp = at->dq + M;
-  lanes_load(told, at->D);
+  lanes_load(stored, at->D);
   for (int i = 0; i < M; i++) {
     at->scale[i] = data->square * data->inverse_mass[i];
     at->mass[i] = fabs(1.0 / data->inverse_mass[i]);

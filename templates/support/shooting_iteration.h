@@ -13,9 +13,10 @@ static void prepare_iteration(const step_data *step, iteration_data *data)
 }
 
 /* p1 - p0 from the forces at the points and the gradient of m . E at the nodes. */
-static inline double momentum_increment(const step_data *step, const iteration_data *data, lanes force, lanes slope)
+static inline double momentum_increment(const step_data *step, const iteration_data *data, lanes force,
+    lanes derivative)
 {
-  return lanes_total(data->weight * force) + step->h * (step->h * lanes_total(NODE_MASK * slope));
+  return lanes_total(data->weight * force) + step->h * (step->h * lanes_total(NODE_MASK * derivative));
 }
 
 /* E, (m . E)_q, (m . E)_v and the mass at the nodes. */
@@ -43,7 +44,8 @@ static inline void evaluate_points(const step_data *step, const curve_data *curv
 
 /* Computes the increments of one step: accelerations, momentum, initial velocity and multipliers m are corrected in
  * turn until all converge. On failure the increments are undefined. */
-HOT int sweep(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq, double *dp,
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, double *dq,
+    double *dp,
     const solver_options *options, solver_report *report)
 {
   curve_data curve;

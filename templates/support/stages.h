@@ -32,7 +32,7 @@ static inline void scatter(const real *table, int points, const real *weight, re
 /* Adds sum_n weight[n] scale row[n][r] slope_n column[b][n] to the entries of the Jacobian in rows (i, r), columns (j,
  * b), for every derivative and its pair of sites i, j. */
 static inline void scatter_derivatives(const real *row, const real *column, int points, const real *weight, real scale,
-    const int (*pair)[2], int count, const real *slope, int across, real *jacobian, const band *shape)
+    const int (*pair)[2], int count, const real *derivative, int across, real *jacobian, const band *shape)
 {
   const int blocks = shape->rows / SITES;
   for (int e = 0; e < count; e++) {
@@ -41,7 +41,7 @@ static inline void scatter_derivatives(const real *row, const real *column, int 
     for (int b = 0; b < B; b++) {
       real sum[B] = {0};
       for (int n = 0; n < points; n++) {
-        const real term = weight[n] * scale * slope[n * across + e] * column[b * points + n];
+        const real term = weight[n] * scale * derivative[n * across + e] * column[b * points + n];
         if (term != 0)
           for (int r = 0; r < B; r++)
             sum[r] += row[n * (B + 1) + r] * term;

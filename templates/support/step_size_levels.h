@@ -1,11 +1,11 @@
-/* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a level (rung), and the error estimate
+/* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a grid level, and the error estimate
  * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
  * ERROR_POWER. Include before a trial of a step and trials.h. */
 enum {
-  OCTAVE = sizeof MANTISSA / sizeof *MANTISSA, /* levels per factor of two */
-  MOST_UP = 4 * OCTAVE, /* levels, while the first step size is determined */
-  MOST_DOWN = 2 * OCTAVE, /* after a step whose error was too large, or a first step that failed */
-  DOWN_FAILED = OCTAVE, /* after a step whose iteration failed */
+  LEVELS_PER_BINADE = sizeof MANTISSA / sizeof *MANTISSA, /* levels per factor of two */
+  MOST_UP = 4 * LEVELS_PER_BINADE, /* levels, while the first step size is determined */
+  MOST_DOWN = 2 * LEVELS_PER_BINADE, /* after a step whose error was too large, or a first step that failed */
+  DOWN_FAILED = LEVELS_PER_BINADE, /* after a step whose iteration failed */
   AVOIDED = 32 /* steps after it that stay below its size */
 };
 
@@ -37,7 +37,7 @@ typedef struct {
 static error_limits limits_of(real tolerance)
 {
   const real most = larger(MATH(pow)(tolerance, 1 / ERROR_POWER), LEAST_UNRESOLVED);
-  const real power = (real)OCTAVE * MATH(log2)(GROWTH);
+  const real power = (real)LEVELS_PER_BINADE * MATH(log2)(GROWTH);
   const error_limits limits = {most, most * USED_PART / GROWTH, most * USED_PART / (GROWTH * GROWTH),
       MATH(exp2)(MATH(log2)(most) / (power > FEW_POWERS ? power - 2 : power))};
   return limits;
@@ -45,8 +45,9 @@ static error_limits limits_of(real tolerance)
 
 static real size_of_level(long long grid_level)
 {
-  const long long octave = grid_level >= 0 ? grid_level / OCTAVE : -((OCTAVE - 1 - grid_level) / OCTAVE);
-  return MATH(ldexp)(MANTISSA[grid_level - octave * OCTAVE], (int)octave);
+  const long long below = -((LEVELS_PER_BINADE - 1 - grid_level) / LEVELS_PER_BINADE);
+  const long long binary_level = grid_level >= 0 ? grid_level / LEVELS_PER_BINADE : below;
+  return MATH(ldexp)(MANTISSA[grid_level - binary_level * LEVELS_PER_BINADE], (int)binary_level);
 }
 
 /* Largest level whose step size does not exceed h > 0. */
@@ -55,17 +56,17 @@ static long long level_below(real h)
   int exponent;
   long long grid_level;
   MATH(frexp)(h, &exponent);
-  for (grid_level = (long long)exponent * OCTAVE; size_of_level(grid_level) > h; grid_level--)
+  for (grid_level = (long long)exponent * LEVELS_PER_BINADE; size_of_level(grid_level) > h; grid_level--)
     ;
   return grid_level;
 }
 
-/* Error estimate if the step size were `rungs` levels larger. */
-static inline real error_at(real error, int rungs)
+/* Error estimate if the step size were `levels` larger on the grid. */
+static inline real error_at(real error, int levels)
 {
-  for (; rungs > 0; rungs--)
+  for (; levels > 0; levels--)
     error *= GROWTH;
-  for (; rungs < 0; rungs++)
+  for (; levels < 0; levels++)
     error /= GROWTH;
   return error;
 }
@@ -77,7 +78,7 @@ static int next_change(real error, real before, const error_limits *limits)
   const real expected =
       before > 0 && error > before ? error * (error / before) : larger(error, before / (GROWTH * GROWTH));
   int change = expected < limits->fewer ? 2 : expected < limits->few;
-  while (change > -OCTAVE && error_at(expected, change) > limits->most)
+  while (change > -LEVELS_PER_BINADE && error_at(expected, change) > limits->most)
     change--;
   return change;
 }

@@ -89,7 +89,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
  * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
 static inline int needs_momenta(run_memory *run, const trial *now)
 {
-  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -OCTAVE && changes_little(run, now)));
+  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -LEVELS_PER_BINADE && changes_little(run, now)));
 }
 
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */

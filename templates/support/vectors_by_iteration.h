@@ -13,7 +13,7 @@ static int solve_by_iteration(propagation *over, const step_data *step, const it
     double *dp)
 {
   for (int tries = over->guess > 0 ? 2 : 1; tries > 0; tries--) {
-    if (sweep(step, data, over->workspace + SCRATCH, &over->guess, dq, dp, over->options, over->report) == OK)
+    if (fixed_point(step, data, over->workspace + SCRATCH, &over->guess, dq, dp, over->options, over->report) == OK)
       return 1;
     over->guess = 0;
   }
@@ -65,12 +65,12 @@ static int propagate_by_iteration(propagation *over, long long k, const double *
 /* Propagates the vectors over steps first <= k < end. */
 static int propagate_steps(propagation *over, long long first, long long end)
 {
-  int swept, status = OK;
+  int iterated, status = OK;
   over->guess = over->back ? 0 : over->guess;
-  swept = solve_steps(over, first, end);
+  iterated = solve_steps(over, first, end);
   for (long long done = 0; status == OK && done < end - first; done++) {
     const long long k = over->back ? end - 1 - done : first + done;
-    const int carried = swept ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
+    const int carried = iterated ? propagate_by_iteration(over, k, stored_of(over, k - first)) : 0;
     if (carried < over->count)
       status = vectors_by_newton(over, k, carried);
     else if (!all_finite(vectors_to(over, k), over->count * STEP_INPUTS))

@@ -205,10 +205,10 @@ class TestHonesty:
     def test_a_step_for_newton_alone_is_not_advised(self):
         """On a chain of springs steps beyond the limit of the fixed point meet the tolerance, at ten times the cost."""
         chosen = problem("fput-chain")
-        swept = compile_stepper(chosen.system, SVI(8), solver="fixed-point")
-        p = swept.momentum(chosen.q, chosen.velocity)
+        iterated = compile_stepper(chosen.system, SVI(8), solver="fixed-point")
+        p = iterated.momentum(chosen.q, chosen.velocity)
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
-        swept.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
+        iterated.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
     def test_the_same_question_has_the_same_answer(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)

@@ -36,7 +36,7 @@ from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
-from scvi_codegen.benchmark.drift import drift_rows, fitted_slope
+from scvi_codegen.benchmark.drift import drift_rows, fitted_rate
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hanging_rods import angles_of, rod_accelerations
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
@@ -459,14 +459,14 @@ class TestCommand:
 
 class TestDrift:
     def test_the_slope_of_a_line(self):
-        slope, error = fitted_slope(np.linspace(0.0, 3e-12, 2001))
-        assert slope == pytest.approx(3e-12)
+        derivative, error = fitted_rate(np.linspace(0.0, 3e-12, 2001))
+        assert derivative == pytest.approx(3e-12)
         assert error < 1e-20
 
     def test_a_random_walk_has_a_slope_within_its_error(self):
         random = np.random.default_rng(5)
-        walks = [fitted_slope(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
-        scores = np.array([slope / error for slope, error in walks])
+        walks = [fitted_rate(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
+        scores = np.array([derivative / error for derivative, error in walks])
         assert 0.85 < scores.std() < 1.2
 
     def test_a_short_run_keeps_its_energy(self):
@@ -513,11 +513,11 @@ class TestTables:
         )
         at = dict(zip(system.coordinates, written.start, strict=True)) | system.constants
         at |= dict.fromkeys(system.velocities, 0.0)
-        slopes = gradient(system.lagrangian, system.coordinates)
-        assert (system.dimension, len(slopes)) == (dimension, dimension)
+        partials = gradient(system.lagrangian, system.coordinates)
+        assert (system.dimension, len(partials)) == (dimension, dimension)
         assert all(
-            math.isfinite(float(slope.xreplace({x: sympy.Float(value) for x, value in at.items()})))
-            for slope in slopes.values()
+            math.isfinite(float(derivative.xreplace({x: sympy.Float(value) for x, value in at.items()})))
+            for derivative in partials.values()
         )
 
     def test_two_post_newtonian_bodies_far_apart_are_newtonian(self):

@@ -341,8 +341,8 @@ def same(text: str, x: float, specification: str) -> bool:
 def drift(done: Done, scale: float) -> float:
     """What a straight line through the relative errors rises by over the run."""
     energy = done.kind.energy(done.t, done.q, done.p)
-    slope = np.polyfit(done.t, (energy - energy[0]) / scale, 1)[0]
-    return float(slope * (done.t[-1] - done.t[0]))
+    derivative = np.polyfit(done.t, (energy - energy[0]) / scale, 1)[0]
+    return float(derivative * (done.t[-1] - done.t[0]))
 
 
 def first_lines(done: Done, lines: list[str]) -> None:

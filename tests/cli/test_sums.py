@@ -139,11 +139,11 @@ def test_a_failing_step(ring: str) -> None:
 def test_derive(ring: str) -> None:
     """Terms with their derivatives, and the step; in LaTeX sums are sums."""
     text = invoke("derive", ring, "--method", "stoermer-verlet").stdout
-    (slope,) = (line.partition(": ")[2] for line in text.splitlines() if "by q[i]:" in line)
+    (derivative,) = (line.partition(": ")[2] for line in text.splitlines() if "by q[i]:" in line)
     places = {"q[i+1]": "(3.0)", "q[i]": "(1.0)", "k": "0.5"}
     for name, value in places.items():
-        slope = slope.replace(name, value)
-    assert float(parse_expression(slope, {})) == 1.0
+        derivative = derivative.replace(name, value)
+    assert float(parse_expression(derivative, {})) == 1.0
     assert "p += h*(0.5)*F" in text
     assert "Conserved: energy, momentum of q" in text
     assert r"\sum_{i \in \mathbb{Z}_{N}}" in invoke("derive", ring, "--latex").stdout
@@ -180,15 +180,15 @@ def test_generate(ring: str) -> None:
 
 def test_newton(ring: str) -> None:
     """By the option or by the model; a folder keeps it, whatever its model said before."""
-    by_option, sweeps = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
+    by_option, iterations = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
     Path("stiff.toml").write_text(RING.replace('"svi:4"', '"svi:4"\nsolver = "newton"'))
-    by_model, swept = (
+    by_model, iterated = (
         json.loads(invoke("run", "stiff.toml", "--json", "--solver", solver).stdout)
         for solver in ("auto", "fixed-point")
     )
     assert (by_model["final"], by_model["iterations"]) == (by_option["final"], by_option["iterations"])
-    assert (swept["final"], swept["iterations"]) == (sweeps["final"], sweeps["iterations"])
-    assert by_model["iterations"] != swept["iterations"]
+    assert (iterated["final"], iterated["iterations"]) == (iterations["final"], iterations["iterations"])
+    assert by_model["iterations"] != iterated["iterations"]
     assert invoke("generate", ring, "-o", "ring_newton", *NEWTON, "--degree", "2").exit_code == 0
     model = load_indexed_model("ring_newton/model.toml")
     assert (model.solver, model.method.name) == ("newton", SVI(2).name)

@@ -33,7 +33,7 @@ from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.derivation.page.elision import MOST_LINES, formulas, operations
-from scvi_codegen.derivation.page.functions import SWEEPS
+from scvi_codegen.derivation.page.functions import ITERATIONS
 from scvi_codegen.derivation.page.jacobian import entry_numbers
 from scvi_codegen.derivation.page.kernels import kernels_of
 from scvi_codegen.derivation.page.sparsity import jacobian_pattern
@@ -189,7 +189,7 @@ class TestPage:
         page = derivation_html(system, sc.SVI(2))
         shown = re.findall(r"<summary>(\w+)\(", page)
         assert {kernel.name for kernel in kernels_of(program)} <= set(shown)
-        assert {"sweep", "solve", "newton", "evaluate", "add_quadrature", "double_pendulum_advance"} <= set(shown)
+        assert {"fixed_point", "solve", "newton", "evaluate", "add_quadrature", "double_pendulum_advance"} <= set(shown)
         assert len(shown) == len(set(shown))
         called = {f.name for f in reached(functions, "double_pendulum_advance") if f.comment and "lanes" not in f.name}
         assert called <= set(shown)
@@ -200,7 +200,7 @@ class TestPage:
             for each in (vars(iterations) | vars(curve_iterations)).values()
             if isinstance(each, type) and issubclass(each, FixedPointIteration)
         ]
-        assert set(SWEEPS) == {each for each in kinds if not isabstract(each)}
+        assert set(ITERATIONS) == {each for each in kinds if not isabstract(each)}
         singular = sc.HamiltonianSystem.from_text(
             name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p + q**2*p**2"
         )
@@ -236,7 +236,7 @@ class TestPage:
             negatives = re.findall(r"-(?=[\w(])", body)
             assert after == len(signs) + len(calls) + len(negatives)
             assert temporaries == body.count("const")
-            assert results == len(re.findall(r"^  (?:value|slope)\[", body, re.MULTILINE))
+            assert results == len(re.findall(r"^  (?:value|derivative)\[", body, re.MULTILINE))
             assert before == sum(sympy.count_ops(formula) for formula in kernel.formulas)
 
     def test_tables_have_radicals_where_they_are_short(self):

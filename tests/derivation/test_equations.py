@@ -99,12 +99,12 @@ def solved(derived, stepper):
         residuals = [number(e.residual) for e in derived.equations]
         jacobian = derived.jacobian.applyfunc(number)
         function = sympy.lambdify(derived.unknowns, residuals, "mpmath")
-        slope = sympy.lambdify(derived.unknowns, sympy.Matrix(jacobian), "mpmath")
+        derivative = sympy.lambdify(derived.unknowns, sympy.Matrix(jacobian), "mpmath")
         x = mpmath.matrix(
             [mpmath.mpf(str(derived.initial_guess[u].subs(known | velocities))) for u in derived.unknowns]
         )
         for _ in range(12):
-            x -= mpmath.lu_solve(slope(*x), mpmath.matrix(function(*x)))
+            x -= mpmath.lu_solve(derivative(*x), mpmath.matrix(function(*x)))
         assert max(abs(r) for r in function(*x)) < mpmath.mpf("1e-25")
         ends = (*derived.end_position, *derived.end_momentum)
         values = sympy.lambdify(derived.unknowns, [number(e.residual) for e in ends], "mpmath")(*x)

@@ -533,10 +533,10 @@ def cardinal(nodes: Any, j: int, x: Any) -> Any:
 def kronecker(method: Any, entry: Entry, index: int) -> bool:
     """(18), (21) of curves that are polynomials: their derivatives are exact."""
     c, h, m = numbers(nodes_of(method) * H), mp.mpf(H), 2
-    slopes = np.array([[mp.diff(lambda x, j=j: cardinal(c, j, x), t) for j in range(len(c))] for t in c[1:]])
+    partials = np.array([[mp.diff(lambda x, j=j: cardinal(c, j, x), t) for j in range(len(c))] for t in c[1:]])
     curve = [np.array([[1 + 2 * t - t**2], [3 - t + 4 * t**2]]) for t in c]
     rates = [np.array([[2 - 2 * t], [-1 + 8 * t]]) for t in c]
-    known = {"A": slopes[:, 1:], "a_0": slopes[:, :1], "q_k": curve[0], "p_k": curve[0], "v_k": rates[0]}
+    known = {"A": partials[:, 1:], "a_0": partials[:, :1], "q_k": curve[0], "p_k": curve[0], "v_k": rates[0]}
     known |= {
         "Q": np.vstack(curve[1:]),
         "P": np.vstack(curve[1:]),
@@ -622,11 +622,11 @@ def numbers_of_c(text: str, case: Case, u: list[Any], t: Any) -> dict[str, Any]:
     """What a kernel's C gives: it is straight-line arithmetic, and means the same in Python."""
     functions = dict(FUNCTIONS) | {"pow": lambda x, y: x**y, "fabs": abs}
     functions |= {f"lanes_{name}": function for name, function in FUNCTIONS.items()} | {"lanes_of": lambda x: x}
-    given = {"u": u, "t": t, "parameters": [mp.mpf(x) for x in PARAMETERS.values()], "value": {}, "slope": {}}
+    given = {"u": u, "t": t, "parameters": [mp.mpf(x) for x in PARAMETERS.values()], "value": {}, "derivative": {}}
     scope = functions | given
     for left, right in STATEMENT.findall(text.partition("{")[2].replace("\n", " ")):
         exec(f"{left} = {right}", scope)
-    return {f"{name}_{k}": x for name in ("value", "slope") for k, x in scope[name].items()}
+    return {f"{name}_{k}": x for name in ("value", "derivative") for k, x in scope[name].items()}
 
 
 def of_kernels(name: str, entry: Entry, index: int) -> bool:
@@ -654,7 +654,7 @@ def of_functions(name: str, entry: Entry, index: int) -> bool:
     if entry.pair == "gather":
         known = {"B": mp.mpf(2), "table_1,n": mp.mpf(3), "table_2,n": mp.mpf(5), "z_1": mp.mpf(7), "z_2": mp.mpf(11)}
         return close(value(entry.tree[2], known.__getitem__), mp.mpf(21 + 55))
-    return entry.pair == "sweep" and of_sweep(name, entry)
+    return entry.pair == "fixed_point" and of_sweep(name, entry)
 
 
 @cache
@@ -664,7 +664,7 @@ def sweep_numbers(name: str) -> tuple[int, dict[str, Any]]:
     q, p, h, t = start_of(case)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        sweep = program_of(case.system, method, prefix="printed").sweep
+        fixed_point = program_of(case.system, method, prefix="printed").fixed_point
     step, x = (
         solution(name, "evaluate")
         if any(e.pair == "evaluate" for e in made(name)[2].entries)
@@ -675,8 +675,8 @@ def sweep_numbers(name: str) -> tuple[int, dict[str, Any]]:
     found: dict[str, Any] = {"h": mp.mpf(h), "q_k": numbers(q), "p_k": numbers(p), "q_k+1": end[0], "p_k+1": end[1]}
     found["v_0"] = known.get("v_0", velocity_of(case, q, p, t))
     families = [f for f in step.stages.families if f.name != "derivative_1"]
-    places = families[-1] if hasattr(sweep, "nodes") and len(families) > 1 else families[0]
-    places = next((f for f in families if f.name == "node"), places) if hasattr(sweep, "nodes") else places
+    places = families[-1] if hasattr(fixed_point, "nodes") and len(families) > 1 else families[0]
+    places = next((f for f in families if f.name == "node"), places) if hasattr(fixed_point, "nodes") else places
     first = int(places.weight_names[0].rpartition("_")[2] or 1)
     for n in range(1, len(places.abscissae) + 1):
         given = step.arguments(places, n, str(n - 1 + first), known)
@@ -696,29 +696,36 @@ def sweep_numbers(name: str) -> tuple[int, dict[str, Any]]:
         )
         for letter in ("P_", "L_q,", "F_"):  # points of a quadrature weigh so much
             found[f"{letter}{n}"] = found[f"{letter}{n}"] * growth
-    if getattr(sweep, "blocks", len(places.abscissae)) != len(places.abscissae):  # V_j are then those of the curve
+    if getattr(fixed_point, "blocks", len(places.abscissae)) != len(
+        places.abscissae
+    ):  # V_j are then those of the curve
         found |= {f"V_{n}": known.get(f"V^{n}", numbers([0, 0])) for n in range(1, len(places.abscissae) + 1)}
     found |= {"g": mp.mpf(len(places.abscissae)), "p_k+1": end[1] * known["growth"]}
-    return len(places.abscissae), found | step.tables | tables_of(sweep, len(places.abscissae), case)
+    return len(places.abscissae), found | step.tables | tables_of(fixed_point, len(places.abscissae), case)
 
 
-def tables_of(sweep: Any, count: int, case: Case) -> dict[str, Any]:
+def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
     """The tables of a sweep by the names of the page; of masses their inverses, where they are constant."""
     found: dict[str, Any] = {"M^−1": np.array([1 / mp.mpf(PARAMETERS["m"]), 1 / mp.mpf(3)], dtype=object)}
-    if getattr(sweep, "projection", ()):
-        found["projection"] = sweep.projection
-    if hasattr(sweep, "product"):
+    if getattr(fixed_point, "projection", ()):
+        found["projection"] = fixed_point.projection
+    if hasattr(fixed_point, "product"):
         for n in range(count):
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(sweep.product[n])}
-            found |= {f"β_{n + 1}": of_package(sweep.end_position[n]), f"b_{n + 1}": of_package(sweep.end_momentum[n])}
-    elif hasattr(sweep, "position"):
-        for n in range(count):
-            w, u = (list(map(of_package, each)) for each in (sweep.position_weights, sweep.momentum_weights))
-            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(sweep.position[n])}
-            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(sweep.momentum[n])}
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) for j, x in enumerate(fixed_point.product[n])}
             found |= {
-                f"b_{n + 1}": of_package(sweep.end_position[n]) * w[n],
-                f"B_{n + 1}": of_package(sweep.end_momentum[n]) * u[n],
+                f"β_{n + 1}": of_package(fixed_point.end_position[n]),
+                f"b_{n + 1}": of_package(fixed_point.end_momentum[n]),
+            }
+    elif hasattr(fixed_point, "position"):
+        for n in range(count):
+            w, u = (
+                list(map(of_package, each)) for each in (fixed_point.position_weights, fixed_point.momentum_weights)
+            )
+            found |= {f"a_{n + 1},{j + 1}": of_package(x) * w[j] for j, x in enumerate(fixed_point.position[n])}
+            found |= {f"A_{n + 1},{j + 1}": of_package(x) * u[j] for j, x in enumerate(fixed_point.momentum[n])}
+            found |= {
+                f"b_{n + 1}": of_package(fixed_point.end_position[n]) * w[n],
+                f"B_{n + 1}": of_package(fixed_point.end_momentum[n]) * u[n],
             }
     return found
 

@@ -74,9 +74,9 @@ def at(text: str, i: int) -> Any:
 def test_slopes_of_terms_add_up_to_forces(system):
     text = derive_sums(system, sc.SVI(2) if system is RING else sc.Gauss(2))
     added: dict[str, Any] = {"q": numbers([0] * COUNT), "p": numbers([0] * COUNT)}
-    slopes = re.findall(r"^    by (\w)\[i([+-]\d+)?\]: (.*)$", text, re.MULTILINE)
-    assert len(slopes) == text.count("    by ")
-    for letter, shift, formula in slopes:
+    partials = re.findall(r"^    by (\w)\[i([+-]\d+)?\]: (.*)$", text, re.MULTILINE)
+    assert len(partials) == text.count("    by ")
+    for letter, shift, formula in partials:
         for i in range(COUNT):
             added[letter][(i + int(shift or 0)) % COUNT] += at(formula, i)
     if system is RING:
@@ -87,8 +87,8 @@ def test_slopes_of_terms_add_up_to_forces(system):
         assert np.max(np.abs(-added["p"] - rates)) < mp.mpf("1e-50")
         assert np.max(np.abs(added["q"] - kicks)) < mp.mpf("1e-50")
     latex = [line for line in derive_sums(system, sc.SVI(2), as_latex=True).splitlines() if r"\quad" in line]
-    assert len(latex) == len(slopes)
-    for line, (letter, shift, formula) in zip(latex, slopes, strict=True):
+    assert len(latex) == len(partials)
+    for line, (letter, shift, formula) in zip(latex, partials, strict=True):
         assert rf"\partial {letter}_{{i{shift}}}" in line
         tree = tree_of_latex(line.partition(r"\quad")[2].removesuffix(r" \]"))
         for i in range(COUNT):

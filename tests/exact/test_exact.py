@@ -115,13 +115,13 @@ def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
         moved = (q0 + 2 * ways * distance, q1 - ways * distance, h + distance)
         return exact_discrete_lagrangian(system, *moved, t=TIME, digits=35)
 
-    here, slope = action(0), (action(width).action - action(-width).action) / (2 * width)
+    here, derivative = action(0), (action(width).action - action(-width).action) / (2 * width)
     end = zip((*system.coordinates, *system.velocities), (*here.q1, *here.v1), strict=True)
     constants = zip((*system.parameters, system.time), (*system.defaults, mp.mpf(TIME) + h), strict=True)
     lagrangian = evaluate(system.lagrangian, {symbol: mp.mpf(value) for symbol, value in (*end, *constants)})
     work = mp.fdot(here.p1, here.v1)
     expected = -mp.fdot(here.p0, 2 * ways) - mp.fdot(here.p1, ways) + lagrangian - work
-    assert abs(slope - expected) < mp.mpf("1e-18")
+    assert abs(derivative - expected) < mp.mpf("1e-18")
 
 
 @pytest.mark.parametrize("name", all_but("pumped-cart-pole"))

@@ -107,9 +107,11 @@ def without_rates_of(*names: str) -> Make:
     return make
 
 
-def slopes(change: Callable[[int, sympy.Expr], sympy.Expr]) -> Make:
+def partials(change: Callable[[int, sympy.Expr], sympy.Expr]) -> Make:
     """Derivatives of the kernel in Newton's matrix, not its values."""
-    return changed_result(lambda found: (tuple(change(k, slope) for k, slope in enumerate(found[0])), found[1]))
+    return changed_result(
+        lambda found: (tuple(change(k, derivative) for k, derivative in enumerate(found[0])), found[1])
+    )
 
 
 def last_column_negated(stages: Any) -> Any:

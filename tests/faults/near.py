@@ -115,7 +115,7 @@ NEAR: dict[str, tuple[str, ...]] = {
             "curve",
             "ladder",
             "observed",
-            "rungs",
+            "levels",
             "stage_error",
             "iteration_error",
             "sweep_or",

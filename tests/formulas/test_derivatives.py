@@ -32,11 +32,11 @@ def same(mine: sympy.Expr, theirs: sympy.Expr) -> bool:
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
 def test_first_and_second_derivatives_are_sympys(expression: sympy.Expr) -> None:
     variables = [X, Y, Z]
-    slopes, curvatures = gradient(expression, variables), hessian(expression, variables)
-    assert list(slopes) == sorted(slopes)
+    partials, curvatures = gradient(expression, variables), hessian(expression, variables)
+    assert list(partials) == sorted(partials)
     assert list(curvatures) == sorted(curvatures)
     for row, first in enumerate(variables):
-        assert same(slopes.get(row, sympy.S.Zero), expression.diff(first))
+        assert same(partials.get(row, sympy.S.Zero), expression.diff(first))
         for column, second in enumerate(variables):
             assert same(curvatures.get((row, column), sympy.S.Zero), expression.diff(first, second))
             assert curvatures.get((row, column)) is curvatures.get((column, row))

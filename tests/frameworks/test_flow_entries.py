@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 from numpy.testing import assert_allclose
-from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, slopes, states, stepper, weights
+from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, partials, states, stepper, weights
 
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native import building
@@ -39,7 +39,7 @@ def test_values_of_rows():
 
 def test_derivatives_of_rows_forward_and_back():
     changes = np.tile(np.eye(SIZE), (2, 1, 1))
-    exact = np.array([slopes(row) for row in ROWS])
+    exact = np.array([partials(row) for row in ROWS])
     pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, KEPT, 4))
     assert_allclose(pushed, np.moveaxis(exact, -1, 1), rtol=1e-11, atol=1e-11)
     one = np.tile(weights(), (2, 1, 1, 1))
@@ -76,9 +76,9 @@ def test_external_functions_of_casadi():
     for row in ROWS:
         assert_allclose(external("", [row], (KEPT, 4)), states(row), **WAYS)
         columns = external("jac_", [row, row], (SIZE, KEPT, 4))
-        assert_allclose(np.moveaxis(columns, 0, -1), slopes(row), rtol=1e-11, atol=1e-11)
+        assert_allclose(np.moveaxis(columns, 0, -1), partials(row), rtol=1e-11, atol=1e-11)
         pulled = external("adj1_", [row, row, weights()], (SIZE,))
-        assert_allclose(pulled, np.tensordot(weights(), slopes(row), 2), rtol=1e-11, atol=1e-11)
+        assert_allclose(pulled, np.tensordot(weights(), partials(row), 2), rtol=1e-11, atol=1e-11)
 
 
 XLA = """
@@ -138,7 +138,7 @@ def test_handlers_of_xla(tmp_path):
         return alive[-1]
 
     assert_allclose(handled("states", [ROWS], (2, KEPT, 4)), [states(row) for row in ROWS], **WAYS)
-    exact, changes = np.array([slopes(row) for row in ROWS]), np.tile(np.eye(SIZE), (2, 1, 1))
+    exact, changes = np.array([partials(row) for row in ROWS]), np.tile(np.eye(SIZE), (2, 1, 1))
     pushed = handled("push", [ROWS, changes], (2, SIZE, KEPT, 4))
     assert_allclose(np.moveaxis(pushed, 1, -1), exact, rtol=1e-11, atol=1e-11)
     pulled = handled("pull", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))

@@ -110,10 +110,10 @@ def test_derivatives_of_a_harmonic_oscillator_are_those_of_sines():
     )
     flow = jax_flow(compile_stepper(system, SVI(6), flags=QUICK_FLAGS), steps=70)
     end = jax.value_and_grad(lambda w, h: flow(jnp.ones(1), jnp.zeros(1), parameters={"w": w}, h=h)[0][0], (0, 1))
-    value, slopes = end(1.3, H)
+    value, partials = end(1.3, H)
     time = 70 * H
     assert_allclose(value, np.cos(1.3 * time), atol=1e-13)
-    assert_allclose(slopes, [-time * np.sin(1.3 * time), -70 * 1.3 * np.sin(1.3 * time)], rtol=1e-11)
+    assert_allclose(partials, [-time * np.sin(1.3 * time), -70 * 1.3 * np.sin(1.3 * time)], rtol=1e-11)
 
 
 def test_transformations_apply_in_any_order():
@@ -200,8 +200,8 @@ def test_inputs_that_are_held_are_parameters():
     )
     flow = jax_flow(compile_stepper(system, SVI(1), flags=QUICK_FLAGS), steps=10)
     start = {"q": jnp.zeros(1), "p": jnp.zeros(1)}
-    slope = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
-    assert_allclose(slope, 2.0, rtol=1e-13)  # t^2 / 2
+    derivative = jax.grad(lambda u: flow(**start, parameters={"u_0": u}, h=0.2)[0][0])(3.0)
+    assert_allclose(derivative, 2.0, rtol=1e-13)  # t^2 / 2
     with pytest.raises(StateError, match="input 'u' is not set"):
         flow(**start, h=0.2)
 
@@ -275,7 +275,7 @@ def test_time_and_parameters_of_a_flow_of_several_pieces():
     for row in pumped.ROWS:
         assert_allclose(along(jnp.array(row)), pumped.states(row), rtol=0, atol=2e-12)
         for derivative in (jax.jacfwd, jax.jacrev):
-            assert_allclose(derivative(along)(jnp.array(row)), pumped.slopes(row), rtol=1e-11, atol=1e-11)
+            assert_allclose(derivative(along)(jnp.array(row)), pumped.partials(row), rtol=1e-11, atol=1e-11)
     with pytest.raises(ArgumentError, match=r"no 't_end'.*fixed number of steps give h = \(t_end - t\) / steps"):
         flow(pumped.ROWS[0][:2], pumped.ROWS[0][2:4], t_end=3.0)
     with pytest.raises(ArgumentError, match=r"no 'velocity': use momenta, p = stepper.momentum"):

@@ -52,9 +52,9 @@ def test_lines_for_torch(capfd):
     pytest.importorskip("torch", reason="needs the extra 'torch'")
     stepper = compile_stepper(problem("kepler").system, "svi:8", flags=QUICK_FLAGS)
     run = stepper.integrate([0.5, 0.0], [0.0, 3**0.5], h=0.1, steps=63)
-    slopes = np.zeros((64, 4))
-    slopes[-1, 0] = 1.0
-    assert_allclose(printed("torch", capfd), run.pullback(slopes).parameters, rtol=1e-3)
+    partials = np.zeros((64, 4))
+    partials[-1, 0] = 1.0
+    assert_allclose(printed("torch", capfd), run.pullback(partials).parameters, rtol=1e-3)
 
 
 def test_lines_for_casadi(capfd):

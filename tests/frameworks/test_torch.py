@@ -109,10 +109,10 @@ def test_many_motions_have_shapes_that_fit():
     flow = torch_flow(kepler(), steps=5, save_every=1)
     q, p = flow(numbers([[[0.5, 0.0]], [[0.6, 0.0]]]), numbers([[0.0, 1.7]] * 3), h=0.05)
     assert q.shape == p.shape == (2, 3, 6, 2)
-    slope = torch.func.vmap(
+    derivative = torch.func.vmap(
         torch.func.jacrev(lambda mu: flow(numbers([0.5, 0.0]), numbers([0.0, 1.7]), h=0.05, parameters={"mu": mu})[0])
     )
-    assert slope(numbers([0.9, 1.0])).shape == (2, 6, 2)
+    assert derivative(numbers([0.9, 1.0])).shape == (2, 6, 2)
 
 
 def test_what_there_is_not_is_refused():
@@ -138,4 +138,4 @@ def test_time_and_parameters_of_a_flow_of_several_pieces():
     for row in pumped.ROWS:
         assert_allclose(along(numbers(row)), pumped.states(row), rtol=0, atol=2e-12)
         for derivative in (torch.func.jacfwd, torch.func.jacrev):
-            assert_allclose(derivative(along)(numbers(row)), pumped.slopes(row), rtol=1e-11, atol=1e-11)
+            assert_allclose(derivative(along)(numbers(row)), pumped.partials(row), rtol=1e-11, atol=1e-11)

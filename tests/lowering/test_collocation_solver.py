@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from samples import sweep
+from samples import fixed_point
 
 from scvi_codegen.ir.curve_iterations import CollocationIteration
 from scvi_codegen.ir.iterations import SeparableIteration
@@ -42,22 +42,22 @@ def difference(left, right):
 
 @pytest.mark.parametrize("method", [*POSITION, *PRINTED], **named)
 def test_every_coupled_system_has_an_iteration_on_accelerations(sample, method):
-    kinds = {type(sweep(sample(name).system, method)) for name in COUPLED}
+    kinds = {type(fixed_point(sample(name).system, method)) for name in COUPLED}
     assert kinds == {CollocationIteration}
 
 
 def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample):
     system = sample("kepler").system
-    assert {type(sweep(system, method)) for method in POSITION} == {SeparableIteration}
-    assert {type(sweep(system, method)) for method in PRINTED} == {CollocationIteration}
-    assert isinstance(sweep(system, SCVI(1, variational=False)), SeparableIteration)
+    assert {type(fixed_point(system, method)) for method in POSITION} == {SeparableIteration}
+    assert {type(fixed_point(system, method)) for method in PRINTED} == {CollocationIteration}
+    assert isinstance(fixed_point(system, SCVI(1, variational=False)), SeparableIteration)
 
 
 def test_more_points_than_lanes_are_left_to_newton(sample):
     system = sample("double-pendulum").system
-    assert sweep(system, SpectralCollocation(32)) is not None
-    assert sweep(system, SpectralCollocation(33)) is None
-    assert sweep(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
+    assert fixed_point(system, SpectralCollocation(32)) is not None
+    assert fixed_point(system, SpectralCollocation(33)) is None
+    assert fixed_point(system, SCVI(2, "gauss-legendre:33", variational=False)) is None
 
 
 @pytest.mark.parametrize("name", ["pumped-cart-pole", "relativistic-particle"])
@@ -95,8 +95,8 @@ def test_the_velocity_kept_from_the_last_step_yields_to_other_parameters(sample,
 @pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
 def test_steps_too_long_for_the_iteration_are_newtons(sample, compiled, method):
     q, p = sample("spherical-pendulum").state
-    swept, newton = (compiled("spherical-pendulum", method, solver=solver) for solver in ("auto", "newton"))
-    run, expected = (stepper.integrate(q, p, h=0.11, steps=8) for stepper in (swept, newton))
+    iterated, newton = (compiled("spherical-pendulum", method, solver=solver) for solver in ("auto", "newton"))
+    run, expected = (stepper.integrate(q, p, h=0.11, steps=8) for stepper in (iterated, newton))
     assert difference(run, expected) < 2e-12
     with pytest.raises(Exception, match="did not converge"):
         compiled("spherical-pendulum", method, solver="fixed-point").integrate(q, p, h=0.11, steps=8)

@@ -59,12 +59,12 @@ def test_slow_sweeps_are_not_taken_for_rounding():
         name="heavy", coordinates=["x"], lagrangian="x_dot**2*(1 + x**2/100)/2 - x**2/2", parameters={}
     )
     method = SVI(4)
-    sweeps, newton = (
+    iterations, newton = (
         compile_stepper(heavy, method, solver=solver, flags=QUICK_FLAGS) for solver in ("fixed-point", "newton")
     )
     for h in (1.0, 2.0, 3.0, 3.86, 3.88, 3.9, 3.92, 3.94, 3.96, 3.98):
         with nullcontext() if h < 3.5 else suppress(StepFailedError):
-            found = np.concatenate(sweeps.step([1.0], [0.3], h))
+            found = np.concatenate(iterations.step([1.0], [0.3], h))
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
 
 

@@ -48,9 +48,9 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     """Twenty steps, of one trajectory and of an ensemble, with a force in place of the compiler's own."""
     method = SVI(3)
     program = program_of(system, method, solver="fixed-point", prefix="chain")
-    assert program.sweep is not None
+    assert program.fixed_point is not None
     if force is not None:
-        program = replace(program, sweep=replace(program.sweep, force=force))
+        program = replace(program, fixed_point=replace(program.fixed_point, force=force))
     stepper = Stepper(
         render(program),
         describe(program, system, method),
@@ -79,9 +79,9 @@ def test_the_code_of_a_loop_does_not_grow_with_its_table() -> None:
     for masses in (8, 64):
         system, bonds = chain(masses)
         program = program_of(system, SVI(2), solver="fixed-point", prefix="chain")
-        assert program.sweep is not None
+        assert program.fixed_point is not None
         force = looped_force(system, "force_lanes", bonds)
-        code = render(replace(program, sweep=replace(program.sweep, force=force))).code
+        code = render(replace(program, fixed_point=replace(program.fixed_point, force=force))).code
         start = code.index("void bond(")
         sizes.append(code[start : code.index("void mass(", start)].count(";"))
     assert sizes[1] - sizes[0] == 64 - 8  # a value set to 0 for each mass

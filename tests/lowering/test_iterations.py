@@ -65,7 +65,7 @@ def test_lanes_take_as_many_sweeps_as_single_runs(name):
         assert isinstance(block, LaneBlock)
         block.advance(STEPS)
         run = own.integrate(given.q, given.p, h=h, steps=STEPS)
-        assert block.memory.sweeps == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)
+        assert block.memory.iterations == pytest.approx(int(run.iterations.sum()), rel=ROUNDING, abs=2)
 
 
 @pytest.mark.parametrize("name", CONTINUED)

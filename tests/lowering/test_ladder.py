@@ -19,13 +19,16 @@ KEPLER = sc.problem("kepler").system
 
 @pytest.mark.parametrize("method", [sc.SVI(3), sc.SVI(8), sc.Gauss(5), sc.SVI(4, sc.gauss_lobatto(5))])
 def test_coefficients_have_106_bits(method):
-    sweep = program_of(KEPLER, method).sweep
+    fixed_point = program_of(KEPLER, method).fixed_point
 
     def printed(numbers):
         return [mp.mpf(DOUBLE.rounded(x)) + mp.mpf(DOUBLE.rounded(DOUBLE.rest(x))) for x in numbers]
 
-    c, b, q = (printed(table)[: sweep.points] for table in (sweep.drift, sweep.end_momentum, sweep.end_position))
-    product = list(map(printed, sweep.product))[: sweep.points]
+    c, b, q = (
+        printed(table)[: fixed_point.points]
+        for table in (fixed_point.drift, fixed_point.end_momentum, fixed_point.end_position)
+    )
+    product = list(map(printed, fixed_point.product))[: fixed_point.points]
     for k in range(method.degree if isinstance(method, sc.SVI) else 5):
         powers = [x**k for x in c]
         assert abs(mp.fdot(b, powers) - mp.mpf(1) / (k + 1)) < 1e-31
@@ -37,12 +40,12 @@ def test_coefficients_have_106_bits(method):
 @pytest.mark.parametrize("system", [KEPLER, sc.problem("double-pendulum").system])
 @pytest.mark.parametrize("degree", [2, 8])
 def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree):
-    sweep = program_of(system, sc.SVI(degree)).sweep
-    ladder, same = predictor_of(sweep), predictor_of(sweep).reach
+    fixed_point = program_of(system, sc.SVI(degree)).fixed_point
+    ladder, same = predictor_of(fixed_point), predictor_of(fixed_point).reach
     for found, wanted in (
-        (ladder.alone[same], sweep.guess.last_alone),
-        (ladder.last[same][same], sweep.guess.last),
-        (ladder.before[same][same], sweep.guess.before),
+        (ladder.alone[same], fixed_point.guess.last_alone),
+        (ladder.last[same][same], fixed_point.guess.last),
+        (ladder.before[same][same], fixed_point.guess.before),
     ):
         expected = np.array(wanted, dtype=float)
         assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
@@ -51,9 +54,9 @@ def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree)
 @pytest.mark.parametrize("method", [sc.SVI(6), sc.SpectralCollocation(6)])
 def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
     system = sc.problem("double-pendulum").system
-    sweep = program_of(system, method).sweep
-    ladder, points = predictor_of(sweep), np.array(sweep.guess.abscissae, dtype=float)
-    accelerations = sweep.kept is StoredValues.ACCELERATIONS  # z = h a is kept
+    fixed_point = program_of(system, method).fixed_point
+    ladder, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)
+    accelerations = fixed_point.kept is StoredValues.ACCELERATIONS  # z = h a is kept
 
     def curve(t):
         return 1.0 + t - 2.0 * t**3 + t**5
@@ -65,7 +68,7 @@ def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
             before, last = scales[0] * curve(points - 1.0), scales[1] * curve(h_last * points)
             wanted = scales[2] * curve(h_last + h_next * points)
             tables = [np.array(each[into_last + 2][into_next + 2]) for each in (ladder.last, ladder.before)]
-            padded = [np.pad(values, (0, sweep.lanes - len(points))) for values in (last, before)]
+            padded = [np.pad(values, (0, fixed_point.lanes - len(points))) for values in (last, before)]
             found = sum(table @ values for table, values in zip(tables, padded, strict=True))
             assert np.allclose(found[: len(points)], wanted, rtol=1e-8, atol=1e-8)
 

@@ -147,7 +147,7 @@ def test_kernels_of_systems_have_the_values_and_slopes_of_their_formulas(name, m
         numbers = [float(point[symbol]) for symbol in symbols]
         m = len(family.arguments)
         expected = [float(exact(e, point)) for e in (*family.results, *slopes_in_order(family))]
-        found = interpret(own.slope, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
+        found = interpret(own.derivative, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
         values = interpret(own.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(values, expected[: len(values)], rtol=1e-12, atol=1e-14)
@@ -155,10 +155,10 @@ def test_kernels_of_systems_have_the_values_and_slopes_of_their_formulas(name, m
 
 def slopes_in_order(family: Any) -> list[sympy.Expr]:
     return [
-        slope
+        derivative
         for scatter in family.scatters
         for gather in family.gathers
-        for slope in jacobian(scatter.results, gather.arguments).values()
+        for derivative in jacobian(scatter.results, gather.arguments).values()
     ]
 
 
@@ -182,14 +182,14 @@ def test_negative_odd_half_powers_are_functions_of_their_own():
 def test_the_slopes_of_kepler_cost_no_division():
     system = kepler()
     forces = gradient(system.lagrangian, system.coordinates)
-    slopes = jacobian(tuple(forces.values()), system.coordinates)
+    partials = jacobian(tuple(forces.values()), system.coordinates)
     kernel = lower_kernel(
         "kepler",
         arguments=system.coordinates,
         time=system.time,
         parameters=system.parameters,
         values=tuple(forces.values()),
-        slopes=tuple(slopes.values()),
+        partials=tuple(partials.values()),
     )
     counts = kernel.operation_counts()
     assert (counts["inverse_root_3"], counts["inverse_root_5"]) == (1, 1)

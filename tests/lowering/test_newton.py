@@ -52,12 +52,12 @@ def chain(method: object, *, pumped: bool = False) -> Stepper:
 @pytest.mark.parametrize("method", [SVI(3), SCVI(3), Gauss(3)], ids=lambda method: method.name)
 def test_the_band_gives_what_the_fixed_point_gives(method):
     q, p = state(6)
-    swept, found = (
+    iterated, found = (
         compile_stepper(fput_chain(6), method, solver=solver).integrate(q, p, h=0.2, steps=40)
         for solver in ("fixed-point", "newton")
     )
-    np.testing.assert_allclose(found.q, swept.q, rtol=0, atol=2e-13)
-    np.testing.assert_allclose(found.p, swept.p, rtol=0, atol=2e-13)
+    np.testing.assert_allclose(found.q, iterated.q, rtol=0, atol=2e-13)
+    np.testing.assert_allclose(found.p, iterated.p, rtol=0, atol=2e-13)
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.full)])

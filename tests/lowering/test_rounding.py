@@ -58,8 +58,8 @@ def test_targets_round_to_the_nearest_number_once():
 
 
 def test_a_program_knows_more_digits_than_a_double():
-    sweep = program_of(kepler(), SVI(3)).sweep
-    product = [x for row in sweep.product for x in row[: sweep.points]]
+    fixed_point = program_of(kepler(), SVI(3)).fixed_point
+    product = [x for row in fixed_point.product for x in row[: fixed_point.points]]
     assert all(mp.mpf(DOUBLE.rounded(x)) != x for x in product)
 
 

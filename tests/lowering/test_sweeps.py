@@ -27,7 +27,7 @@ ONE_SWEEP = SolverOptions(tolerance=1e300)
 ROUNDING = 64 * 2.0**-52
 
 
-def swept(system: MechanicalSystem) -> Stepper:
+def iterated(system: MechanicalSystem) -> Stepper:
     return compile_stepper(system, SVI(1), solver="fixed-point", flags=QUICK_FLAGS)
 
 
@@ -40,7 +40,7 @@ def functions(system: MechanicalSystem):
     return tuple(map(partial(as_numbers, [q, second, t]), (by_q, by_second, curvature)))
 
 
-def slopes(system: MechanicalSystem):
+def partials(system: MechanicalSystem):
     """F_q, F_v and L_vq."""
     q, v, L = system.coordinates, system.velocities, system.formula.subs(system.constants)
     by_q, by_v = (sympy.Matrix([L.diff(x) for x in symbols]) for symbols in (q, v))
@@ -80,9 +80,9 @@ def close(found, expected) -> bool:
 
 @pytest.mark.parametrize("system", [tangle(), pumped_cart_pole()], ids=lambda system: system.name)
 def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_to_first_order(system):
-    stepper, (force, momentum, mass) = swept(system), functions(system)
+    stepper, (force, momentum, mass) = iterated(system), functions(system)
     assert "support/followed_corrections.h" in stepper.source.files
-    F_q, F_v, P_q = slopes(system)
+    F_q, F_v, P_q = partials(system)
     for q0, v0 in states(system.dimension):
         p0, t = momentum(q0, v0, T), T + H / 2
         at = q0 + H / 2 * v0, v0, t
@@ -98,7 +98,7 @@ def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_
     "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
 )
 def test_where_masses_are_the_same_everywhere_velocities_follow_momenta_and_forces_are_those_where_they_end(system):
-    stepper, (force, momentum, mass) = swept(system), functions(system)
+    stepper, (force, momentum, mass) = iterated(system), functions(system)
     assert "support/corrections.h" in stepper.source.files
     for q0, v0 in states(system.dimension):
         p0, t = momentum(q0, v0, T), T + H / 2
@@ -113,16 +113,16 @@ def test_of_many_coordinates_no_slopes_are_asked_for():
     names = [f"a{k}" for k in range(9)]
     coupled = " + ".join(f"{a}_dot**2 + {a}_dot*{b}_dot*cos({a} - {b})" for a, b in itertools.pairwise([*names, "a0"]))
     chain = LagrangianSystem.from_text(name="ring of nine", coordinates=names, lagrangian=coupled)
-    assert "support/corrections.h" in swept(chain).source.files
+    assert "support/corrections.h" in iterated(chain).source.files
 
 
 def test_momenta_follow_forces_and_velocities_follow_momenta():
     system = hamiltonian_of(problem("charged-particle").system)
-    stepper, (slope, velocity, _) = swept(system), functions(system)
+    stepper, (derivative, velocity, _) = iterated(system), functions(system)
     assert "support/hamiltonian_iteration.h" in stepper.source.files
     for q0, p0 in states(system.dimension):
         t, v0 = T + H / 2, velocity(q0, p0, T)
-        p = p0 - H / 2 * slope(q0 + H / 2 * v0, p0, t)
+        p = p0 - H / 2 * derivative(q0 + H / 2 * v0, p0, t)
         v = velocity(q0 + H / 2 * v0, p, t)
-        expected = q0 + H * v, p0 - H * slope(q0 + H / 2 * v, p, t)
+        expected = q0 + H * v, p0 - H * derivative(q0 + H / 2 * v, p, t)
         assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)

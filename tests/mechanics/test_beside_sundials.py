@@ -11,7 +11,7 @@ G, SPAN = 9.81, 2.0
 MASSES = np.array([1.0, 1.0, 2.0, 2.0])
 
 
-def slopes(q):
+def partials(q):
     """(2, 4) of x1^2 + y1^2 - 1 and of (x2 - x1)^2 + (y2 - y1)^2 - 1/4; quadratic, so slopes(v) is their change."""
     x, y = q[2] - q[0], q[3] - q[1]
     return 2 * np.array([[q[0], q[1], 0, 0], [-x, -y, x, y]])
@@ -33,10 +33,10 @@ def test_a_double_pendulum_of_rods_is_where_ida_has_it():
     def residual(t, y, rates, out):
         q, v, multipliers = y[:4], y[4:8], y[8:]
         out[:4] = rates[:4] - v
-        out[4:8] = MASSES * rates[4:8] - weight + slopes(q).T @ multipliers
-        out[8:] = slopes(q) @ rates[4:8] + slopes(v) @ v
+        out[4:8] = MASSES * rates[4:8] - weight + partials(q).T @ multipliers
+        out[8:] = partials(q) @ rates[4:8] + partials(v) @ v
 
-    at_rest = slopes(q)
+    at_rest = partials(q)
     multipliers = np.linalg.solve(at_rest / MASSES @ at_rest.T, at_rest @ (weight / MASSES))
     start = np.concatenate([q, 0 * q, multipliers])
     rates = np.concatenate([0 * q, (weight - at_rest.T @ multipliers) / MASSES, [0, 0]])

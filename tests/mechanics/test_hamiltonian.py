@@ -290,10 +290,10 @@ def test_point_vortices_against_gauss_written_out() -> None:
     root = np.sqrt(3.0) / 6.0
     A = np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]])
     state, h = np.concatenate([entry.q, entry.p]), 0.1
-    slopes = np.zeros((2, len(state)))
+    partials = np.zeros((2, len(state)))
     for _ in range(200):
-        slopes = np.array([vortex_rates(state + h * line @ slopes, strength) for line in A])
-    expected = state + h * slopes.sum(axis=0) / 2
+        partials = np.array([vortex_rates(state + h * line @ partials, strength) for line in A])
+    expected = state + h * partials.sum(axis=0) / 2
     assert np.abs(np.concatenate(stepper.step(entry.q, entry.p, h)) - expected).max() < ROUND_OFF
 
 

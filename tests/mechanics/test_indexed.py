@@ -121,9 +121,9 @@ def test_what_is_derived_is_shown() -> None:
         parameters={"mass[N]": 1},
         tables=["ends_of[B, 2]"],
     )
-    slopes = {str(term): found for term, found in net.kernels}
+    partials = {str(term): found for term, found in net.kernels}
     a, b = (sympy.Symbol(f"q[ends_of[b, {k}]]", real=True) for k in (0, 1))
-    assert slopes["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"] == {
+    assert partials["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"] == {
         a.name: sympy.sin(a - b),
         b.name: -sympy.sin(a - b),
     }

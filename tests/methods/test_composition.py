@@ -47,8 +47,8 @@ def test_the_order_is_the_one_claimed(system, order):
     runs = [stepper.integrate(q, p, h=span / n, steps=int(n)) for n in counts]
     errors = np.array([np.abs(run.q[-1] - reference).max() for run in runs])
     used = np.flatnonzero(errors > 1e-12)[-4:]  # the shortest steps above round-off and the reference's 1e-14
-    slope = -np.polyfit(np.log(counts[used]), np.log(errors[used]), 1)[0]
-    assert slope == pytest.approx(order, abs=0.4)
+    derivative = -np.polyfit(np.log(counts[used]), np.log(errors[used]), 1)[0]
+    assert derivative == pytest.approx(order, abs=0.4)
 
 
 def test_the_force_at_the_end_is_used_again_without_a_trace():

@@ -44,14 +44,14 @@ def test_a_dumbbell_flies_as_its_centre_and_turns_evenly():
 
 
 @pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
-def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(bend):
+def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(hook_angle):
     hook = JOINTS.bent_pendulum()
     a, b = 0.6, 0.4
-    places = [np.sin(np.pi - bend), -np.cos(np.pi - bend)]
+    places = [np.sin(np.pi - hook_angle), -np.cos(np.pi - hook_angle)]
     q = [0.0, -a, b * places[0], b * places[1] - a]
-    system = hook.system.with_parameters(bend=bend)
+    system = hook.system.with_parameters(hook_angle=hook_angle)
     run = ran(JOINTS.Mechanism(system, q, [2.0 * a, 0.0, -2.0 * q[3], 2.0 * q[2]]))
-    far = a**2 + b**2 - 2 * a * b * np.cos(bend)
+    far = a**2 + b**2 - 2 * a * b * np.cos(hook_angle)
     f = reduced(
         "(a**2 + far)*u0_dot**2/2 + g*(2*a*cos(u0) - b*cos(u0 - bend))",
         [0.0],
@@ -60,12 +60,12 @@ def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(bend):
         a=a,
         b=b,
         far=far,
-        bend=bend,
+        hook_angle=hook_angle,
     )[:, 0]
-    bent = f + np.pi - bend
+    hook = f + np.pi - hook_angle
     middle = a * np.column_stack([np.sin(f), -np.cos(f)])
     assert_allclose(run.q[:, :2], middle, atol=1e-9)
-    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(bent), -np.cos(bent)]), atol=1e-9)
+    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(hook), -np.cos(hook)]), atol=1e-9)
 
 
 def test_a_point_slides_on_its_line():

@@ -46,6 +46,6 @@ def integrate(q, v, masses, gravity, span, steps):
     for _ in range(steps):
         x = accelerated(q, v, masses, REAL(gravity))
         q = (x * powers[:, None, None])[::-1].sum(axis=0)
-        slopes = np.arange(1, ORDER + 1, dtype=REAL) * powers[:-1]
-        v = (x[1:] * slopes[:, None, None])[::-1].sum(axis=0)
+        partials = np.arange(1, ORDER + 1, dtype=REAL) * powers[:-1]
+        v = (x[1:] * partials[:, None, None])[::-1].sum(axis=0)
     return q, v

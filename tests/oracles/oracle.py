@@ -29,7 +29,7 @@ def numbers(values: Any) -> np.ndarray:
 # Polynomials: coefficients, lowest first.
 
 
-def slope(polynomial: np.ndarray) -> np.ndarray:
+def derivative(polynomial: np.ndarray) -> np.ndarray:
     return polynomial[1:] * np.arange(1, len(polynomial))
 
 
@@ -95,7 +95,7 @@ def points(family: str, n: int) -> np.ndarray:
     }
     zeros = {
         "gauss": lambda: roots(legendre(n)),
-        "lobatto": lambda: [-1, *roots(slope(legendre(n - 1))), 1],
+        "lobatto": lambda: [-1, *roots(derivative(legendre(n - 1))), 1],
         "radau-left": lambda: roots(legendre(n) + padded(legendre(n - 1))),
         "radau-right": lambda: roots(legendre(n) - padded(legendre(n - 1))),
     }
@@ -212,12 +212,12 @@ State = tuple[np.ndarray, np.ndarray]
 
 def svi(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: Any, w: Any) -> State:
     """(26)-(27): L_d = h sum w L(q(c), qdot(c)) stationary in the inner node values, p0 = -D_0 L_d, p1 = D_s L_d."""
-    values, slopes = table(nodes, c), table(nodes, c, slope) / h
+    values, partials = table(nodes, c), table(nodes, c, derivative) / h
 
     def gradient(unknown: np.ndarray) -> np.ndarray:
         Q = np.vstack([q0[None], unknown])
-        at = (t + c * h, values @ Q, slopes @ Q)
-        return h * (values.T @ (w[:, None] * system.force(*at)) + slopes.T @ (w[:, None] * system.momentum(*at)))
+        at = (t + c * h, values @ Q, partials @ Q)
+        return h * (values.T @ (w[:, None] * system.force(*at)) + partials.T @ (w[:, None] * system.momentum(*at)))
 
     def rows(unknown: np.ndarray) -> np.ndarray:
         G = gradient(unknown)
@@ -232,7 +232,7 @@ def svi(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: A
 
 def collocation(system: Mechanics, t: Any, q0: Any, Q: np.ndarray, v0: Any, h: Any, nodes: Any) -> tuple[Any, Any]:
     """(15)-(18): E at the nodes 1 .. s for node values Q, and the velocities there."""
-    D = table(nodes, nodes, slope)[1:] / h
+    D = table(nodes, nodes, derivative)[1:] / h
     V = D @ np.vstack([q0[None], Q])
     acceleration = D @ np.vstack([v0[None], V])
     return system.residual(t + nodes[1:] * h, Q, V, acceleration), V
@@ -240,7 +240,7 @@ def collocation(system: Mechanics, t: Any, q0: Any, Q: np.ndarray, v0: Any, h: A
 
 def action(system: Mechanics, t: Any, Q: np.ndarray, h: Any, nodes: Any, c: Any, w: Any) -> Any:
     """(25), (33): the quadrature of L along the polynomial through all node values."""
-    return h * (w @ system.lagrangian(t + c * h, table(nodes, c) @ Q, table(nodes, c, slope) @ Q / h))
+    return h * (w @ system.lagrangian(t + c * h, table(nodes, c) @ Q, table(nodes, c, derivative) @ Q / h))
 
 
 def central(function: Callable[[np.ndarray], Any], x: np.ndarray, width: str) -> np.ndarray:
@@ -298,11 +298,11 @@ def generated_map(discrete_lagrangian: Callable[[Any, Any], Any], q0: Any, p0: A
 
 def scvi_printed(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: Any, w: Any) -> State:
     """(34a)-(34e): the same with partial derivatives by the end node values, as printed."""
-    values, slopes = table(nodes, c), table(nodes, c, slope) / h
+    values, partials = table(nodes, c), table(nodes, c, derivative) / h
 
     def end_slopes(Q: np.ndarray) -> np.ndarray:
-        at = (t + c * h, values @ Q, slopes @ Q)
-        G = h * (values.T @ (w[:, None] * system.force(*at)) + slopes.T @ (w[:, None] * system.momentum(*at)))
+        at = (t + c * h, values @ Q, partials @ Q)
+        G = h * (values.T @ (w[:, None] * system.force(*at)) + partials.T @ (w[:, None] * system.momentum(*at)))
         return G[[0, -1]]
 
     def rows(unknown: np.ndarray) -> np.ndarray:
@@ -325,7 +325,7 @@ def sc_position(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: A
 
 def sc_phase_space(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any) -> State:
     """(21): Hamilton's equations q' = v, p' = L_q at nodes 1 .. s, p = L_v(q, v), unknowns Q^i and V_i."""
-    D, times, s = table(nodes, nodes, slope)[1:] / h, t + nodes[1:] * h, len(nodes) - 1
+    D, times, s = table(nodes, nodes, derivative)[1:] / h, t + nodes[1:] * h, len(nodes) - 1
 
     def rows(unknown: np.ndarray) -> np.ndarray:
         Q, V = unknown[:s], unknown[s:]

@@ -48,7 +48,7 @@ def states(row):
     return np.array(kept)
 
 
-def slopes(row):
+def partials(row):
     """(kept, 4, 10) derivatives of :func:`states`, by complex steps: right to rounding."""
     tiny = 1e-40
     changes = [states(row + 1j * tiny * direction).imag / tiny for direction in np.eye(len(row))]
@@ -63,5 +63,5 @@ def weights():
 def hessian(row):
     """(10, 10) second derivatives of the states times :func:`weights`, to 1e-8."""
     steps = 3e-7 * np.eye(len(row))
-    gradient = [np.tensordot(weights(), slopes(row + e) - slopes(row - e), 2) / 6e-7 for e in steps]
+    gradient = [np.tensordot(weights(), partials(row + e) - partials(row - e), 2) / 6e-7 for e in steps]
     return np.array(gradient)

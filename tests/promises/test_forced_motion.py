@@ -76,7 +76,7 @@ def reference(build):
     return run.y[:m, -1]
 
 
-def slope(stepper, build, counts):
+def derivative(stepper, build, counts):
     q, v = STATES[build]
     errors = []
     for count in counts:
@@ -118,7 +118,7 @@ def named(case):
 def test_order_is_that_without_forces(quickly_compiled, case):
     method, order, counts = case
     assert method.order == order
-    found, errors = slope(quickly_compiled(cart_pole(), method), cart_pole, counts)
+    found, errors = derivative(quickly_compiled(cart_pole(), method), cart_pole, counts)
     assert found == pytest.approx(order, abs=0.25), errors
 
 
@@ -128,7 +128,7 @@ def test_order_of_every_method_is_that_without_forces(quickly_compiled, case):
     method, order, counts = case
     assert method.order == order
     for build in (cart_pole, radial):
-        found, errors = slope(quickly_compiled(build(), method), build, counts)
+        found, errors = derivative(quickly_compiled(build(), method), build, counts)
         assert found == pytest.approx(order, abs=0.3 if order < 8 else 0.7), errors
 
 

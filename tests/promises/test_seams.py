@@ -96,7 +96,7 @@ from scvi_codegen.compiler import program_of
 assert scvi_codegen.__file__.startswith(sys.path[0])
 system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
 own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
-print(own.families == gauss.families, own.sweep == gauss.sweep, *(each.exact for each in own.momentum_maps))
+print(own.families == gauss.families, own.fixed_point == gauss.fixed_point, *(each.exact for each in own.momentum_maps))
 """
     assert run(extended, script).split() == ["True", "True", "True"]
 
@@ -109,7 +109,7 @@ from scvi_codegen.compiler import program_of
 from scvi_codegen.models.problems import problem
 given = problem("kepler")
 method = SCVI(4, abscissae="gauss")
-print(*(type(program_of(given.system, each).sweep).__name__ for each in (method, SCVI(4))))
+print(*(type(program_of(given.system, each).fixed_point).__name__ for each in (method, SCVI(4))))
 ends = []
 for solver in ("fixed-point", "newton"):
     run = compile_stepper(given.system, method, solver=solver).integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=50)

@@ -22,7 +22,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.models.problems import problem
 
-SLOPE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+DERIVATIVE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 """Central differences of order six."""
 WIDTH = 2e-3
 """Where round-off (1e-16 / WIDTH) and truncation (WIDTH^6 f^(7) / 140) both stay near 1e-13 at the states used here."""
@@ -31,7 +31,7 @@ WIDTH = 2e-3
 def step_jacobian(step, state):
     """d step(z) / dz by sixth-order differences."""
     columns = [
-        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in SLOPE_WEIGHTS.items())
+        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in DERIVATIVE_WEIGHTS.items())
         for unit in np.eye(len(state)) * WIDTH
     ]
     return np.array(columns).T

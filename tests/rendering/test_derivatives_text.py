@@ -21,7 +21,7 @@ CASES = {
     "damped": (damped_pendulum(), SVI(2)),
     "rods": (two_rods(), SVI(1, "gauss-lobatto:2")),
     "double": (problem("double-pendulum").system, SCVI(2)),
-    "swept": (problem("kepler").system, SVI(4)),
+    "iterated": (problem("kepler").system, SVI(4)),
     "swept, coupled": (problem("double-pendulum").system, SVI(2)),
     "swept, pushed": (pushed_pendulum(), Gauss(3)),
     "clock": (reparametrise(problem("kepler").system, "frequency"), SVI(2)),
@@ -37,7 +37,7 @@ def test_compiles_without_a_warning(name, second, compiler, tmp_path):
     system, method = CASES[name]
     if second and system.clock:
         pytest.skip("there are no second derivatives in transformed time")
-    program = program_of(system, method, solver="auto" if name.startswith("swept") else "newton")
+    program = program_of(system, method, solver="auto" if name.startswith("iterated") else "newton")
     derivatives = derivatives_of(system, discretise(system, method), program, second=second)
     source = render_derivatives(derivatives).amalgamated()
     (tmp_path / f"{source.prefix}.h").write_text(source.header)

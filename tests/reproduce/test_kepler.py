@@ -95,9 +95,9 @@ CIRCLE_SLOPES = {
 )
 def test_slopes_of_the_error_of_a_step(scheme, degree, e, expected):
     found = orders(scheme, degree, e)
-    assert [slope is None for slope in found] == [power is None for power in expected]
-    pairs = [(slope, power) for slope, power in zip(found, expected, strict=True) if power]
-    assert all(abs(slope - power) < 0.1 for slope, power in pairs)
+    assert [derivative is None for derivative in found] == [power is None for power in expected]
+    pairs = [(derivative, power) for derivative, power in zip(found, expected, strict=True) if power]
+    assert all(abs(derivative - power) < 0.1 for derivative, power in pairs)
 
 
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])

@@ -172,9 +172,9 @@ def test_the_error_of_a_step_is_estimated_within_bounds(kepler):
 
 def test_newtons_iteration_estimates_it_too():
     system = sc.problem("kepler").system
-    newton, sweeps = (sc.compile_stepper(system, sc.SVI(6), solver=solver) for solver in ("newton", "auto"))
+    newton, iterations = (sc.compile_stepper(system, sc.SVI(6), solver=solver) for solver in ("newton", "auto"))
     q, p = orbit(0.6)
-    found = [stepper.integrate(q, p, h=0.2, steps=40) for stepper in (newton, sweeps)]
+    found = [stepper.integrate(q, p, h=0.2, steps=40) for stepper in (newton, iterations)]
     assert found[0].worst_step_time == found[1].worst_step_time
     assert 0.01 < found[0].step_error / found[1].step_error < 100.0
     assert math.isnan(sc.compile_stepper(system, sc.StoermerVerlet()).integrate(q, p, h=0.1, steps=3).step_error)

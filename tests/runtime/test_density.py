@@ -39,8 +39,8 @@ def by_hand(stepper, q, p, tau, steps, rate, control):
     """The controller, step by step, around an integrator that knows nothing of it."""
     density, t, states = 0.0, 0.0, []
     for _ in range(steps):
-        slope = control(t, q, p)
-        density = density + tau * slope if density else 1.0 / rate(t, q, p) + tau / 2.0 * slope
+        derivative = control(t, q, p)
+        density = density + tau * derivative if density else 1.0 / rate(t, q, p) + tau / 2.0 * derivative
         q, p = stepper.step(q, p, tau / density, t)
         t += tau / density
         states.append([t, *q, *p])

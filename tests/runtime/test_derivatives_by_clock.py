@@ -84,7 +84,7 @@ class Digits:
         found = made(q, p, mp.findroot(late, (0.5 * h, 0.7 * h), tol=mp.mpf(10) ** -70))
         return [*found.q, *found.p, given[-2] + t_end - T0]
 
-    def slopes(self, values, steps, t_end=None):
+    def partials(self, values, steps, t_end=None):
         """(5, given) by differences; the energy, last of the parameters, is what is added to that of the state."""
         columns = []
         for k in range(len(values)):
@@ -115,7 +115,7 @@ def values_of(form):
 @pytest.mark.parametrize("form", FORMS)
 def test_of_a_step_by_all_it_starts_from(form):
     """At the energy of its state; and at one that is given, where it is symplectic."""
-    made, exact = stepper(form), Digits(form).slopes(values_of(form), 1)
+    made, exact = stepper(form), Digits(form).partials(values_of(form), 1)
     found = columns_of(made.sensitivity(Q, P, H, T0))
     assert np.abs(found - exact).max() < EXACT * np.abs(exact).max()
     assert_allclose(made.jacobian(Q, P, H, T0), found[:4, :4], rtol=0, atol=1e-15)
@@ -134,11 +134,11 @@ def test_of_a_step_by_all_it_starts_from(form):
 def test_of_runs_of_steps_and_to_a_time(form):
     made, values = stepper(form), values_of(form)
     run = made.integrate(Q, P, h=H, steps=3, t=T0)
-    exact = Digits(form).slopes(values, 3)
+    exact = Digits(form).partials(values, 3)
     assert np.abs(columns_of(run.sensitivity())[-1] - exact).max() < 3 * EXACT * np.abs(exact).max()
     t_end = float(run.t[2] + 0.6 * (run.t[3] - run.t[2]))
     ended = made.integrate(Q, P, h=H, t_end=t_end, t=T0)
-    exact = Digits(form).slopes(values, 2, t_end)[:, :-1]
+    exact = Digits(form).partials(values, 2, t_end)[:, :-1]
     assert np.abs(columns_of(ended.sensitivity())[-1] - exact).max() < 3 * EXACT * np.abs(exact).max()
     assert ended.sensitivity().h is None
 

@@ -34,7 +34,7 @@ def galaxy():
     return compile_stepper(problem("henon-heiles").system, SVI(2))
 
 
-def slope(x, y):
+def derivative(x, y):
     return np.polyfit(x, y, 1)[0]
 
 
@@ -72,10 +72,10 @@ def test_a_saddle_has_the_exponents_of_its_linear_motion():
     assert_allclose(run.lyapunov_exponents(), [0.3, 0.0, 0.0, -0.3], atol=1e-2)
     deviations = run.chaos_indicators()
     assert deviations.log_gali(2)[-1] < -110.0
-    assert slope(run.t[2000:], deviations.log_gali(2)[2000:]) == pytest.approx(-0.3, rel=1e-3)
-    assert slope(run.t[2000:], deviations.log_gali(4)[2000:]) == pytest.approx(-1.2, rel=1e-3)
-    assert slope(run.t[2000:], run.megno()[2000:]) == pytest.approx(0.15, rel=1e-3)
-    assert slope(run.t[2000:], run.fli()[2000:]) == pytest.approx(0.3, rel=1e-3)
+    assert derivative(run.t[2000:], deviations.log_gali(2)[2000:]) == pytest.approx(-0.3, rel=1e-3)
+    assert derivative(run.t[2000:], deviations.log_gali(4)[2000:]) == pytest.approx(-1.2, rel=1e-3)
+    assert derivative(run.t[2000:], run.megno()[2000:]) == pytest.approx(0.15, rel=1e-3)
+    assert derivative(run.t[2000:], run.fli()[2000:]) == pytest.approx(0.3, rel=1e-3)
 
 
 def test_a_free_particle_spreads_as_it_can_be_written_down():
@@ -125,9 +125,9 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=10_000) for start in (REGULAR, CHAOTIC))
     assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
     late, found = slice(1000, None), regular.chaos_indicators()
-    powers = [slope(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
+    powers = [derivative(np.log(regular.t[late]), found.log_gali(k)[late]) for k in (2, 3, 4)]
     assert_allclose(powers, [0.0, -2.0, -4.0], atol=0.3)
-    assert slope(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
+    assert derivative(np.log(regular.t[late]), found.fli()[late]) == pytest.approx(1.0, abs=0.2)
     assert regular.gali(2).min() > 0.05
     found, t = chaotic.chaos_indicators(), chaotic.t[-1]
     exponents = found.lyapunov_exponents()[-1]

@@ -43,7 +43,7 @@ def by_start(gradient, stepper):
     return np.array([*gradient.q, *gradient.p, *gradient.parameters[columns]])
 
 
-def slope(function, x, width=1e-4):
+def derivative(function, x, width=1e-4):
     """(k, ..) of fourth order."""
     columns = []
     for unit in np.eye(x.size).reshape(-1, *x.shape):
@@ -61,8 +61,8 @@ def test_gradients_by_the_start_by_parameters_and_by_the_data(stepper, options):
         return (weights * states_of(run_from(stepper, x, coefficients, **options))).sum()
 
     found = run.pullback(weights)
-    assert_allclose(by_start(found, stepper), slope(weighted, START), rtol=1e-8)
-    expected = slope(lambda c: weighted(START, c), COEFFICIENTS).reshape(4, 4)
+    assert_allclose(by_start(found, stepper), derivative(weighted, START), rtol=1e-8)
+    expected = derivative(lambda c: weighted(START, c), COEFFICIENTS).reshape(4, 4)
     assert_allclose(found.inputs["u"], expected[::-1].T, rtol=1e-7, atol=1e-8)
     assert found.h is None
     assert np.isnan(found.parameters).sum() == 5
@@ -73,7 +73,7 @@ def test_gradients_by_the_start_by_parameters_and_by_the_data(stepper, options):
 
 def test_tangents_go_from_piece_to_piece(stepper):
     run = run_from(stepper, START)
-    expected = slope(lambda x: states_of(run_from(stepper, x)), START)
+    expected = derivative(lambda x: states_of(run_from(stepper, x)), START)
     assert_allclose(run.tangent(), expected[:2].transpose(1, 2, 0), atol=1e-9)
     direction = np.zeros(stepper._input_size)
     direction[2 + stepper.parameters.index("l")] = 1.0
@@ -92,10 +92,10 @@ def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
 
     directions = np.zeros((stepper._input_size, 4))
     directions[[0, 1, *(2 + stepper.parameters.index(name) for name in ("c", "l"))], range(4)] = 1.0
-    slopes = weights + np.einsum("nij,nj->ni", bends, states_of(run))
-    product = run.hessian_product(slopes, directions, bends)
+    partials = weights + np.einsum("nij,nj->ni", bends, states_of(run))
+    product = run.hessian_product(partials, directions, bends)
     found = by_start(product, stepper)
-    expected = slope(gradient, START)
+    expected = derivative(gradient, START)
     assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     assert product.inputs["u"].shape == (4, 4, 4)
 

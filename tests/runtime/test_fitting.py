@@ -370,11 +370,11 @@ def test_least_squares_with_equations_and_bounds():
     """Beside the best of all choices of unknowns that a bound holds."""
     rng = np.random.default_rng(5)
     for _ in range(40):
-        slopes, found, rows = rng.normal(size=(9, 5)), rng.normal(size=9), 7
+        partials, found, rows = rng.normal(size=(9, 5)), rng.normal(size=9), 7
         low, high = np.full(5, -np.inf), np.full(5, np.inf)
         low[:3], high[:3] = -rng.uniform(0.01, 0.2, 3), rng.uniform(0.01, 0.2, 3)
-        update, _, held = _bounded_update(slopes, found, rows, (low, high))
-        assert np.abs(slopes[rows:] @ update + found[rows:]).max() < 1e-12
+        update, _, held = _bounded_update(partials, found, rows, (low, high))
+        assert np.abs(partials[rows:] @ update + found[rows:]).max() < 1e-12
         assert (low <= update).all()
         assert (update <= high).all()
         assert ((update == low) | (update == high))[held].all()
@@ -384,10 +384,10 @@ def test_least_squares_with_equations_and_bounds():
             other = np.zeros(5)
             other[fixed] = [choice[k][k] for k in fixed]
             free = np.setdiff1d(np.arange(5), fixed)
-            other[free] = _equality_constrained_update(slopes[:, free], found + slopes @ other, rows)[0]
+            other[free] = _equality_constrained_update(partials[:, free], found + partials @ other, rows)[0]
             if (low <= other + 1e-12).all() and (other <= high + 1e-12).all():
-                best = min(best, float(np.linalg.norm(slopes[:rows] @ other + found[:rows])))
-        assert np.linalg.norm(slopes[:rows] @ update + found[:rows]) == pytest.approx(best, rel=1e-10)
+                best = min(best, float(np.linalg.norm(partials[:rows] @ other + found[:rows])))
+        assert np.linalg.norm(partials[:rows] @ update + found[:rows]) == pytest.approx(best, rel=1e-10)
 
 
 @cache

@@ -53,22 +53,22 @@ def test_the_hessian_of_a_function_of_all_states(stepper, save_every):
     run = run_from(stepper, START, save_every=save_every)
     weights, bends = square(len(run))
 
-    def slopes(run):
+    def partials(run):
         return weights + np.einsum("nij,nj->ni", bends, states_of(run))
 
     columns = []
     for unit in np.eye(len(START)):
         ends = [
-            stacked(r.pullback(slopes(r)))
+            stacked(r.pullback(partials(r)))
             for r in (run_from(stepper, START + s * 1e-4 * unit, save_every=save_every) for s in (1, -1, 2, -2))
         ]
         columns.append((8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4)
     expected = np.array(columns).T
-    product = run.hessian_product(slopes(run), np.eye(stepper._input_size), bends)
+    product = run.hessian_product(partials(run), np.eye(stepper._input_size), bends)
     found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
     assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     assert_allclose(found, found.T, atol=1e-13 * np.abs(found).max())
-    one = run.hessian_product(slopes(run), [0.5, -2.0], bends)
+    one = run.hessian_product(partials(run), [0.5, -2.0], bends)
     assert_allclose(stacked(one), found[:, :2] @ [0.5, -2.0], rtol=1e-11, atol=1e-11)
 
 
@@ -115,10 +115,10 @@ def test_the_energy_of_a_motion_at_its_end_bends_as_at_its_start():
     stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
     m, length, g = stepper.defaults
-    slopes, bends = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
-    slopes[-1] = m * g * length * np.sin(run.q[-1, 0]), run.p[-1, 0] / (m * length**2)
+    partials, bends = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
+    partials[-1] = m * g * length * np.sin(run.q[-1, 0]), run.p[-1, 0] / (m * length**2)
     bends[-1] = np.diag([m * g * length * np.cos(run.q[-1, 0]), 1 / (m * length**2)])
-    found = run.hessian_product(slopes, np.eye(2), bends)
+    found = run.hessian_product(partials, np.eye(2), bends)
     assert_allclose(found.q, [[m * g * length * np.cos(2.0), 0.0]], atol=1e-7)
     assert_allclose(found.p, [[0.0, 1 / (m * length**2)]], atol=1e-7)
 

@@ -61,11 +61,11 @@ def test_stiff_bonds_at_rest_do_not_shorten_the_steps():
     velocity = np.stack([np.zeros(count), np.repeat(np.sin(np.arange(count // 2) / 3.0), 2) / 10], axis=1)
     data = {"tables": {"bonds": chain}, "parameters": {"k": k}}
     newton = sc.compile_indexed(molecules(), "svi:4", solver="newton")
-    sweeps = sc.compile_indexed(molecules(), "svi:4")
+    iterations = sc.compile_indexed(molecules(), "svi:4")
     with pytest.raises(StepFailedError, match="solver='newton'"):
-        sweeps.integrate(start, velocity=velocity, h=0.05, steps=1, **data)
+        iterations.integrate(start, velocity=velocity, h=0.05, steps=1, **data)
     run = newton.integrate(start, velocity=velocity, h=0.05, steps=20, **data)
-    exact = sweeps.integrate(start, velocity=velocity, h=0.001, steps=1000, save_every=1000, **data)
+    exact = iterations.integrate(start, velocity=velocity, h=0.001, steps=1000, save_every=1000, **data)
     assert np.abs(run.q["r"][-1] - exact.q["r"][-1]).max() < 1e-6
     assert run.energy_error() < 1e-9
     assert run.iterations < 6 * run.steps

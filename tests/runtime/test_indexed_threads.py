@@ -64,8 +64,8 @@ def plane(u: Any) -> Any:
 
 
 def pairs(q: Any) -> Any:
-    slopes = np.sin(q[:, None] - q[None, :]) / len(q)
-    return slopes.sum(axis=1)
+    partials = np.sin(q[:, None] - q[None, :]) / len(q)
+    return partials.sum(axis=1)
 
 
 def transposed(u: Any) -> Any:

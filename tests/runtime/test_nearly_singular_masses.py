@@ -30,13 +30,13 @@ def stepper(cart):
 def angle_alone():
     """The angle at the end: the momentum along x is 0, which leaves one coordinate and its equation."""
 
-    def slope(t, state):
+    def derivative(t, state):
         angle, rate = state
         part = 1.0 / (1.0 + LIGHT)
         mass = 1.0 - part * np.cos(angle) ** 2
         return rate, -np.sin(angle) * (9.81 + part * np.cos(angle) * rate**2) / mass
 
-    return solve_ivp(slope, (0.0, SPAN), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
+    return solve_ivp(derivative, (0.0, SPAN), (1.0, 0.0), method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
 
 
 @pytest.mark.parametrize("method", ["svi:8", "scvi:4"])

@@ -99,7 +99,7 @@ def test_derivatives_by_all_that_a_step_starts_from(name):
     assert np.array_equal(found.state, stepper.jacobian(q, p, h, T, stepper.defaults))
 
 
-def bent(stepper, q, p, h, t, weights):
+def curvature(stepper, q, p, h, t, weights):
     """(given, given) second derivatives of weights . (q1, p1) of a step."""
     size, starts = stepper._input_size, Starts.chain(q, p, np.array([t]), np.array([h]))
     changes, vectors = np.zeros((2, size, size)), np.zeros((2, 2, size, size))
@@ -127,7 +127,7 @@ def test_second_derivatives_by_all_that_a_step_starts_from(name):
     case, stepper, q, p, h = given(name)
     rng, start = np.random.default_rng(7), np.array([*q, *p, *stepper.defaults, T, h])
     weights = rng.normal(size=2 * len(q))
-    found = bent(stepper, q, p, h, T, weights)
+    found = curvature(stepper, q, p, h, T, weights)
     sizes = 1.0 / np.sqrt(np.maximum(np.abs(found).max(axis=1), 1e-6 * np.abs(found).max()))
     scaled = sizes[:, np.newaxis] * found * sizes
     tolerance = SECOND_BOUND if case.system.constraints else SECOND
@@ -186,8 +186,8 @@ def test_runs_tell_how_their_states_depend_on_all_they_started_from():
             moved[k] += steps * width
             other = stepper.integrate(moved[:1], moved[1:2], parameters=moved[2:-2], t=moved[-2], h=moved[-1], steps=60)
             ends.append(np.concatenate([other.q, other.p], axis=1))
-        slope = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * width)
-        assert_allclose(columns[:, :, k], slope, atol=1e-6 * np.abs(slope).max() + 1e-9)
+        derivative = (8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12 * width)
+        assert_allclose(columns[:, :, k], derivative, atol=1e-6 * np.abs(derivative).max() + 1e-9)
     assert_allclose(found.state, run.tangent(), rtol=0, atol=1e-15)
 
 

@@ -470,10 +470,10 @@ def test_the_discrete_lagrangian_is_the_quadrature_along_the_oracles_curve(sampl
     def along(middle):
         return oracle.action(case.mechanics, t, np.vstack([q[None], middle, q1[None]]), h, nodes, c, w)
 
-    def slope(middle):
+    def derivative(middle):
         return oracle.central(lambda x: along(x[None]), middle, "1e-12")
 
-    middle = oracle.newton(slope, (q + q1) / 2, digits=20, width="1e-9")[None]
+    middle = oracle.newton(derivative, (q + q1) / 2, digits=20, width="1e-9")[None]
     found = stepper.discrete_lagrangian(q.astype(float), q1.astype(float), 0.1, 0.3)
     assert found == pytest.approx(float(along(middle)), abs=1e-14)
 

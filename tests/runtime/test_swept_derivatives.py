@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from samples import sweep, tangle
+from samples import fixed_point, tangle
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
 from scvi_codegen.lowering import point_derivatives
@@ -44,19 +44,19 @@ def numbers_of(gradient):
 def test_sweeps_carry_what_factors_do(name):
     """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
     system, method, h = CASES[name]
-    swept, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
-    assert "vectors_by_iteration.h" in swept.derivatives.code
+    iterated, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
+    assert "vectors_by_iteration.h" in iterated.derivatives.code
     assert "vectors_by_iteration.h" not in factored.derivatives.code
-    random, m = np.random.default_rng(20261122), swept.dimension
+    random, m = np.random.default_rng(20261122), iterated.dimension
     q = np.array([0.9, -0.4, 0.1, 0.6, -0.8, 0.2, 0.5, -0.3, 0.4, 0.7])[:m]
-    p = swept.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
-    directions = random.normal(size=(swept._input_size, 9))
-    slopes = random.normal(size=(STEPS + 1, 2 * m, 2))
+    p = iterated.momentum(q, random.uniform(-0.4, 0.4, m) + (np.arange(m) == 1))
+    directions = random.normal(size=(iterated._input_size, 9))
+    partials = random.normal(size=(STEPS + 1, 2 * m, 2))
     found = []
-    for stepper in (swept, factored):
+    for stepper in (iterated, factored):
         run = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3)
         some = stepper.integrate(q, p, h=h, steps=STEPS, t=0.3, save_every=35)
-        gradient, other = run.pullback(slopes), some.pullback(slopes[::35])
+        gradient, other = run.pullback(partials), some.pullback(partials[::35])
         step = stepper.sensitivity(q, p, h, 0.3)
         columns = (step.state, step.parameters, step.t[:, np.newaxis], step.h[:, np.newaxis])
         found.append((np.hstack(columns), run.tangent(directions)[-1], numbers_of(gradient), numbers_of(other)))
@@ -85,10 +85,10 @@ def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
 
 def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch):
     system = problem("kepler").system
-    found = sweep(system, SVI(2))
-    slopes = point_derivatives.point_derivatives_of(system, found)
-    assert slopes is not None
-    monkeypatch.setattr(point_derivatives, "MOST_DERIVATIVES", slopes.count + len(slopes.given.entries) - 1)
+    found = fixed_point(system, SVI(2))
+    partials = point_derivatives.point_derivatives_of(system, found)
+    assert partials is not None
+    monkeypatch.setattr(point_derivatives, "MOST_DERIVATIVES", partials.count + len(partials.given.entries) - 1)
     assert point_derivatives.point_derivatives_of(system, found) is None
 
 

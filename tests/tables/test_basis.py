@@ -43,7 +43,7 @@ def polynomial(coefficients: list[Fraction], x: Fraction) -> Fraction:
     return sum((c * x**k for k, c in enumerate(coefficients)), Fraction(0))
 
 
-def slope(coefficients: list[Fraction], x: Fraction) -> Fraction:
+def derivative(coefficients: list[Fraction], x: Fraction) -> Fraction:
     return sum((k * c * x ** (k - 1) for k, c in enumerate(coefficients) if k), Fraction(0))
 
 
@@ -60,9 +60,9 @@ def test_tables_reproduce_polynomials_on_any_points(
     values = tuple(number(polynomial(coefficients, x)) for x in points)
     for table, exact in [
         (cardinal_values(points, at), [polynomial(coefficients, t) for t in at]),
-        (cardinal_derivatives(points, at), [slope(coefficients, t) for t in at]),
+        (cardinal_derivatives(points, at), [derivative(coefficients, t) for t in at]),
         (cardinal_integrals(points, at, start), [integral(coefficients, start, t) for t in at]),
-        (differentiation_matrix(points), [slope(coefficients, x) for x in points]),
+        (differentiation_matrix(points), [derivative(coefficients, x) for x in points]),
         (extrapolation(points, start), [polynomial(coefficients, x + start) for x in points]),
     ]:
         scale = 1 + max(abs(entry) for row in table for entry in row) * max(map(abs, values))
@@ -112,11 +112,11 @@ def test_the_differentiation_matrix_is_equation_11_on_descending_points(N: int) 
 def test_degree_thirty_keeps_fifty_digits(nodes: object) -> None:
     points = nodes.points
     at = gauss_legendre(31).points
-    values, slopes = cardinal_values(points, at), cardinal_derivatives(points, at)
+    values, partials = cardinal_values(points, at), cardinal_derivatives(points, at)
     for power in (0, 1, 17, 30):
         f = tuple(x**power for x in points)
-        scale = max(abs(entry) for row in slopes for entry in row)
-        for x, ours, derivative in zip(at, apply(values, f), apply(slopes, f), strict=True):
+        scale = max(abs(entry) for row in partials for entry in row)
+        for x, ours, derivative in zip(at, apply(values, f), apply(partials, f), strict=True):
             assert abs(ours - x**power) < FIFTY_DIGITS
             assert abs(derivative - (power * x ** (power - 1) if power else 0)) < FIFTY_DIGITS * scale
         total = apply(cardinal_integrals(points, (1,), -1), f)[0]

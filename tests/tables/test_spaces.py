@@ -31,7 +31,7 @@ def final_error(system, method, start, *, h, steps, reference):
 
 
 @pytest.mark.parametrize(
-    ("space", "degree", "curve", "slope"),
+    ("space", "degree", "curve", "derivative"),
     [
         (Trigonometric(0.7), 2, lambda c: mp.sin(0.7 * c), lambda c: 0.7 * mp.cos(0.7 * c)),
         (Trigonometric(0.7), 5, lambda c: mp.cos(1.4 * c) - 1 + c, lambda c: 1 - 1.4 * mp.sin(1.4 * c)),
@@ -42,14 +42,14 @@ def final_error(system, method, start, *, h, steps, reference):
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_curves_of_the_space_are_reproduced(space, degree, curve, slope) -> None:
+def test_curves_of_the_space_are_reproduced(space, degree, curve, derivative) -> None:
     """From its velocities at the space's points each curve follows at any other, to 50 digits."""
     with mp.workdps(60):
         points = space.points(degree, gauss_legendre(degree + 2))
         assert len(points) == space.dimension(degree)
         at = tuple(mp.mpf(k) / 16 for k in range(17))
-        given = [slope(c) for c in points]
-        for lines, expected in ((space.velocities(points, at), slope), (space.positions(points, at), curve)):
+        given = [derivative(c) for c in points]
+        for lines, expected in ((space.velocities(points, at), derivative), (space.positions(points, at), curve)):
             for line, c in zip(lines, at, strict=True):
                 assert abs(mp.fdot(line, given) - expected(c)) < mp.mpf("1e-50")
 

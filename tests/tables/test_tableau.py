@@ -162,15 +162,15 @@ def test_the_order_is_that_of_the_error_of_one_step_on_a_nonlinear_equation(tabl
     exact = mp.odefun(f, 0, mp.mpf("0.7"), tol=mp.mpf("1e-45"))
 
     def defect(h: object) -> object:
-        y0, slopes = mp.mpf("0.7"), [mp.zero] * tableau.stages
+        y0, partials = mp.mpf("0.7"), [mp.zero] * tableau.stages
         for _ in range(60):
-            stages = [y0 + h * mp.fdot(row, slopes) for row in tableau.A]
-            slopes = [f(c * h, y) for c, y in zip(tableau.c, stages, strict=True)]
-        return abs(y0 + h * mp.fdot(tableau.b, slopes) - exact(h))
+            stages = [y0 + h * mp.fdot(row, partials) for row in tableau.A]
+            partials = [f(c * h, y) for c, y in zip(tableau.c, stages, strict=True)]
+        return abs(y0 + h * mp.fdot(tableau.b, partials) - exact(h))
 
     h = mp.mpf("1e-4")
-    slope = mp.log(defect(2 * h) / defect(h)) / mp.log(2)
-    assert abs(slope - (tableau.order + 1)) < 0.05
+    derivative = mp.log(defect(2 * h) / defect(h)) / mp.log(2)
+    assert abs(derivative - (tableau.order + 1)) < 0.05
 
 
 def test_textbook_tableaux() -> None:

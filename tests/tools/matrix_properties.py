@@ -440,8 +440,8 @@ def _velocity_of(case: Case, truth: Any, t: float, state: Any, values: dict[str,
     v = np.zeros(truth.m)
     for _ in range(2):  # momenta are affine in velocities
         given = (t, state[0], v, list(values.values()), truth._inputs(t))
-        slope = truth._block(*given)[: truth.m, : truth.m]
-        v = v + np.linalg.solve(slope, np.array(state[1]) - truth._p(*given).ravel())
+        derivative = truth._block(*given)[: truth.m, : truth.m]
+        v = v + np.linalg.solve(derivative, np.array(state[1]) - truth._p(*given).ravel())
     return tuple(v)
 
 
@@ -512,13 +512,13 @@ def derivatives(case: Case) -> None:
     columns = {f"{'qp'[i // m]} {i % m}": found.state[:, :, i] for i in range(2 * m)}
     columns |= {f"parameter {name}": found.parameters[:, :, i] for i, name in enumerate(case.stepper.parameters)}
     columns |= {"t": found.t, "h": found.h}
-    slopes = {f"{'qp'[i // m]} {i % m}": [*pulled.q, *pulled.p][i] for i in range(2 * m)}
-    slopes |= {f"parameter {name}": pulled.parameters[i] for i, name in enumerate(case.stepper.parameters)}
-    slopes |= {"t": pulled.t, "h": pulled.h}
+    partials = {f"{'qp'[i // m]} {i % m}": [*pulled.q, *pulled.p][i] for i in range(2 * m)}
+    partials |= {f"parameter {name}": pulled.parameters[i] for i, name in enumerate(case.stepper.parameters)}
+    partials |= {"t": pulled.t, "h": pulled.h}
     near(tangent, found.state, 1e-13)
     for name in names:
         near(columns[name], wanted[name], 1e-7)
-        near(slopes[name], np.sum(seeds * wanted[name]), 1e-6)
+        near(partials[name], np.sum(seeds * wanted[name]), 1e-6)
     one = case.stepper.sensitivity(run.q[0], run.p[0], case.h, case.given.t, case.parameters(), options=case.options)
     if case.given.save_every == 1:
         near(one.state, found.state[1], 1e-11)
@@ -552,7 +552,7 @@ def flows(case: Case) -> None:
     row = np.array([*run.q[0], *run.p[0], *run.parameters, case.given.t, case.h])
     x = np.array([1.001 * row, row])  # the second of two rows is what is compared
     kept, given = steps // save_every + 1, len(row)
-    change, slopes = (
+    change, partials = (
         np.random.default_rng(5).normal(size=(2, given)),
         np.random.default_rng(6).normal(size=(2, kept, 2 * m)),
     )
@@ -567,9 +567,9 @@ def flows(case: Case) -> None:
     near(states, np.concatenate([run.q, run.p], axis=1), 1e-12)
     near(states[:, :m], case.motion_to(steps).q(run.t), 10 * case.error)
     near(call(1, 1, change, (kept, 2 * m)), run.tangent(change[1]), 1e-9)
-    pulled = run.pullback(slopes[1])
+    pulled = run.pullback(partials[1])
     wanted = np.concatenate([pulled.q, pulled.p, pulled.parameters, [pulled.t, pulled.h]])
-    near(call(2, 1, slopes, (given,)), wanted, 1e-9)
+    near(call(2, 1, partials, (given,)), wanted, 1e-9)
 
 
 def reactions(case: Case) -> None:

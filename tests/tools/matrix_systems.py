@@ -115,9 +115,9 @@ class Truth:
             )
             G = g.jacobian(q) if len(g) else sympy.zeros(0, len(q))
             turning = (G * x + g.diff(t)) if len(g) else sympy.zeros(0, 1)
-            bent = turning.jacobian(q) * x + turning.diff(t) if len(g) else sympy.zeros(0, 1)
+            curvature = turning.jacobian(q) * x + turning.diff(t) if len(g) else sympy.zeros(0, 1)
             block = sympy.Matrix(sympy.BlockMatrix([[p.jacobian(x), -G.T], [G, sympy.zeros(len(g))]]))
-            self._block, self._right = function(block), function(sympy.Matrix([*force, *(-bent)]))
+            self._block, self._right = function(block), function(sympy.Matrix([*force, *(-curvature)]))
             rate = None
         self._rate = function(rate[0]) if rate else None
         self._p, self._v, self._energy, self._f = map(function, (p, v, energy, f))

@@ -30,7 +30,7 @@ def lowered(system: MechanicalSystem, method: Method) -> Program:
     return lower(system, method, discretise(system, method), prefix="p")
 
 
-def sweep(system: MechanicalSystem, method: Method) -> FixedPointIteration | None:
+def fixed_point(system: MechanicalSystem, method: Method) -> FixedPointIteration | None:
     """The fixed-point iteration, if there is one."""
     return iteration_of(system, discretise(system, method))
 

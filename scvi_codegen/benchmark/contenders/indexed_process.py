@@ -45,11 +45,11 @@ def _one_size(method: str, name: str, size: int) -> str:
 def _operations(program: IndexedProgram, iterations_before: float) -> float:
     """Return arithmetic operations per coordinate and step: of kernels, and of the products with tables."""
     force = sum(_counted(each.kernel) for each in program.forces)
-    if program.sweep is None:
+    if program.fixed_point is None:
         drifts = program.splitting.drifts if program.splitting is not None else ()
         return sum(map(bool, drifts)) * (force + 4)  # a kick and a drift are each a product and a sum
-    points = program.sweep.points
-    return (iterations_before + program.sweep.final_iterations) * points * (force + 2 * points)
+    points = program.fixed_point.points
+    return (iterations_before + program.fixed_point.final_iterations) * points * (force + 2 * points)
 
 
 def _bytes(program: IndexedProgram, iterations_before: float) -> float:
@@ -59,9 +59,9 @@ def _bytes(program: IndexedProgram, iterations_before: float) -> float:
     writes positions; a leapfrog step sums increments from positions, then reads momenta, positions and both increments,
     and writes two arrays.
     """
-    if program.sweep is None:
+    if program.fixed_point is None:
         return 8.0 * len(program.splitting.drifts if program.splitting else ()) * (3 + 7)
-    return 8.0 * (iterations_before + program.sweep.final_iterations) * (7 * program.sweep.lanes + 3)
+    return 8.0 * (iterations_before + program.fixed_point.final_iterations) * (7 * program.fixed_point.lanes + 3)
 
 
 def _counted(kernel: Kernel) -> int:

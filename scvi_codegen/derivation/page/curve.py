@@ -176,8 +176,8 @@ def kronecker_form(method: SpectralCollocation) -> Iterator[Paragraph | Formula]
         "and what belongs to the nodes one below the other:"
     )
     if method.form == "position":
-        slopes = KroneckerProduct(A**2, Identity(m)) * Q + KroneckerProduct(a0, v0) + KroneckerProduct(A * a0, q0)
-        yield Formula(rates, slopes, "18")
+        partials = KroneckerProduct(A**2, Identity(m)) * Q + KroneckerProduct(a0, v0) + KroneckerProduct(A * a0, q0)
+        yield Formula(rates, partials, "18")
         yield Paragraph("where the accelerations on the right solve the Euler-Lagrange equations at the nodes.")
     else:
         once = KroneckerProduct(A, Identity(m))

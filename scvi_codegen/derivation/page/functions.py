@@ -26,7 +26,7 @@ from scvi_codegen.rendering.outline import Function, reached
 
 __all__ = ["functions_section"]
 
-OPENED = re.compile(r"\w+_advance|solve|sweep|newton|evaluate")
+OPENED = re.compile(r"\w+_advance|solve|fixed_point|newton|evaluate")
 """Functions that are unfolded: the loop over the steps, and the solvers of the stages."""
 LANE_FUNCTION = re.compile(r"(lanes_)?inverse_root_\d|lanes_\w+")
 n, j = Symbol("n", integer=True), Symbol("j", integer=True)
@@ -70,8 +70,8 @@ def _formulas(name: str, system: MechanicalSystem, stages: StageSystem, program:
         yield from _compiled(system, stages)
     elif name == "newton":
         yield from _newton()
-    elif name == "sweep" and program.sweep is not None:
-        yield from SWEEPS[type(program.sweep)]
+    elif name == "fixed_point" and program.fixed_point is not None:
+        yield from ITERATIONS[type(program.fixed_point)]
     elif name == "gather":
         yield Formula(sympy.Sum(Symbol("table_j_n") * Symbol("z_j"), (j, 1, Symbol("B"))), Symbol("u_n"))
 
@@ -99,7 +99,7 @@ def _sum(coefficient: str, value: sympy.Expr) -> sympy.Expr:
     return sympy.Sum(Symbol(coefficient) * value, (j, 1, g))
 
 
-SWEEPS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
+ITERATIONS: dict[type[FixedPointIteration], tuple[Content, ...]] = {
     SeparableIteration: (
         Paragraph("Positions q_n at the points, F the forces L_q, M the constant masses; iterated to convergence:"),
         Formula(q + h * Symbol("c_n") * v0 + h**2 * _sum("a_n_j", inverse_mass * Symbol("F_j")), Symbol("q_n")),

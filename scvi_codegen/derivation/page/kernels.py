@@ -25,9 +25,9 @@ COUNTS = re.compile(r" Operations: .*$")
 def kernels_of(program: Program) -> tuple[Kernel, ...]:
     """Return every kernel of the C, each name once."""
     kernels = list(program.kernels)
-    if program.sweep:
-        kernels += program.sweep.kernels
-        kernels += [program.sweep.constant_mass] if program.sweep.constant_mass else []
+    if program.fixed_point:
+        kernels += program.fixed_point.kernels
+        kernels += [program.fixed_point.constant_mass] if program.fixed_point.constant_mass else []
     if program.splitting:
         kernels += program.splitting.kernels
     return tuple({kernel.name: kernel for kernel in kernels}.values())
@@ -91,14 +91,14 @@ def _pair(
     program: Program, kernel: Kernel, functions: Mapping[str, Function], names: Mapping[Symbol, Symbol]
 ) -> SideBySide:
     function = functions[kernel.name]
-    values, slopes = (
+    values, partials = (
         [
             Formula(formula.xreplace(names) if k < MOST_FORMULAS else formula, Symbol(f"{name}_{k}"))
             for k, formula in enumerate(all_formulas)
         ]
         for name, all_formulas in (
             ("value", kernel.formulas[: kernel.values]),
-            ("slope", kernel.formulas[kernel.values :]),
+            ("derivative", kernel.formulas[kernel.values :]),
         )
     )
     left: list[Content] = [Paragraph(COUNTS.sub("", function.comment))] if function.comment else []
@@ -106,6 +106,6 @@ def _pair(
         left.append(Formula(sympy.Tuple(*kernel.symbols).xreplace(names), Symbol("u")))
     if kernel.uses_parameters:
         left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
-    left += [*formulas(values, "value"), *formulas(slopes, "slope")]
+    left += [*formulas(values, "value"), *formulas(partials, "derivative")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
     return SideBySide(title=title, left=tuple(left), right=(lines(kernel_text(functions, kernel.name)),))

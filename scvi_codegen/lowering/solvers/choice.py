@@ -42,7 +42,7 @@ def iteration_of(system: MechanicalSystem, stages: StageSystem) -> FixedPointIte
     if system.constraints:
         return None
     problem = StepProblem(system, stages.shape)
-    return next((sweep for solver in FIXED_POINTS if (sweep := solver(problem)) is not None), None)
+    return next((fixed_point for solver in FIXED_POINTS if (fixed_point := solver(problem)) is not None), None)
 
 
 def check_solver(

@@ -71,16 +71,16 @@ def printed_iteration(problem: StepProblem) -> CollocationIteration | None:
 def _printed_ends(tableau: Tableau, rule: Quadrature, lanes: int) -> PrintedEnds:
     """Return the weights times the cardinal functions of the nodes at both ends, (34d) and (34e)."""
     nodes = (0, *tableau.c)
-    values, slopes = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_derivatives))
+    values, partials = (cardinals(nodes, rule.abscissae) for cardinals in (cardinal_values, cardinal_derivatives))
 
     def weighted(numbers: Iterable[Number]) -> tuple[Number, ...]:
         return pad_vector(tuple(w * x for w, x in zip(rule.unit_weights, numbers, strict=True)), lanes)
 
     return PrintedEnds(
         start_force=weighted(line[0] for line in values),
-        start_momentum=weighted(line[0] for line in slopes),
+        start_momentum=weighted(line[0] for line in partials),
         end_force=weighted(line[0] + line[-1] for line in values),
-        end_momentum=weighted(line[0] + line[-1] for line in slopes),
+        end_momentum=weighted(line[0] + line[-1] for line in partials),
     )
 
 
@@ -91,6 +91,6 @@ def _node_kernel(system: MechanicalSystem) -> Kernel:
         "applied_force_lanes",
         forms_of(system).applied_force,
         of=(*system.coordinates, *system.velocities),
-        slopes=forms_of(system).lower_mass.values(),
+        partials=forms_of(system).lower_mass.values(),
         purpose="L_q - L_vq v - L_vt and the lower triangle of L_vv at all nodes, u = (q, v).",
     )

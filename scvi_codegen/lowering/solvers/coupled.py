@@ -40,10 +40,10 @@ MOST_LINEARISED = 8
 def coupled_iteration(problem: StepProblem) -> CoupledIteration | None:
     """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
     system, tables = problem.lagrangian, velocity_tables(problem.shape)
-    return _sweep(system, tables) if system and tables else None
+    return _fixed_point(system, tables) if system and tables else None
 
 
-def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration | None:
+def _fixed_point(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration | None:
     points, blocks = len(tables.abscissae), len(tables.blocks)
     lanes = lane_count(max(points, blocks))
     if lanes > MOST_LANES:
@@ -52,7 +52,7 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration
     guess = predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables))
     forms, of = forms_of(system), (*system.coordinates, *system.velocities)
     followed = () if tables.projection else _linearised_forces(system)
-    evaluated = "L_q, L_v, their slopes F_q, F_v and L_vq" if followed else "L_q, L_v"
+    evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
     return CoupledIteration(
         points=points,
         blocks=blocks,
@@ -72,7 +72,7 @@ def _sweep(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration
             "point_lanes",
             (*forms.force, *forms.momentum, *followed),
             of=of,
-            slopes=forms.lower_mass.values(),
+            partials=forms.lower_mass.values(),
             purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
         ),
         force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),

@@ -19,9 +19,9 @@ from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, 
 
 __all__ = ["control_of", "control_of_iteration", "predictor_of"]
 
-RUNGS, REACH = 4, 2
+LEVELS_PER_BINADE, REACH = 4, 2
 """Levels per factor of two, and the largest change of level for which the predictor is available."""
-MANTISSAS = tuple(round(2.0 ** (k / RUNGS + 32)) / 2.0**32 for k in range(RUNGS))
+MANTISSAS = tuple(round(2.0 ** (k / LEVELS_PER_BINADE + 32)) / 2.0**32 for k in range(LEVELS_PER_BINADE))
 """Step sizes in one octave, rounded to 32 bits.
 
 In 53 bits the square of the root of 2 is 2 plus an ulp; the resulting rounding error of a product depends only on the
@@ -35,52 +35,61 @@ def control_of(program: Program) -> Control | None:
         return None
     return Control(
         mantissas=MANTISSAS,
-        predictor=predictor_of(program.sweep) if program.sweep else None,
-        stage_growth=2.0 ** (program.stage_curve.power / RUNGS) if program.stage_curve else 0.0,
+        predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
+        stage_growth=2.0 ** (program.stage_curve.power / LEVELS_PER_BINADE) if program.stage_curve else 0.0,
     )
 
 
-def control_of_iteration(sweep: FixedPointIteration) -> Control:
+def control_of_iteration(fixed_point: FixedPointIteration) -> Control:
     """Return the adaptive step-size control of a fixed-point iteration alone."""
-    return Control(mantissas=MANTISSAS, predictor=predictor_of(sweep))
+    return Control(mantissas=MANTISSAS, predictor=predictor_of(fixed_point))
 
 
-def predictor_of(sweep: FixedPointIteration) -> AdaptivePredictor:
+def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
     """Return the predictor tables of a fixed-point iteration."""
-    points, ratios = _doubles(sweep.guess.abscissae), [2.0 ** (change / RUNGS) for change in range(-REACH, REACH + 1)]
-    alone = _tables(sweep, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
+    points, ratios = (
+        _doubles(fixed_point.guess.abscissae),
+        [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)],
+    )
+    alone = _tables(fixed_point, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
     for ratio in ratios:
         sources = (*points, *((x - 1.0) / ratio for x in points))
         most = min(len(set(sources)) - 1, max(2 * len(points) - 2, INTERPOLATED), DEGREE_OF_TWO)
-        pairs.append(_tables(sweep, ratios, sources, most, (1.0, ratio)))
+        pairs.append(_tables(fixed_point, ratios, sources, most, (1.0, ratio)))
     return AdaptivePredictor(
         reach=REACH,
         alone=tuple(table for (table,) in alone),
         last=tuple(tuple(last for last, _ in line) for line in pairs),
         before=tuple(tuple(before for _, before in line) for line in pairs),
-        growth=2.0 ** (sweep.error_power / RUNGS),
+        growth=2.0 ** (fixed_point.error_power / LEVELS_PER_BINADE),
     )
 
 
 def _tables(
-    sweep: FixedPointIteration, ratios: Sequence[float], sources: Sequence[float], degree: int, ages: Sequence[float]
+    fixed_point: FixedPointIteration,
+    ratios: Sequence[float],
+    sources: Sequence[float],
+    degree: int,
+    ages: Sequence[float],
 ) -> list[list[NumberTable]]:
     """Return, for each ratio of the next step size to the last, a table for each step that the sources belong to.
 
     ``ages``: the ratio of the last step size to each of these, by which stored values h a are scaled.
     """
-    points = _doubles(sweep.guess.abscissae)
-    through = tuple(map(_doubles, sweep.predictor_matrix))
+    points = _doubles(fixed_point.guess.abscissae)
+    through = tuple(map(_doubles, fixed_point.predictor_matrix))
     count = len(points)
     rows = least_squares(sources, [1.0 + ratio * x for ratio in ratios for x in points], degree)
     tables = []
     for k, ratio in enumerate(ratios):
-        scales = [ratio * age if sweep.kept is StoredValues.ACCELERATIONS else 1.0 for age in ages]
+        scales = [ratio * age if fixed_point.kept is StoredValues.ACCELERATIONS else 1.0 for age in ages]
         part = rows[k * count : (k + 1) * count]
         tables.append(
             [
-                _padded([[scale * x for x in row[n * count : (n + 1) * count]] for row in part], through, sweep.lanes)
+                _padded(
+                    [[scale * x for x in row[n * count : (n + 1) * count]] for row in part], through, fixed_point.lanes
+                )
                 for n, scale in enumerate(scales)
             ]
         )

@@ -33,9 +33,9 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     forms, tables = forms_of(system), velocity_tables(stages.shape)
     if not system.constraints or any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
         return None
-    slopes = list(constraint_jacobian(system))
+    partials = list(constraint_jacobian(system))
     at: dict[int, list[int]] = {}
-    for e, (_, i) in enumerate(slopes):
+    for e, (_, i) in enumerate(partials):
         at.setdefault(i, []).append(e)
     products = tuple((e, f) for own in at.values() for e in own for f in own)
     position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
@@ -43,7 +43,7 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
         force=system_kernel(system, "constrained_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
         mass=system_kernel(system, "constrained_mass", forms.mass.values(), of=(), purpose="The constant masses."),
         products=products,
-        entries=tuple((slopes[e][0], slopes[f][0]) for e, f in products),
+        entries=tuple((partials[e][0], partials[f][0]) for e, f in products),
         abscissae=lower_vector(tables.abscissae),
         weights=lower_vector(tables.end_momentum),
         position=lower_matrix(transpose(position)),

@@ -45,10 +45,10 @@ def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> Se
         tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)
     else:
         tables = velocity_tables(shape.unrounded or shape if isinstance(shape, Velocities) else None)
-    return _sweep(system, tables, velocities=velocities) if tables else None
+    return _fixed_point(system, tables, velocities=velocities) if tables else None
 
 
-def _sweep(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableIteration | None:
+def _fixed_point(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableIteration | None:
     lanes = lane_count(len(tables.abscissae))
     if lanes > MOST_LANES:
         return None

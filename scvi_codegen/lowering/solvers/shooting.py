@@ -56,13 +56,13 @@ def shooting_iteration(problem: StepProblem) -> ShootingIteration | None:
 def _node_kernel(system: MechanicalSystem) -> Kernel:
     """Return the kernel of E, (m . E)_q, (m . E)_v and the lower triangle of the mass."""
     forms, state = forms_of(system), (*system.coordinates, *system.velocities)
-    slopes = gradient(forms.multiplied_residual, state)
+    partials = gradient(forms.multiplied_residual, state)
     adjoint = sum(forms.multiplied_forces[:2], ()) or (S.Zero,) * len(state)
     return system_kernel(
         system,
         "node_lanes",
-        (*forms.euler_lagrange, *(slopes.get(i, S.Zero) + force for i, force in enumerate(adjoint))),
+        (*forms.euler_lagrange, *(partials.get(i, S.Zero) + force for i, force in enumerate(adjoint))),
         of=(*state, *accelerations(system), *multipliers(system)),
-        slopes=forms.lower_mass.values(),
+        partials=forms.lower_mass.values(),
         purpose="E, (m . E)_q, (m . E)_v and the lower triangle of L_vv at all nodes, u = (q, v, a, m).",
     )

@@ -48,8 +48,8 @@ class _ForceTerms:
 def _force_terms(system: IndexedSystem) -> Iterator[_ForceTerms]:
     for term in system.potentials:
         moved = [(slot, access) for slot, access in term.slots if access.array in system.state]
-        slopes = gradient(term.formula, [slot for slot, _ in moved])
-        entries = tuple((access, slopes.get(k, S.Zero)) for k, (_, access) in enumerate(moved))
+        partials = gradient(term.formula, [slot for slot, _ in moved])
+        entries = tuple((access, partials.get(k, S.Zero)) for k, (_, access) in enumerate(moved))
         yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
     for force in system.forces:
         yield _ForceTerms(force.targets, tuple(slot for slot, _ in force.slots))
@@ -88,7 +88,7 @@ def _whole(component: int) -> Place:
 def _shift(
     system: IndexedSystem, force_terms: _ForceTerms, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
-    parts = [slope for access, slope in force_terms.entries if _component(access, array, component)]
+    parts = [derivative for access, derivative in force_terms.entries if _component(access, array, component)]
     return parts, _symbols(system, force_terms)
 
 
@@ -126,13 +126,13 @@ def _rotated_terms(
     parts: list[Expr] = []
     known = _symbols(system, force_terms)
     for (array, last), (other, by), sign in pairs:
-        for access, slope in force_terms.entries:
+        for access, derivative in force_terms.entries:
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
             places = access.places if by is None else (*access.places[:-1], by)
             partner = symbol(str(Access(array=other, places=places)))
             known += [] if partner in known else [partner]
-            parts.append(sign * partner * slope)
+            parts.append(sign * partner * derivative)
     return parts, known
 
 

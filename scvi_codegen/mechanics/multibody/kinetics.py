@@ -110,9 +110,9 @@ def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, .
     partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
     found = {}
     for i in {column for _, column in (*partial, *pulls)}:
-        slopes = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
-        changes = [variables.rate(slope) for slope in slopes]
-        turned = Matrix(slopes).cross(Matrix(motion.axes))
+        partials = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
+        changes = [variables.rate(derivative) for derivative in partials]
+        turned = Matrix(partials).cross(Matrix(motion.axes))
         found[i] = tuple(changes[a] - pulls.get((a, i), sympy.S.Zero) - turned[a] for a in range(3))
     return found
 
@@ -129,6 +129,6 @@ def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variable
     for place, vector in loads:
         velocity = place.vel(frame) if hasattr(place, "vel") else place.ang_vel_in(frame)
         force = [variables.read(component) for component in vector.to_matrix(frame)]
-        for (a, i), slope in jacobian(_components(place, velocity, frame, variables), variables.v).items():
-            terms[i].append(force[a] * slope)
+        for (a, i), derivative in jacobian(_components(place, velocity, frame, variables), variables.v).items():
+            terms[i].append(force[a] * derivative)
     return tuple(sympy.Add(*row) for row in terms)

@@ -72,7 +72,7 @@ class Variables:
         """Return d/dt of a function of coordinates and time."""
         flow = dict(zip(self.x, self.v, strict=True)) | {self.time: sympy.S.One}
         along = tuple(flow)
-        return sympy.Add(*(slope * flow[along[j]] for j, slope in gradient(function, along).items()))
+        return sympy.Add(*(derivative * flow[along[j]] for j, derivative in gradient(function, along).items()))
 
 
 def _symbol(function: Expr) -> Symbol:

@@ -47,8 +47,8 @@ def array_forces(
         values |= {slot: q[places[:, k]] for k, slot in enumerate(term_group.slots)}
         for symbol, column in zip(term_group.given, term_group.values, strict=True):
             values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
-        for k, slope in enumerate(term_group.slopes):
-            np.add.at(force, places[:, k], array_value(slope, values) + np.zeros((len(places), count)))
+        for k, derivative in enumerate(term_group.partials):
+            np.add.at(force, places[:, k], array_value(derivative, values) + np.zeros((len(places), count)))
     return list(force)
 
 
@@ -59,7 +59,7 @@ def exact_forces(
     force: list[Number] = [mp.zero] * len(coordinates)
     for term_group in families:
         shared_symbols = [symbol for symbol in known if symbol not in coordinates]
-        tape = Tape(term_group.slopes, (*term_group.slots, *term_group.given, *shared_symbols))
+        tape = Tape(term_group.partials, (*term_group.slots, *term_group.given, *shared_symbols))
         shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
         for row, *given in zip(term_group.places, *term_group.values, strict=True):
             for x in given:

@@ -112,7 +112,7 @@ class _Search:
 
     def __init__(self, motion: Rates, columns: Sequence[Column]) -> None:
         self.motion, self.columns = motion, columns
-        self.slopes: dict[int, dict[int, Expr]] = {}
+        self.partials: dict[int, dict[int, Expr]] = {}
         self.drawn: dict[Symbol, Array] = {}
 
     def null_spaces(self, chosen: Sequence[int], count: int) -> list[Array | None]:
@@ -157,10 +157,10 @@ class _Search:
                 for monomial, factor in column.items()
             ]
         state = (*self.motion.arguments[: len(self.motion.momenta)], *self.motion.momenta, self.motion.time)
-        if c not in self.slopes:
-            self.slopes[c] = gradient(column, state)
+        if c not in self.partials:
+            self.partials[c] = gradient(column, state)
         rates = (*sample.rates, 1.0)
-        return [sample.value(slope) * rates[i] for i, slope in self.slopes[c].items()] or [0.0 * sample.t]
+        return [sample.value(derivative) * rates[i] for i, derivative in self.partials[c].items()] or [0.0 * sample.t]
 
     def with_values(self, factors: Sequence[Expr]) -> list[tuple[Expr, Array]]:
         """Return factors with their values at the drawn parameters, without those that are 0 or undefined there."""

@@ -81,8 +81,8 @@ class ByHand:
 def by_hand() -> ByHand:
     """Return one step on the nodes -1, 0, 1: derivatives of the parabola through three values, applied twice."""
     curve = tau * (tau - 1) / 2 * q_k + (1 - tau**2) * Q_1 + tau * (tau + 1) / 2 * Q_2
-    velocities = _slopes(q_k, Q_1, Q_2)
-    accelerations = _slopes(v_0, *velocities)
+    velocities = _partials(q_k, Q_1, Q_2)
+    accelerations = _partials(v_0, *velocities)
     action = sum(
         h / 2 * ((2 / h * curve.diff(tau)) ** 2 / 2 + sympy.cos(curve)).subs(tau, point)
         for point in (-1 / sympy.sqrt(3), 1 / sympy.sqrt(3))
@@ -91,7 +91,7 @@ def by_hand() -> ByHand:
     return ByHand(curve, velocities, accelerations, residuals, action)
 
 
-def _slopes(start: sympy.Expr, middle: sympy.Expr, end: sympy.Expr) -> tuple[sympy.Expr, sympy.Expr]:
+def _partials(start: sympy.Expr, middle: sympy.Expr, end: sympy.Expr) -> tuple[sympy.Expr, sympy.Expr]:
     return (end - start) / h, (start - 4 * middle + 3 * end) / h
 
 
@@ -179,6 +179,6 @@ def multipliers_agree() -> bool:
     """Return True if the multipliers' terms are X dQ_1/dq_k and X dQ_1/dQ_2, the chain rule."""
     X, multipliers = sympy.Symbol("X", real=True), eliminated()
     return all(
-        sympy.simplify(lost.subs(multipliers) - X * slope) == 0
-        for lost, slope in zip(missing_terms(), middle_value().derivatives, strict=True)
+        sympy.simplify(lost.subs(multipliers) - X * derivative) == 0
+        for lost, derivative in zip(missing_terms(), middle_value().derivatives, strict=True)
     )

@@ -207,8 +207,8 @@ def _example() -> tuple[Block, ...]:
         ),
         Formula(middle_value().condition, sympy.Integer(0)),
         *(
-            Formula(slope, _after(sympy.Function("Q_1")(*_ends()), end))
-            for slope, end in zip(middle_value().derivatives, _ends(), strict=True)
+            Formula(derivative, _after(sympy.Function("Q_1")(*_ends()), end))
+            for derivative, end in zip(middle_value().derivatives, _ends(), strict=True)
         ),
         Paragraph(
             "For small h both are 1/2: move an end of the step, and the middle moves half as far. The printed "

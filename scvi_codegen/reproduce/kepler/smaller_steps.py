@@ -80,13 +80,13 @@ def _order(scheme: str, degree: int, e: float, quantity: str) -> float | None:
 
 
 def _h_refinement(name: str, quantities: tuple[str, ...], title: str, _: Mapping[str, Result]) -> Result:
-    checks = [_check_powers()] if "q1" in quantities else [_check_slopes(quantities[0])]
+    checks = [_check_powers()] if "q1" in quantities else [_check_partials(quantities[0])]
     return Result(
         name=name,
         title=title,
         setting=H_SETTING,
         checks=(*checks, _check_superior_h(quantities)),
-        tables=(_slopes_table(quantities), *(_h_table(quantity) for quantity in quantities)),
+        tables=(_partials_table(quantities), *(_h_table(quantity) for quantity in quantities)),
         picture=Picture(draw=partial(_draw_h, curves=_h_curves(quantities)), width=9.0, height=4.4 * len(quantities)),
     )
 
@@ -104,7 +104,7 @@ def _check_powers() -> Comparison:
         claim="The errors of q1 fall like h^2, h^4, h^6, h^8, h^12, those of q2 like h^3, h^5, h^7, h^10.",
         measured=(
             f"With N points: q1 {_listed(result['q1'])} and q2 {_listed(result['q2'])}; h^11 is a line of SVI with six "
-            f"points, whose order is 10. With N the degree: {_slopes_text('q1', 1)}; {_slopes_text('q2', 1)}."
+            f"points, whose order is 10. With N the degree: {_partials_text('q1', 1)}; {_partials_text('q2', 1)}."
         ),
         verdict=Verdict.PARTLY if 0 < same < len(drawn) else holds(same == len(drawn)),
     )
@@ -114,25 +114,25 @@ def _listed(powers: set[int]) -> str:
     return ", ".join(f"h^{power}" for power in sorted(powers))
 
 
-def _check_slopes(quantity: str) -> Comparison:
+def _check_partials(quantity: str) -> Comparison:
     """Return the check of the orders in both readings; an SVI conserves the momentum in any case."""
     e_and_degrees = [(e, degree(n)) for _, e, degree in READINGS for n in LEGEND]
     exact = all(_order("SVI", d, e, quantity) is None for e, d in e_and_degrees)
     faster = all((_order("SVI", d, e, quantity) or 99) > (_order("SC", d, e, quantity) or 0) for e, d in e_and_degrees)
     return Comparison(
         claim=f"The error of the {quantity} falls faster with h for SVI than for SC.",
-        measured=f"{_slopes_text(quantity, 0)} with N points; {_slopes_text(quantity, 1)} with N the degree.",
+        measured=f"{_partials_text(quantity, 0)} with N points; {_partials_text(quantity, 1)} with N the degree.",
         verdict=holds(exact if quantity == "momentum" else faster),
         bears_on=("accuracy",),
     )
 
 
-def _slopes_text(quantity: str, reading: int) -> str:
+def _partials_text(quantity: str, reading: int) -> str:
     _, e, degree = READINGS[reading]
     parts = []
     for scheme in SCHEMES:
         result = [_order(scheme, degree(n), e, quantity) for n in LEGEND]
-        powers = ", ".join("no error" if slope is None else f"{slope:.1f}" for slope in result)
+        powers = ", ".join("no error" if derivative is None else f"{derivative:.1f}" for derivative in result)
         parts.append(f"{scheme} {'no error' if not any(result) else powers}")
     return f"{quantity} {' and '.join(parts)}"
 
@@ -149,7 +149,7 @@ def _check_superior_h(quantities: tuple[str, ...]) -> Comparison:
     return superiority([shares_won(svi, sc) for svi, sc in pairs], otherwise=otherwise)
 
 
-def _slopes_table(quantities: tuple[str, ...]) -> TableBlock:
+def _partials_table(quantities: tuple[str, ...]) -> TableBlock:
     return TableBlock(
         columns=("reading", "N", "degree", "scheme", *(f"slope of {quantity}" for quantity in quantities)),
         rows=tuple(

@@ -25,8 +25,8 @@ STEP = 0.3
 SPAN = 2.4
 STEPS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 ABOVE_ROUNDOFF = 1e-13
-POINTS_OF_A_SLOPE = 3
-SLOPE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+POINTS_OF_A_RATE = 3
+DERIVATIVE_WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 WIDTH = 2e-3
 """Width of central differences of order six; round-off and truncation are then both near 1e-13."""
 
@@ -68,7 +68,7 @@ def symplecticity_defect(stepper: Stepper, q: Array, p: Array, h: float) -> floa
 
 def _jacobian(step: Callable[[Array], Array], state: Array) -> Array:
     columns = [
-        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in SLOPE_WEIGHTS.items())
+        sum(w / WIDTH * (step(state + k * unit) - step(state - k * unit)) for k, w in DERIVATIVE_WEIGHTS.items())
         for unit in np.eye(len(state)) * WIDTH
     ]
     return np.array(columns).T
@@ -77,9 +77,9 @@ def _jacobian(step: Callable[[Array], Array], state: Array) -> Array:
 def _order(stepper: Stepper) -> float:
     """Return the slope through the smallest errors that are above round-off."""
     errors = {steps: error for steps in STEPS if (error := _error(stepper, steps)) > ABOVE_ROUNDOFF}
-    smallest: Sequence[int] = sorted(errors)[-POINTS_OF_A_SLOPE:]
-    slope, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([errors[n] for n in smallest]), 1)
-    return float(slope)
+    smallest: Sequence[int] = sorted(errors)[-POINTS_OF_A_RATE:]
+    derivative, _ = np.polyfit(np.log([SPAN / n for n in smallest]), np.log([errors[n] for n in smallest]), 1)
+    return float(derivative)
 
 
 def _error(stepper: Stepper, steps: int) -> float:

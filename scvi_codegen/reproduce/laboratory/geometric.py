@@ -44,8 +44,8 @@ def fitted_line(n: Array, errors: Array) -> Line | None:
     used = within(errors)
     if np.count_nonzero(used) < LEAST:
         return None
-    slope, offset = np.polyfit(n[used], np.log(errors[used]), 1)
-    return float(np.exp(offset)), float(np.exp(slope))
+    derivative, offset = np.polyfit(n[used], np.log(errors[used]), 1)
+    return float(np.exp(offset)), float(np.exp(derivative))
 
 
 def is_straight(n: Array, errors: Array) -> bool:
