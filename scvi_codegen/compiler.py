@@ -3,7 +3,7 @@
     MechanicalSystem, Method
       -> discretise  StageSystem   points, kernel and tables: the equations of one step
                                    (:mod:`scvi_codegen.methods.discretise`)
-      -> iteration_of    Sweep         fixed-point iteration, if the system admits one; splitting_of: explicit splitting
+      -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
                                    (:mod:`scvi_codegen.lowering.solvers.choice`)
       -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
       -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)

@@ -1,7 +1,7 @@
 /* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
  * stationary form, with multipliers of the collocation equations). Requires: curve_points.h, the tables, the kernels
  * node_lanes and action_lanes. */
-#define ROUNDING_MARGIN 0.25 /* after one converged iteration, small changes are rounding errors and do not decrease */
+#define ROUNDING_MARGIN 0.25 /* after one converged iteration, variations are rounding errors and do not decrease */
 
 typedef struct {
   lanes weight; /* h w */

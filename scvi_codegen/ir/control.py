@@ -12,10 +12,10 @@ __all__ = ["AdaptivePredictor", "Control"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """Adaptive steps with sizes h = 2^(k / rungs), by fixed-point iteration or Newton's method; or a step density.
+    """Adaptive steps with sizes h = 2^(k / levels), by fixed-point iteration or Newton's method; or a step density.
 
     Attributes:
-        mantissas: 2^(k / rungs) for the levels of an octave.
+        mantissas: 2^(k / levels) for the levels of an octave.
         predictor: predictor of the fixed-point iteration, ``None`` without one.
         stage_growth: factor of the error estimate per level for Newton's method; 0 if there is no estimate.
         density: 1/g and -d(log g)/dt at (q, v), or (q, p) of a Hamiltonian, of a time transformation g; instead of the

@@ -78,7 +78,7 @@ class Derivatives:
             gradient of mu . phi along dy; ``None`` if phi is linear.
         damping: derivatives of the rate of a damping with respect to parameters.
         clock: of the time of a time-transformed system.
-        swept: if vectors are propagated by fixed-point iteration, too; ``None`` if only by Newton's factors.
+        iterated: if vectors are propagated by fixed-point iteration, too; ``None`` if only by Newton's factors.
         lanes: vectors that are propagated at a time.
     """
 

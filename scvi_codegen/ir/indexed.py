@@ -68,7 +68,7 @@ class IndexedProgram:
         parameter_names, parameter_defaults: of the numbers.
         forces, masses: loops.
         constants: terms of L, or of -H, without coordinates and momenta, which the energy needs.
-        sweep: the fixed-point iteration of one coordinate, whose tables serve all; ``forces`` are its kernels.
+        iteration: the fixed-point iteration of one coordinate, whose tables serve all; ``forces`` are its kernels.
         splitting: the kicks and drifts of an explicit method, instead.
         held: constrained steps, instead of both.
         control: adaptive steps, if requested.

@@ -99,7 +99,7 @@ class Program:
         momentum_maps: first integrals from symmetries.
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
             none.
-        sweep: the fixed-point iteration tried first, or ``None`` for Newton's method alone.
+        iteration: the fixed-point iteration tried first, or ``None`` for Newton's method alone.
         splitting: the explicit sequence that replaces both, or ``None``.
         newton: whether Newton's method is included.
         acts: whether the equations are those of a discrete Lagrangian, which Newton's method evaluates.

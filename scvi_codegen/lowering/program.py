@@ -53,7 +53,7 @@ def lower(
         system, method: the system and the method.
         stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
-        sweep: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.iteration_of`).
+        iteration: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.iteration_of`).
         splitting: the explicit solver that replaces both
             (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
         newton: whether Newton's method is included; with it the discrete Legendre transforms.

@@ -307,7 +307,7 @@ def model_text(model: Model) -> str | None:
         return None
 
 
-CONTROL = """By steps that choose their length, each with a relative error of `tolerance` (0: round-off), to `t_end`:
+CONTROL = """By adaptive steps, each with a relative error of `tolerance` (0: round-off), to `t_end`:
 
 ```c
 static ${prefix}_run run;

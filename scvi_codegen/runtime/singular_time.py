@@ -1,6 +1,6 @@
 """Detect a time transformation dt = g dtau whose g reaches zero, where a run would not terminate.
 
-Where g = 0 no number of steps of tau advances t. In transformed time rounding then decides the continuation, because
+Where g = 0 not a number of steps of tau advances t. In transformed time rounding then decides the continuation, because
 the constraint K = g (H - E) = 0 holds there for any energy.
 """
 

@@ -47,7 +47,7 @@ class Check:
 
     Attributes:
         name: short name.
-        promise: statement of the property; for an information, what its number means.
+        statement: statement of the property; for an information, what its number means.
         outcome: property holds, is violated, or was not measured; or an information without a property.
         measured: measured number, or ``None``.
         bound: bound on that number, or ``None``.

@@ -139,7 +139,7 @@ def _fallback(tested: SystemUnderTest) -> Finding | None:
                 iterations, end = _counted(tested, state, SolverOptions(max_iterations=most))
             except StepFailedError:
                 continue
-            if iterations <= most + 1:  # the sweeps converged
+            if iterations <= most + 1:  # the iterations converged
                 break
             expected = tested.derived()(state.q, state.p, state.h, state.t)
             return Finding(

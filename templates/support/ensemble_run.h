@@ -1,5 +1,5 @@
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, time.h, and
- * prepare_iteration and sweep of a solver, which compute the increments of a step. */
+ * prepare_iteration and iteration of a solver, which compute the increments of a step. */
 
 void NAME(start)(block_memory *block, double t, double h)
 {

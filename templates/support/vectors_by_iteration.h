@@ -1,6 +1,6 @@
 /* Tangent and adjoint vectors over steps that are solved by fixed-point iteration. Blocks of STEPS_AT_ONCE steps are
  * solved first, each with a predictor from the previous one; then the vectors are propagated, forward or backward.
- * Requires: vectors_by_newton.h, which takes over where an iteration fails; sweep, store_step, linearise_points,
+ * Requires: vectors_by_newton.h, which takes over where an iteration fails; iteration, store_step, linearise_points,
  * jvp_by_iteration and vjp_by_iteration, the iteration and its linearisation. */
 
 static double *stored_of(const propagation *over, long long k)

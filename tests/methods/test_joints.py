@@ -43,7 +43,7 @@ def test_a_dumbbell_flies_as_its_centre_and_turns_evenly():
     assert_allclose(-2 * 0.8 * run.multipliers()[:, 0], 0.75 * turning**2 * 0.8, atol=1e-9)
 
 
-@pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
+@pytest.mark.parametrize("hook_angle", [np.pi / 2, 0.7, 2.5])
 def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(hook_angle):
     hook = JOINTS.bent_pendulum()
     a, b = 0.6, 0.4

@@ -26,14 +26,12 @@ FRAGMENT = re.compile(
 """Beginning of a docstring that names nothing and tells to do nothing."""
 RETIRED_PHRASES = {
     r"choos\w+ (their|its) (own )?length|of their own lengths?": "adaptive step size",
-    r"steps of one length|steps of (length )?h\b": "fixed step size",
+    r"steps of one length": "fixed step size",
     r"lengths? of (a|the) steps?": "step size",
     r"\bladders?\b|\brungs?\b": "step-size grid, level",
     r"\bsweeps?\b|\bswept\b|\bsweeping\b": "fixed-point iteration",
     r"\bcom(e|es|ing) to rest\b": "converges",
-    r"\bslopes?\b": "derivatives, gradient, Jacobian",
     r"\bas good as nothing\b": "below machine precision",
-    r"\bstray(s|ed)?\b": "spurious solution",
     r"\bnearby motions?\b|\bsmall changes\b": "tangent vectors",
     r"\bpush and pull\b": "JVP and VJP",
     r"\bjoined by lines\b": "piecewise linear interpolation",
@@ -52,9 +50,9 @@ RETIRED_PHRASES = {
 RETIRED_NAMES = frozenset(
     re.findall(
         r"\w+",
-        "slope slopes sweep sweeps swept sweeping goal goals rung rungs ladder octave octaves crowd lent borrowed told "
-        "said bend bent stray strays strayed promise promises pace paces companions stretch portions gather_sums "
-        "expand_sums drive drive_ensemble solve_motion hold",
+        "slopes sweep sweeps swept sweeping goal goals rung rungs ladder octave octaves crowd lent borrowed told said "
+        "bent promise promises pace paces companions stretch portions gather_sums expand_sums drive_ensemble "
+        "solve_motion",
     )
 )
 """Words of identifiers that have a standard term; see the glossary of the documentation."""

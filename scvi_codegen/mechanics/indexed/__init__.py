@@ -1,1 +1,1 @@
-"""Indexed systems: Lagrangians and Hamiltonians that are sums over indices, with any number of coordinates."""
+"""Indexed systems: Lagrangians and Hamiltonians of arrays in index notation, of any size."""

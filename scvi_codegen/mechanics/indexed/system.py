@@ -1,4 +1,4 @@
-"""Indexed systems: Lagrangians that are sums over indices of few kinds of terms (lattices, fields, N bodies).
+"""Indexed systems: Lagrangians in index notation, of few kinds of terms (lattices, fields, N bodies).
 
     L = sum_f sum_(e in loops of f) l_f(array entries at e, parameters, t)
 
@@ -39,7 +39,7 @@ __all__ = ["INDEXED", "IndexedSystem"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexedSystem:
-    """Lagrangian or Hamiltonian as sums over indices, validated on construction: :meth:`from_text`, :meth:`from_sympy`.
+    """Lagrangian or Hamiltonian in index notation, validated on construction: :meth:`from_text`, :meth:`from_sympy`.
 
     Attributes:
         name: name of the system.

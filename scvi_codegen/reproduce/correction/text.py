@@ -170,7 +170,7 @@ def _consequences() -> tuple[Block, ...]:
             "This is even below the order of the collocation method itself. In full, nothing of this counts: the exact "
             "curve makes the action stationary, so the error of L_d is quadratic in that of the curve, h times "
             "(h^s)^2, and the order of the method is one less than that of L_d, that is 2s, if the quadrature (of "
-            "order 2g with g Gauss points) is as good. Theorem 4.1 promises the lower min(s, 2g); the corrected method "
+            "order 2g with g Gauss points) is as good. Theorem 4.1 states the lower min(s, 2g); the corrected method "
             "does better than promised, the printed one worse:"
         ),
         Formula(

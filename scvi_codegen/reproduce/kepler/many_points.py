@@ -78,7 +78,7 @@ def _figure_28(_: Mapping[str, Result]) -> Result:
     orbits = _orbits()
     turns = {form: [abs(orbits[form, g].turn) for g in GAUSS] for form in FORMS}
     precession = Comparison(
-        claim="With 5 Gauss points the orbit precesses and sweeps out an annulus; with 6 and 7 it does not visibly.",
+        claim="With 5 Gauss points the orbit precesses and fills an annulus; with 6 and 7 it does not visibly.",
         measured=(
             f"The perihelion turns by {_listed(turns[PRINTED])} rad a revolution as printed, by "
             f"{_listed(turns[VARIATIONAL])} in variational form: over 200 revolutions the annulus belongs to the "

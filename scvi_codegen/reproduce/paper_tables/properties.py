@@ -169,7 +169,7 @@ def _stability_check(result: Sequence[Properties]) -> Comparison:
 def _listed(stages: Sequence[int]) -> str:
     """Return stages as text: ``1, 3 stages``."""
     if not stages:
-        return "no number of stages"
+        return "unknown number of stages"
     return f"{', '.join(map(str, stages))} stage{'s' * (list(stages) != [1])}"
 
 
