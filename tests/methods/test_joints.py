@@ -43,15 +43,15 @@ def test_a_dumbbell_flies_as_its_centre_and_turns_evenly():
     assert_allclose(-2 * 0.8 * run.multipliers()[:, 0], 0.75 * turning**2 * 0.8, atol=1e-9)
 
 
-@pytest.mark.parametrize("hook_angle", [np.pi / 2, 0.7, 2.5])
-def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(hook_angle):
+@pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
+def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(bend):
     hook = JOINTS.bent_pendulum()
     a, b = 0.6, 0.4
-    places = [np.sin(np.pi - hook_angle), -np.cos(np.pi - hook_angle)]
+    places = [np.sin(np.pi - bend), -np.cos(np.pi - bend)]
     q = [0.0, -a, b * places[0], b * places[1] - a]
-    system = hook.system.with_parameters(hook_angle=hook_angle)
+    system = hook.system.with_parameters(bend=bend)
     run = ran(JOINTS.Mechanism(system, q, [2.0 * a, 0.0, -2.0 * q[3], 2.0 * q[2]]))
-    far = a**2 + b**2 - 2 * a * b * np.cos(hook_angle)
+    far = a**2 + b**2 - 2 * a * b * np.cos(bend)
     f = reduced(
         "(a**2 + far)*u0_dot**2/2 + g*(2*a*cos(u0) - b*cos(u0 - bend))",
         [0.0],
@@ -60,12 +60,12 @@ def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(hook_angle):
         a=a,
         b=b,
         far=far,
-        hook_angle=hook_angle,
+        bend=bend,
     )[:, 0]
-    hook = f + np.pi - hook_angle
+    bent = f + np.pi - bend
     middle = a * np.column_stack([np.sin(f), -np.cos(f)])
     assert_allclose(run.q[:, :2], middle, atol=1e-9)
-    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(hook), -np.cos(hook)]), atol=1e-9)
+    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(bent), -np.cos(bent)]), atol=1e-9)
 
 
 def test_a_point_slides_on_its_line():
