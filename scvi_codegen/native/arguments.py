@@ -57,7 +57,7 @@ def empty_array(shape: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         return np.empty(shape)
     except (MemoryError, ValueError) as error:
-        raise StateError(f"{shape[0]} states do not fit into the memory: keep fewer of them (every)") from error
+        raise StateError(f"{shape[0]} states do not fit into the memory: store fewer of them (save_every)") from error
 
 
 def checked_number(value: Any, name: str) -> float:
