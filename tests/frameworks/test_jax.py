@@ -280,5 +280,5 @@ def test_time_and_parameters_of_a_flow_of_several_pieces():
         flow(pumped.ROWS[0][:2], pumped.ROWS[0][2:4], t_end=3.0)
     with pytest.raises(ArgumentError, match=r"no 'velocity': use momenta, p = stepper.momentum"):
         flow(pumped.ROWS[0][:2], velocity=pumped.ROWS[0][2:4], h=0.1)
-    with pytest.raises(ArgumentError, match=r"no 't_end'.*steps of h"):
+    with pytest.raises(ArgumentError, match=r"no 't_end'.*fixed number of steps"):
         jax_flow(pumped.stepper(), t_end=3.0)

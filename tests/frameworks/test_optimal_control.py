@@ -150,7 +150,7 @@ def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
         ({"parameters": {"b": 1.0}}, StateError, "there is no parameter 'b'.* There are: a"),
         ({"guess": {"u_0": 1.0}}, StateError, "there is no coordinate or input 'u_0'"),
         ({"guess": {"q": [0.0, np.nan]}}, StateError, "the guess of q must be a finite number, or a list"),
-        ({"degree": 2}, MethodError, "take degree 1 at most"),
+        ({"degree": 2}, MethodError, "use degree 1 or less"),
         ({"method": RadauIIA(2)}, MethodError, "no quadrature"),
         ({"system": problem("kepler").system}, MethodError, "'Kepler problem' has no inputs"),
     ],

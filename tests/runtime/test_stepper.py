@@ -190,7 +190,10 @@ def test_bytes_of_another_length_are_refused(kepler):
         (([1.0, 0.0], [0.0, 1.0], np.nan), "the step size h is nan"),
         (([1.0, 0.0], [0.0, 1.0], np.inf), "the step size h is inf"),
         (([1.0, 0.0], [0.0, 1.0], "small"), "the step size h must be real numbers"),
-        (([1.0, 0.0], [0.0, 1.0], None), "the step size h must be real numbers"),
+        (
+            ([1.0, 0.0], [0.0, 1.0], None),
+            "the step size h must be real numbers|give either h .fixed step size. or t_end",
+        ),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"muu": 1.0}), "no parameter 'muu' among mu; did you mean 'mu'"),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, {"mu": np.inf}), "the parameter mu is inf"),
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, [1.0, 2.0]), r"parameters must have 1 values \(mu\), not 2"),
