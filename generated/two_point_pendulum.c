@@ -111,10 +111,11 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
   double u[4], value[4], derivative[4];
   quadrature_points(step, z, u);
   for (int n = 0; n < 2; n++) {
+    const double t = step->t;
     if (jacobian)
-      quadrature_slope(u + n * 2, step->t, step->parameters, value + n * 2, derivative + n * 2);
+      quadrature_slope(u + n * 2, t, step->parameters, value + n * 2, derivative + n * 2);
     else
-      quadrature_value(u + n * 2, step->t, step->parameters, value + n * 2);
+      quadrature_value(u + n * 2, t, step->parameters, value + n * 2);
   }
 
   /* (34d) = 0, with q1 = q0 + h sum_b END_POSITION[b]

@@ -155,12 +155,7 @@ def test_on_a_microcontroller(model, precision, tmp_path):
     assert abs(len(states) - 20) < 6
 
 
-LONG_LINE = pytest.mark.xfail(reason="one call in the C is 125 characters long", strict=True)
-
-
-@pytest.mark.parametrize(
-    "method", [SVI(4), pytest.param(StoermerVerlet(), marks=LONG_LINE)], ids=lambda method: method.name
-)
+@pytest.mark.parametrize("method", [SVI(4), StoermerVerlet()], ids=lambda method: method.name)
 def test_the_text_is_in_style(model, method, tmp_path):
     folder = generate_package(replace(model, method=method), tmp_path / "pushed")
     for path in [*folder.glob("*.[ch]"), folder / "support" / "inputs.h"]:
