@@ -170,7 +170,7 @@ class TestDegree:
         assert costs[4] > 1.8 * costs[8]
         assert achieved(system, advice, q, p, kepler_end(0.2, 200.0), 1.0) < tolerance
 
-    def test_the_choice_does_not_depend_on_the_clock(self, monkeypatch: pytest.MonkeyPatch):
+    def test_degree_choice_does_not_depend_on_timings(self, monkeypatch: pytest.MonkeyPatch):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         times = iter(np.random.default_rng(1).uniform(0.0, 1e9, 10_000).cumsum())
         monkeypatch.setattr("scvi_codegen.advice.pilot.time.perf_counter", lambda: next(times))
@@ -187,7 +187,7 @@ class TestDegree:
 
 
 class TestHonesty:
-    def test_advice_is_frozen_and_tells_its_evidence(self):
+    def test_advice_is_immutable_and_shows_its_evidence(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, SVI(6), q, p, 100.0, 1e-8)
         with pytest.raises(FrozenInstanceError):
@@ -210,13 +210,13 @@ class TestHonesty:
         advice = advise(chosen.system, SVI(8), chosen.q, p, 200.0, 1e-6)
         iterated.integrate(chosen.q, p, h=advice.h, steps=advice.steps, save_every=advice.steps)
 
-    def test_the_same_question_has_the_same_answer(self):
+    def test_equal_questions_give_equal_answers(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
         first, second = (advise(system, SVI(6), q, p, 1e4, 1e-8) for _ in range(2))
         assert (first.h, first.expected_error, first.warnings) == (second.h, second.expected_error, second.warnings)
 
     @pytest.mark.parametrize("span", [100.0, 2000.0, 50_000.0])
-    def test_a_tolerance_below_rounding_is_said_to_be(self, span: float):
+    def test_tolerance_below_rounding_is_reported(self, span: float):
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, SVI(8), q, p, span, 1e-17)
         assert any("round-off alone causes an error of about" in warning for warning in advice.warnings)
@@ -226,14 +226,14 @@ class TestHonesty:
 
     @pytest.mark.parametrize("method", [SVI(8), StoermerVerlet()], ids=name)
     @pytest.mark.parametrize("span", [50.0, 1000.0])
-    def test_chaos_is_said_to_be_hopeless(self, method: Method, span: float):
+    def test_chaos_is_reported_as_unpredictable(self, method: Method, span: float):
         entry = problem("double-pendulum")
         p = compile_stepper(entry.system, method).momentum(entry.q, entry.velocity)
         advice = advise(entry.system, method, entry.q, p, span, 1e-6)
         assert advice.expected_error > 1e-2
         assert any("chaos" in warning for warning in advice.warnings)
 
-    def test_chaos_in_a_run_longer_than_the_pilot_is_not_promised(self):
+    def test_chaos_beyond_the_pilot_run_is_not_certified(self):
         entry = problem("double-pendulum")
         p = compile_stepper(entry.system, StoermerVerlet()).momentum(entry.q, entry.velocity)
         advice = advise(entry.system, StoermerVerlet(), entry.q, p, 10.0, 1e-2)
@@ -262,12 +262,12 @@ class TestHonesty:
         message = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6).message
         assert float(re.search(r"grew like t\^(\d\.\d)", message)[1]) > 1.3  # type: ignore[index]
 
-    def test_a_motion_that_ends_is_said_to(self):
+    def test_trajectory_that_ends_is_reported(self):
         system = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
         with pytest.raises(StateError, match="may end in a singularity"):
             advise(system, Gauss(2), [1.0], [1.0], 10.0, 1e-6)
 
-    def test_far_too_long_steps_are_told(self):
+    def test_far_too_long_steps_are_reported(self):
         entry = problem("double-pendulum")
         p = compile_stepper(entry.system, SVI(8)).momentum(entry.q, entry.velocity)
         message = advise(entry.system, SVI(8), entry.q, p, 5.0, 1e-6).message
@@ -339,7 +339,7 @@ class TestCommandLine:
             assert message in result.stderr
 
 
-def test_nothing_symplectic_is_said_where_forces_act():
+def test_symplecticity_is_not_claimed_under_forces():
     kept = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
     damped = LagrangianSystem.from_text(
         name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", dissipation="q_dot**2/10"

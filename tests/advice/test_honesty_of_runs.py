@@ -48,7 +48,7 @@ class TestLongSteps:
     def test_short_ones_are_not(self, kepler):
         assert kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.05, steps=100).step_error < 1e-3
 
-    def test_a_run_says_it_once(self, kepler):
+    def test_warning_is_issued_once_per_run(self, kepler):
         going = kepler.start([0.4, 0.0], [0.0, 2.0], h=1.0)
         with pytest.warns(sc.AccuracyWarning):
             going.record(10)
@@ -69,7 +69,7 @@ class TestLongSteps:
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "scvi:2", "svi:3"])
     @pytest.mark.parametrize("h", [0.1, 0.02])
-    def test_nor_is_a_start_from_rest_at_the_origin(self, method, h):
+    def test_start_at_rest_at_the_origin_does_not_warn(self, method, h):
         """x = t sin(t) / 2: the first step is right to 2e-3 of its own way, which is a thousandth of the motion's."""
         run = sc.compile_stepper(PUSHED, method).integrate([0.0], [0.0], h=h, steps=round(20 / h), parameters=FORCED)
         assert np.abs(run.q[:, 0] - run.t * np.sin(run.t) / 2).max() < 0.1  # of 9
@@ -77,7 +77,7 @@ class TestLongSteps:
 
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
-    def test_nor_rest_at_the_origin_on_the_way(self, method):
+    def test_rest_at_the_origin_during_a_run_does_not_warn(self, method):
         """x = (3 sin(t) - sin(3 t)) / 8 rests at 0 whenever t is a multiple of pi."""
         run = sc.compile_stepper(PUSHED, method).integrate(
             [0.0], [0.0], h=0.1, steps=400, parameters={"a": 0.0, "b": 1.0}
@@ -85,7 +85,7 @@ class TestLongSteps:
         assert np.abs(run.q[:, 0] - (3 * np.sin(run.t) - np.sin(3 * run.t)) / 8).max() < 0.1
 
     @pytest.mark.filterwarnings("error")
-    def test_nor_a_state_that_is_pushed_late_or_step_by_step(self):
+    def test_late_or_stepwise_push_does_not_warn(self):
         held = sc.LagrangianSystem.from_text(
             name="held", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2 + u*x", inputs=["u"]
         )
@@ -98,7 +98,7 @@ class TestLongSteps:
         assert 0.0 < going.step_error[0] < 1e-3
 
     @pytest.mark.parametrize("method", ["svi:1", "svi:2", "svi:3", "svi:4"])
-    def test_a_blow_that_the_first_step_misjudges_is_said(self, method):
+    def test_impulse_misjudged_by_the_first_step_warns(self, method):
         """A flight goes on from it, whose way grows: the momentum is as wrong as ever."""
         blow = sc.LagrangianSystem.from_text(
             name="blow", coordinates=["x"], lagrangian="x_dot**2/2 + x*exp(-(t/0.03)**2)"
@@ -108,12 +108,12 @@ class TestLongSteps:
         assert abs(run.p[-1, 0] / (0.03 * math.sqrt(math.pi) / 2) - 1.0) > 1e-3
 
     @pytest.mark.parametrize("steps", [3, 30])
-    def test_a_motion_that_grows_from_the_origin_by_steps_too_long_is_said(self, steps):
+    def test_growth_from_the_origin_with_too_long_steps_warns(self, steps):
         unstable = sc.LagrangianSystem.from_text(name="unstable", coordinates=["x"], lagrangian="x_dot**2/2 + x**2/2")
         with pytest.warns(sc.AccuracyWarning, match="too large"):
             sc.compile_stepper(unstable, "svi:1").integrate([0.0], [1e-6], h=1.0, steps=steps)
 
-    def test_a_near_meeting_of_bodies_from_far_is_said(self):
+    def test_close_encounter_from_far_warns(self):
         """There positions are a fortieth of those before; momenta are the largest of all."""
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
@@ -122,7 +122,7 @@ class TestLongSteps:
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
     @pytest.mark.parametrize("method", ["svi:2", "svi:3"])
-    def test_sums_from_rest_at_the_origin_are_no_reason(self, method, solver):
+    def test_array_systems_from_rest_at_the_origin_do_not_warn(self, method, solver):
         chain = sc.IndexedSystem.from_text(
             name="pushed chain",
             coordinates=["x[N]"],
@@ -131,7 +131,7 @@ class TestLongSteps:
         run = sc.compile_indexed(chain, method, solver=solver).integrate(np.zeros(40), h=0.1, steps=200)
         assert 0.0 < run.step_error < 1e-4
 
-    def test_where_nothing_tells_it_that_is_said(self):
+    def test_missing_error_estimate_is_reported(self):
         verlet = sc.compile_stepper(sc.problem("kepler").system, sc.StoermerVerlet())
         trajectory = verlet.integrate([1.0, 0.0], [0.0, 1.0], h=0.1, steps=3)
         assert math.isnan(trajectory.step_error)
@@ -157,7 +157,7 @@ class TestAnotherRoot:
         ],
     )
     @pytest.mark.filterwarnings("error")
-    def test_is_refused_or_said(self, name, method, h, q, p):
+    def test_spurious_root_is_rejected_or_reported(self, name, method, h, q, p):
         """Energies that grew to 1e9 in three steps, status ok."""
         stepper = sc.compile_stepper(sc.problem(name).system, method)
         with pytest.raises((sc.StepFailedError, sc.AccuracyWarning)):
@@ -177,7 +177,7 @@ def pair():
 
 
 class TestLostEnergy:
-    def test_of_a_near_collision_is_said(self, kepler):
+    def test_energy_loss_in_a_near_collision_is_reported(self, kepler):
         """Each step keeps its tolerance; at the pericentre, 5e-7 from the centre, the speed is a thousandfold."""
         with pytest.warns(
             sc.AccuracyWarning, match=r"energy changed from -1 to \S+ although every step.*Reduce the tolerance"
@@ -187,7 +187,7 @@ class TestLostEnergy:
         assert abs(energy[-1] - energy[0]) > 1e-3
 
     @pytest.mark.filterwarnings("error")
-    def test_nothing_is_said_where_it_is_kept_or_need_not_be(self, kepler):
+    def test_no_report_if_energy_is_conserved_or_need_not_be(self, kepler):
         kepler.integrate([1.0, 0.0], [0.0, 1e-3], t_end=3.0)
         driven = sc.LagrangianSystem.from_text(
             name="driven", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2 + 5*q*sin(t)"
@@ -196,7 +196,7 @@ class TestLostEnergy:
         energy = run.energy()
         assert abs(energy[-1] - energy[0]) > 1.0
 
-    def test_of_a_trajectory_of_many_is_said(self, kepler):
+    def test_energy_loss_of_one_trajectory_of_an_ensemble_is_reported(self, kepler):
         """Of the one whose orbit is nearly a line; the other keeps its energy."""
         starts = [[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1e-3]]
         with pytest.warns(
@@ -211,7 +211,7 @@ class TestLostEnergy:
             ("stoermer-verlet", {"h": 0.01, "steps": 400}, "although the system conserves it.* Reduce h"),
         ],
     )
-    def test_of_sums_over_indices_is_said(self, pair, method, steps, message):
+    def test_energy_loss_of_array_systems_is_reported(self, pair, method, steps, message):
         """Two bodies that fall onto each other: the step jumps over where they meet."""
         with pytest.warns(sc.AccuracyWarning, match=rf"energy changed from -0.5\d* to \S+ {message}"):
             run = sc.compile_indexed(pair, method).integrate([[-0.987, 0.0], [1.0, 0.0]], **steps)
@@ -219,7 +219,7 @@ class TestLostEnergy:
 
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize("method", ["svi:8", "stoermer-verlet"])
-    def test_nothing_is_said_of_sums_that_keep_theirs(self, pair, method):
+    def test_array_systems_that_conserve_energy_are_not_reported(self, pair, method):
         steps = {"t_end": 4.0, "tolerance": 1e-6} if method == "svi:8" else {"h": 0.3, "steps": 60}
         start = {"q": [[-1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 0.5], [0.0, -0.5]]}
         sc.compile_indexed(pair, method).integrate(**start, **steps)
@@ -233,7 +233,7 @@ class TestPromises:
         assert refused.exit_code != 0
         assert re.search("use adaptive step size", refused.stderr)
 
-    def test_by_default_steps_choose_their_length(self):
+    def test_steps_are_adaptive_by_default(self):
         system = sc.problem("kepler").system
         motion = sc.solve_ivp(system, (0.0, 6.0 * math.pi), [*NEARLY_RADIAL[0], *NEARLY_RADIAL[1]])
         assert motion.success
@@ -263,7 +263,7 @@ class TestPromises:
         assert error < tolerance
         assert "a second run with other steps differs by" in missed_tolerance(problem.system, found, error / 5)
 
-    def test_an_estimate_that_is_too_small_hides_nothing(self):
+    def test_underestimated_errors_are_detected(self):
         """Where a second run is at hand: a step's error says nothing of how errors grow."""
         system = sc.problem("kepler").system
         trajectory = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0], [0.0, 1.2], h=0.2, steps=2000)
@@ -288,7 +288,7 @@ class TestPromises:
         assert missed_tolerance(damped, trajectory, 1e-9) == ""
         assert "energy" in missed_tolerance(sc.LagrangianSystem.from_text(**text), trajectory, 1e-9)
 
-    def test_it_is_withdrawn_aloud(self, monkeypatch):
+    def test_withdrawn_tolerance_is_reported(self, monkeypatch):
         for module in ("cli.commands.run", "advice.solve_ivp"):
             monkeypatch.setattr(f"scvi_codegen.{module}.missed_tolerance", lambda *_: "the tolerance is not kept")
         result = run("kepler --span 5 --advise 1e-6")
@@ -297,14 +297,14 @@ class TestPromises:
         motion = sc.solve_ivp(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6)
         assert (motion.success, motion.message) == (False, "the tolerance is not kept")
 
-    def test_a_tolerance_that_doubles_do_not_allow_is_said_before(self):
+    def test_tolerance_below_double_precision_is_reported_before_the_run(self):
         result = run("kepler --span 5 --tolerance 1e-30")
         assert result.exit_code == 0
         assert "Warning: tolerance 1e-30 is below double precision" in result.stderr
 
 
 class TestKnownDigits:
-    def test_they_are_right(self, kepler):
+    def test_correct_digits_are_correct(self, kepler):
         """Against a circle, with a step that leaves an error of 1e-7 or so."""
         trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=1.9, steps=60)
         known = known_digits(sc.problem("kepler").system, trajectory, most=10_000)
@@ -322,7 +322,7 @@ class TestKnownDigits:
         assert known.chaotic
         assert known.q.max() > 1e-4
 
-    def test_a_second_run_that_takes_too_long_is_given_up(self, kepler):
+    def test_slow_second_run_is_abandoned(self, kepler):
         trajectory = kepler.integrate([1.0, 0.0], [0.0, 1.0], h=0.5, steps=4000)
         assert known_digits(sc.problem("kepler").system, trajectory, most=10) is None
 
@@ -336,10 +336,10 @@ class TestKnownDigits:
             (0.1, 0.0, " 0.10000000000000001"),
         ],
     )
-    def test_are_printed(self, x, error, text):
+    def test_correct_digits_are_printed(self, x, error, text):
         assert in_known_digits(x, error) == text
 
-    def test_on_the_command_line(self):
+    def test_command_line_prints_correct_digits(self):
         said = run("kepler --steps 400").output
         assert "in the digits confirmed by a second run)" in said
         assert len(re.search(r"q1 =\s+(\S+)", said)[1]) < 17
@@ -347,7 +347,7 @@ class TestKnownDigits:
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(3))
-def test_wrong_steps_are_refused_or_said(seed):
+def test_wrong_steps_are_rejected_or_reported(seed):
     """Random states and lengths over the catalogue; the judge is the same step, cut by steps of their own lengths.
 
     A single step may be so long that the highest coefficient of its curve vanishes by chance: of 306 wrong ones 12 were
@@ -386,6 +386,6 @@ def _said_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.
 
 
 @pytest.mark.parametrize("other", [{"h": 0.1}, {"rtol": 1e-9}, {"monitor": "frequency"}])
-def test_a_promise_of_the_end_goes_with_no_other_steps(other):
+def test_confirmed_end_requires_default_steps(other):
     with pytest.raises(sc.StateError, match="give one"):
         sc.solve_ivp(sc.problem("kepler").system, (0.0, 5.0), [1.0, 0.0, 0.0, 1.0], tolerance=1e-6, **other)

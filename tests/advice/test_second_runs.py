@@ -62,7 +62,7 @@ def test_advice_is_of_the_parameters_and_the_time_given(driven):
     assert advise(driven, "svi:2", [0.75], [-0.5], SPAN, 1e-5).h > 1.5 * advice.h
 
 
-def test_a_lucky_end_is_not_the_error():
+def test_accidentally_small_final_error_is_not_the_error():
     apart = np.full((160, 1), 1e-3)
     apart[-1] = 1e-9
     assert 0.9e-3 < _final_error(apart)[0] < 1e-3
@@ -78,7 +78,7 @@ def test_chaos_is_growth_by_decades(span):
     assert _tenfold(1e-13 * (1.0 + 1e3 * share**2), span) == math.inf
 
 
-def test_a_chaotic_motion_is_known_as_such():
+def test_chaotic_trajectory_is_classified_as_chaotic():
     double = sc.problem("double-pendulum")
     stepper = sc.compile_stepper(double.system, "svi:4")
     found = {}
@@ -109,7 +109,7 @@ def of_promise(**more):
     ],
     ids=["kept", "just kept", "just broken", "doubt that a second run dispels", "worst step", "energy"],
 )
-def test_a_promise_is_held_against_the_end(known, more, words):
+def test_claimed_tolerance_is_compared_with_the_final_error(known, more, words):
     system = sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     regular, chaotic = (Known(q=np.array([known]), p=np.array([9.0]), tenfold=tenfold) for tenfold in (math.inf, 2.0))
     found = missed_tolerance(system, of_promise(**more), 1e-6, regular)
@@ -117,7 +117,7 @@ def test_a_promise_is_held_against_the_end(known, more, words):
     assert bool(missed_tolerance(system, of_promise(**more), 1e-6, chaotic)) == bool(more)
 
 
-def test_without_a_second_run_one_is_made_of_doubts_alone(driven, monkeypatch):
+def test_missing_second_run_is_made_if_the_estimate_is_doubtful(driven, monkeypatch):
     asked = []
     monkeypatch.setattr(tolerance_check, "known_digits", lambda system, run, *, most: asked.append(most))
     assert missed_tolerance(driven, of_promise(), 1e-6) == ""

@@ -82,7 +82,7 @@ def test_steps_of_a_reference_are_the_shortest_of_its_runs():
     assert third.sum() == 4.0
 
 
-def test_a_reference_takes_shorter_steps_where_long_ones_cannot_be_solved(monkeypatch):
+def test_reference_uses_smaller_steps_where_large_ones_fail(monkeypatch):
     asked = []
 
     def states_after(field, start, steps):

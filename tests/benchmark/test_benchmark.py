@@ -207,7 +207,7 @@ class TestReference:
         t = np.longdouble(10.1)
         assert np.abs(end[0] - [np.cos(t), -np.sin(t)]).max() < 2e-18
 
-    def test_is_kept_and_found_again(self, monkeypatch):
+    def test_reference_is_stored_and_reloaded(self, monkeypatch):
         chosen = short("planar-pendulum", 5.0)
         first = reference(chosen)
 
@@ -220,7 +220,7 @@ class TestReference:
         with pytest.raises(BaseException, match="again"):
             reference(short("planar-pendulum", 6.0))
 
-    def test_momenta_that_were_rounded_have_a_reference_of_their_own(self):
+    def test_rounded_momenta_have_a_separate_reference(self):
         chosen = short("outer-solar-system", 1024.0)
         momenta = chosen.velocity * np.array(chosen.masses)
         moved = reference(chosen, momenta)
@@ -241,7 +241,7 @@ class TestCurves:
         assert time_at(curve, 1e-10) == pytest.approx(8e-3)
         assert time_at(curve, 1e-8) == pytest.approx(4e-3)
 
-    def test_extrapolates_nothing(self):
+    def test_curves_are_not_extrapolated(self):
         curve = points((1.0, 1e-4), (2.0, 1e-6))
         assert time_at(curve, 1e-2) == 1.0
         assert time_at(curve, 1e-7) is None
@@ -289,7 +289,7 @@ class TestReport:
         assert (ours.default, ours.best, ours.peer) == tuple(pytest.approx(x) for x in (5.0, 3.0, 2.0))
         assert fast.best == 1.0
 
-    def test_without_heyoka_there_are_no_ratios(self):
+    def test_ratios_require_heyoka(self):
         result = result_of(measurement("scvi-codegen svi", 1e-3, 1e-12))
         (row,) = report.rows(result)
         assert row.default is row.best is row.peer is None
@@ -302,7 +302,7 @@ class TestReport:
         (line,) = (line.split() for line in text.splitlines() if line.startswith("  broken  "))
         assert line[:3] == ["broken", "failed", "-"]
 
-    def test_what_was_written_is_read_again(self):
+    def test_report_survives_a_round_trip(self):
         table = ResultTable(name="t", title="x", columns={"a": ".1f"}, rows=({"a": 1.0}, {"a": None}), remarks=("so",))
         for result in (self.result, table):
             data = json.loads(json.dumps(result.data()))
@@ -338,7 +338,7 @@ class TestReport:
 
 
 class TestMeasuring:
-    def test_rounds_alternate_and_failures_are_kept(self):
+    def test_rounds_alternate_and_failures_are_recorded(self):
         order = []
 
         def contender(name):
@@ -376,7 +376,7 @@ class TestMeasuring:
 
 @needs_extended
 class TestCommand:
-    def test_without_peers(self, tmp_path, monkeypatch):
+    def test_runs_without_peers(self, tmp_path, monkeypatch):
         monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
         path = tmp_path / "out.json"
         said = []
@@ -392,7 +392,7 @@ class TestCommand:
         assert len(data["tables"][0]["rows"]) == 6
         assert "planar-pendulum: reference" in said
 
-    def test_ctrl_c_keeps_what_was_measured(self, tmp_path, monkeypatch):
+    def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
         def interrupt(plan, report_activity):
             raise KeyboardInterrupt
 
@@ -411,7 +411,7 @@ class TestCommand:
         assert json.loads(path.read_text())["interrupted"] == "two"
         assert "done: kept" in found.text()
 
-    def test_each_section_is_written_when_measured_and_not_measured_again(self, tmp_path, monkeypatch):
+    def test_each_section_is_saved_when_measured_and_not_repeated(self, tmp_path, monkeypatch):
         path, measured = tmp_path / "out.json", []
 
         def section(name, plan, report_activity):
@@ -458,24 +458,24 @@ class TestCommand:
 
 
 class TestDrift:
-    def test_the_slope_of_a_line(self):
+    def test_slope_of_a_line_is_exact(self):
         derivative, error = fitted_rate(np.linspace(0.0, 3e-12, 2001))
         assert derivative == pytest.approx(3e-12)
         assert error < 1e-20
 
-    def test_a_random_walk_has_a_slope_within_its_error(self):
+    def test_slope_of_a_random_walk_is_within_its_error(self):
         random = np.random.default_rng(5)
         walks = [fitted_rate(np.cumsum(random.standard_normal(2001))) for _ in range(300)]
         scores = np.array([derivative / error for derivative, error in walks])
         assert 0.85 < scores.std() < 1.2
 
-    def test_a_short_run_keeps_its_energy(self):
+    def test_short_run_conserves_energy(self):
         (row,) = drift_rows(cases.case("kepler:0.2"), 0.2, 20_000, with_heyoka=False)
         assert row["largest"] < 1e-12
 
 
 class TestTables:
-    def test_the_method_written_by_hand_agrees_with_the_generated_one(self):
+    def test_handwritten_method_agrees_with_the_generated_one(self):
         found = hand_written.run_hand_written(bench.Plan(quick=True, repeats=1), lambda text: None)
         assert [row["case"] for row in found.rows] == list(hand_written.HAND_WRITTEN)
         assert all(row["apart"] < 1e-12 for row in found.rows)
@@ -550,7 +550,7 @@ class TestTables:
         assert min(ours["second_ms"], other["second_ms"], ours["first_step_s"], other["first_step_s"]) > 0.0
         assert "KeyError" in missing["why_not"]
 
-    def test_held_bodies_are_the_same_in_angles_on_rods_and_in_mujoco(self):
+    def test_constrained_bodies_agree_in_angles_rods_and_mujoco(self):
         """The chain twice by this project, and both by MuJoCo where it is installed: small steps, one motion."""
         chain, linkage = (constrained_contenders.LINKAGES[name]() for name in ("chain", "four-bar"))
         on_rods, in_angles = (
@@ -569,7 +569,7 @@ class TestTables:
         assert stiff.length_error < 1e-5 < soft.length_error < 1e-2
         assert stiff.energy < 1e-4
 
-    def test_what_is_unstable_says_so_and_leaves_no_file(self, monkeypatch, tmp_path):
+    def test_instability_is_reported_and_leaves_no_file(self, monkeypatch, tmp_path):
         """MuJoCo would write its warnings into the working folder."""
         pytest.importorskip("mujoco", reason="extra bench")
         monkeypatch.chdir(tmp_path)
@@ -579,7 +579,7 @@ class TestTables:
         assert ["unstable" in row.get("why_not", "") for row in rows] == [True, False]
         assert not list(tmp_path.iterdir())
 
-    def test_rows_of_held_bodies_are_told_at_equal_time(self, monkeypatch):
+    def test_rows_of_constrained_bodies_are_printed_at_equal_time(self, monkeypatch):
         monkeypatch.setattr(constrained_bodies, "OUR_STEPS", (1000, 500))
         monkeypatch.setattr(
             constrained_bodies, "_others", lambda bodies: [("other", constrained_bodies.our_motion(bodies, "svi:1"))]

@@ -60,7 +60,7 @@ def test_rebound_settles_where_we_do():
 
 
 @pytest.mark.full
-def test_sums_are_measured_at_equal_error(monkeypatch):
+def test_array_systems_are_measured_at_equal_error(monkeypatch):
     monkeypatch.setattr(sums, "lattices", lambda plan: (ring(32, 2.0), bodies(4, 0.5)))
     rows = sums.run_sums(QUICK, quiet).rows
     assert [row["error"] for row in rows] == [*sums.ERRORS, *sums.ERRORS]

@@ -46,7 +46,7 @@ def output_of(model, *words):
     return result.stdout
 
 
-def test_it_is_that_of_the_run():
+def test_printed_balance_is_that_of_the_run():
     text = output_of(MODEL)
     model = load_model("model.toml")
     run = model.stepper().integrate(model.q, velocity=model.velocity, h=0.1, steps=70, save_every=7)
@@ -81,7 +81,7 @@ def test_damping_and_inputs_have_one():
     ],
     ids=["L has time", "a method without account", "many steps", "no forces"],
 )
-def test_where_there_is_none(changed):
+def test_conservative_systems_have_no_balance(changed):
     model = MODEL
     for old, new in changed.items():
         assert old in model
@@ -92,7 +92,7 @@ def test_where_there_is_none(changed):
     assert found["energy_balance"] is None
 
 
-def test_many_coordinates_have_none():
+def test_many_coordinates_have_no_balance():
     """Nothing is asked of the run."""
     system = problem("outer-solar-system").system
     assert system.dimension > MAX_BALANCE_COORDINATES

@@ -116,7 +116,7 @@ class TestHelp:
         assert printed in result.stdout
 
     @pytest.mark.parametrize("name", ABOUT)
-    def test_each_command_that_is_listed_is_there(self, name):
+    def test_every_listed_command_exists(self, name):
         command = main.get_command(click.Context(main), name)
         assert command.name == name
         assert command.params
@@ -148,7 +148,7 @@ class TestHelp:
 
 
 class TestChoices:
-    def test_nothing_chosen_is_the_catalogue(self):
+    def test_missing_selection_lists_the_catalogue(self):
         assert chosen() == Model.from_problem(problem("kepler"))
         assert chosen("fput-chain:5").system.dimension == 5
 
@@ -195,14 +195,14 @@ class TestChoices:
         save_model(replace(chosen(), method=SVI(3, "clenshaw-curtis:7")), "a.toml")
         assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
 
-    def test_states_and_lengths(self):
+    def test_states_and_step_sizes_are_read(self):
         model = chosen(q=(1.0, 0.0), p=(0.0, 1.0), time=2.0, step=-0.5, steps=7, save_every=2, parameter=(("mu", 3.0),))
         assert (model.q, model.p, model.velocity, model.t) == ((1.0, 0.0), (0.0, 1.0), None, 2.0)
         assert (model.h, model.steps, model.span, model.save_every) == (-0.5, 7, None, 2)
         assert model.system.defaults == (3.0,)
         assert chosen(step=0.5).step_count == 400
 
-    def test_on_the_command_line(self):
+    def test_options_select_a_problem(self):
         words = "--q -1,0 --velocity 0,-1.1 --parameter mu=1.5 --step 0.1 --steps 10 --method gauss --stages 2"
         text = output_of("run", "kepler", *words.split())
         assert "10 steps of 0.1 from t = 0 to t = 1; 11 states saved" in text
@@ -283,7 +283,7 @@ class TestChoices:
 
 
 class TestRun:
-    def test_steps_that_choose_their_length_are_not_called_symplectic(self):
+    def test_adaptive_steps_are_not_called_symplectic(self):
         text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
         assert "order 16, symplectic only at fixed step size, symmetric" in text
 
@@ -298,7 +298,7 @@ class TestRun:
         for words in ("--step 0.25 --span 1", "--step 0.3 --steps 3", "--tolerance 1e-9 --span 1"):
             assert "whole number" not in output_of("run", "kepler", *words.split())
 
-    def test_sums_up_what_was_conserved(self):
+    def test_summary_lists_conserved_quantities(self):
         text = output_of("run", "kepler")
         assert "order 16, symplectic, symmetric" in text
         assert re.search(r"a step, \d\.\d\d iterations a step; prepared in \d", text)
@@ -326,7 +326,7 @@ class TestRun:
         )
 
     @pytest.mark.parametrize("option", ["--quiet", "--json"])
-    def test_a_step_that_is_far_too_long_is_warned_of_whatever_is_printed(self, option):
+    def test_far_too_long_step_warns_for_every_output_format(self, option):
         """One point and a step of a quarter of the period: the energy of so few states is constant, by chance."""
         words = ("run", "harmonic-oscillator", "--degree", "2", "--quadrature", "gauss-legendre:1", "--steps", "40")
         result = invoke(*words, "--step", "1.5", option)
@@ -334,7 +334,7 @@ class TestRun:
         assert re.search(r"Warning: the step from t = \S+ is too large: .* use a smaller --step", result.stderr)
         assert "too long" not in invoke("run", "harmonic-oscillator", option).stderr
 
-    def test_the_largest_energy_error_is_told_and_not_the_last(self):
+    def test_largest_energy_error_is_reported_instead_of_the_last(self):
         run = compile_stepper(problem("kepler").system, StoermerVerlet()).integrate(
             problem("kepler").q, problem("kepler").velocity, h=0.01, steps=628
         )
@@ -347,7 +347,7 @@ class TestRun:
         assert "and 3 more coordinates" in text
         assert "q7" not in text
 
-    def test_energy_of_driven_systems_is_not_called_an_error(self):
+    def test_energy_change_of_systems_with_inputs_is_not_called_an_error(self):
         assert "L depends on time" in output_of("run", "duffing", "--parameter", "gamma=0.3")
 
     @pytest.mark.parametrize("save_every", [1, 7])
@@ -369,7 +369,7 @@ class TestRun:
         assert "0 steps of 0.25" in output_of("run", "kepler", "--steps", "0", "-o", "a.npz")
         assert len(arrays("a.npz")["t"]) == 1
 
-    def test_states_that_do_not_fit_are_kept_as_advised(self, monkeypatch):
+    def test_states_beyond_memory_are_saved_as_advised(self, monkeypatch):
         monkeypatch.setattr("scvi_codegen.cli.memory.usable_memory", lambda: 20_000.0)
         save_every = re.search(r"--save-every (\d+)", error_of("run", "kepler", "--steps", "1000"))[1]
         assert 1 < int(save_every) < 10
@@ -380,7 +380,7 @@ class TestRun:
         assert Path("orbit.svg").read_text().startswith("<?xml")
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-    def test_an_interrupted_run_keeps_what_was_computed(self, number, monkeypatch):
+    def test_interrupted_run_saves_computed_states(self, number, monkeypatch):
         @contextmanager
         def third_portion(steps: int) -> Iterator[Callable[[int], None]]:
             done = []
@@ -396,7 +396,7 @@ class TestRun:
         assert np.allclose(np.diff(t), 0.25)
         assert "relative energy error" in result.stdout
 
-    def test_a_failing_step_keeps_what_was_computed(self):
+    def test_failing_step_saves_computed_states(self):
         # Falls into the centre of attraction along a line that a step of Newton's method cannot pass.
         words = "--method gauss --stages 1 --velocity 0,0 --step 0.01 --max-iterations 3 -o fall.npz"
         result = invoke("run", "kepler", *words.split())
@@ -411,7 +411,7 @@ class TestRun:
         assert np.array_equal(written["t"], 0.01 * np.arange(step + 1))
         assert np.isfinite(written["q"]).all()
 
-    def test_a_first_step_that_fails_is_told_in_short(self):
+    def test_failure_of_the_first_step_is_one_short_message(self):
         result = invoke("run", "double-pendulum", "--step", "5")
         assert result.exit_code == 1
         assert "Error: step 0 at t = 0 with h = 5 failed" in result.stderr
@@ -462,13 +462,13 @@ class TestInstalledCommand:
             assert result.returncode == status
             assert bool(result.stderr) == bool(status)
 
-    def test_a_reader_that_stops_early_is_no_error(self):
+    def test_closed_pipe_is_not_an_error(self):
         result = subprocess.run(f"{COMMAND} systems | head -1", shell=True, capture_output=True, text=True, check=False)
         assert result.stderr == ""
 
 
 class TestGenerate:
-    def test_writes_a_folder_and_says_how_to_use_it(self):
+    def test_generate_writes_a_folder_and_prints_how_to_use_it(self):
         text = output_of("generate", "planar-pendulum", "-o", "out/pendulum_svi", "--degree", "2")
         assert "make -C out/pendulum_svi run" in text
         assert "import pendulum_svi" in text
@@ -539,7 +539,7 @@ def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
     assert ("q1 =" in ended.stdout) == (stream == "2")
 
 
-def test_a_package_that_cannot_be_written_is_a_failure(tmp_path, monkeypatch):
+def test_unwritable_package_is_a_failure(tmp_path, monkeypatch):
     """Exit status 1, as for every file that cannot be written."""
 
     def full(*_: object) -> None:

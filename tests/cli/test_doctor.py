@@ -48,7 +48,7 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: name != "ziglang" and find(name, *more))
 
 
-def test_a_stepper_is_compiled_and_run_in_a_folder_of_its_own(tmp_path, monkeypatch):
+def test_trial_stepper_is_compiled_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
     status, said = doctor()
     assert status == 0
@@ -60,7 +60,7 @@ def test_a_stepper_is_compiled_and_run_in_a_folder_of_its_own(tmp_path, monkeypa
     assert not (tmp_path / "cache").exists()
 
 
-def test_without_a_compiler_it_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
     no_compiler(monkeypatch, tmp_path)
     status, said = doctor()
     assert status == 1
@@ -100,7 +100,7 @@ def test_arithmetic_that_is_broken_is_found_out(tmp_path, monkeypatch):
     assert "violate IEEE 754 arithmetic" in findings(1)["trial"]["remedy"]
 
 
-def test_a_stepper_without_vector_functions_is_told_from_one_with_them(monkeypatch):
+def test_steppers_with_and_without_vector_functions_are_distinguished(monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1")
     tuned = findings()["vectors"]["status"]
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-O1 -USCVI_LIBMVEC")

@@ -54,7 +54,7 @@ def output_of(*words):
     return result.stdout
 
 
-def test_a_run_is_that_of_drive_and_its_file_too(model):
+def test_run_with_inputs_and_its_file_equal_integrate(model):
     text = output_of("-o", "run.npz", "--plot", "run.png", "--save-every", "2")
     expected = compile_stepper(model.system, model.method).integrate(
         model.q, model.p, inputs=dict(model.inputs), h=0.1, t_end=2.3, save_every=2
@@ -95,7 +95,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
         (["--parameter", "u_0=1"], "no parameter 'u_0'"),
     ],
 )
-def test_what_is_refused(words, said):
+def test_unsupported_options_are_rejected(words, said):
     result = invoke(*words)
     assert result.exit_code == 2, result.output
     assert said in result.stderr
@@ -119,7 +119,7 @@ def test_an_ensemble_of_them(model):
     assert "give a step h" in invoke("--ensemble", "many.csv").stderr
 
 
-def test_no_steps_and_columns_that_inputs_say():
+def test_runs_without_steps_and_columns_of_inputs():
     assert "0 steps of 0.1 from t = 0 to t = 0; 1 state saved" in output_of("--steps", "0")
     Path("many.csv").write_text("q,u_0\n0.1,5\n")
     assert "'u_0' is not a coordinate" in invoke("--ensemble", "many.csv").stderr
@@ -131,7 +131,7 @@ def test_an_input_that_is_not_given():
     assert "final state" in output_of("--input", "u=u.csv")
 
 
-def test_a_step_that_fails_leaves_the_stretches_before_it(model):
+def test_failing_step_saves_the_preceding_segments(model):
     """Towards the end the push has no numbers left."""
     Path("pushed.toml").write_text(MODEL.replace('q = "u"', 'q = "sqrt(u + 0.5)"'))
     result = invoke("-o", "run.csv")
@@ -142,7 +142,7 @@ def test_a_step_that_fails_leaves_the_stretches_before_it(model):
     assert 1.0 in found[:, 0]
 
 
-def test_a_signal_stops_between_portions(model, monkeypatch):
+def test_signal_stops_a_run_between_chunks(model, monkeypatch):
     record, sent = Run.record, []
 
     def interrupted(run, steps=None, **settings):

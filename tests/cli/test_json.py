@@ -60,12 +60,12 @@ def refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is no JSON")
 
 
-def test_every_command_is_asked():
+def test_every_command_is_tested():
     assert {words[0] for words in QUIET_COMMANDS} == set(main.list_commands(click.Context(main)))
 
 
 @pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
-def test_quiet_prints_nothing_and_json_one_document(words, monkeypatch):
+def test_quiet_prints_nothing_and_json_prints_one_document(words, monkeypatch):
     monkeypatch.setattr(benchmark, "SECTIONS", {"nothing-but-this": lambda plan, say: NO_TIMES})
     invoke("run", *KEPLER, "-o", "orbit.run")
     assert invoke(*words).stdout
@@ -107,7 +107,7 @@ def test_the_numbers_of_a_run_are_those_of_the_library():
     assert (found["failure"], found["missed"], found["written"]) == (None, None, ["orbit.npz"])
 
 
-def test_a_run_that_fails_tells_how_far_it_came():
+def test_failed_run_reports_how_far_it_got():
     found = document("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
@@ -153,6 +153,6 @@ def test_a_certificate_is_the_one_that_is_saved():
     assert found == json.loads(Path("certificate.json").read_text())
 
 
-def test_what_is_no_number_is_none():
+def test_undefined_numbers_are_null():
     values = {"a": math.nan, "b": [math.inf, 1.5], "c": np.array([1.0, np.nan]), "d": np.int64(3), "e": Path("x")}
     assert command_group._plain(values) == {"a": None, "b": [None, 1.5], "c": [1.0, None], "d": 3, "e": "x"}

@@ -119,7 +119,7 @@ def test_checks_of_verify_compare_what_they_measured_with_their_bounds():
     assert len({check["outcome"] for check in checks.values()}) == 1
 
 
-def test_positions_and_momenta_are_printed_in_their_own_known_digits():
+def test_positions_and_momenta_are_printed_with_their_correct_digits():
     known = Known(q=np.array([1e-3, 1e-9]), p=np.array([1e-9, 1e-3]), tenfold=np.inf)
     lines = list(final_state(["x", "y"], np.array([1 / 3, 2 / 3]), np.array([1 / 7, 1 / 9]), known))
     digits = [[len(text) for text in re.findall(r"0\.(\d*[1-9])", line)] for line in lines[1:]]

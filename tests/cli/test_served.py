@@ -60,7 +60,7 @@ def tried(command: str, kind: str) -> Result:
 
 
 @each_cell
-def test_what_is_served_comes_to_be_compiled_and_the_rest_is_refused(command, kind, served, tmp_path, monkeypatch):
+def test_allowed_requests_are_compiled_and_others_rejected(command, kind, served, tmp_path, monkeypatch):
     def unbuilt(*_, **__):
         raise BuildError(BUILT)
 
@@ -77,6 +77,6 @@ def test_what_is_served_comes_to_be_compiled_and_the_rest_is_refused(command, ki
 
 @pytest.mark.full
 @each_cell
-def test_what_is_served_is_done(command, kind, served, tmp_path, monkeypatch):
+def test_allowed_requests_are_executed(command, kind, served, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert tried(command, kind).exit_code == (0 if served else 2)

@@ -56,7 +56,7 @@ def invoke(*words: str) -> Result:
     return CliRunner().invoke(main, list(words), prog_name="scvi-codegen")
 
 
-def test_run_by_steps_that_choose_their_length(ring: str) -> None:
+def test_adaptive_run_of_an_array_system(ring: str) -> None:
     """To the end, as accurate as wanted; in place of the step of the file. What needs one step says so."""
     result = invoke("run", ring, "--tolerance", "1e-9", "--span", "7", "--json")
     assert result.exit_code == 0, result.output
@@ -120,7 +120,7 @@ def test_options(ring: str) -> None:
         (("derive", "--html", "page.html"), "--html is not available for indexed models"),
     ],
 )
-def test_what_is_not_for_sums(ring: str, words: tuple[str, ...], message: str) -> None:
+def test_unsupported_options_of_array_systems_are_rejected(ring: str, words: tuple[str, ...], message: str) -> None:
     """Exit status 2 and the reason."""
     result = invoke(words[0], ring, *words[1:])
     assert result.exit_code == 2
@@ -204,7 +204,7 @@ def test_newton(ring: str) -> None:
     assert "are those it was generated with" in invoke("verify", "ring_newton", "--solver", "fixed-point").output
 
 
-def test_a_folder_is_verified_as_it_stands(ring: str, tmp_path: Path) -> None:
+def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> None:
     """Also with arrays from files, which are elsewhere later; a fault in its C is found."""
     np.save("start.npy", np.sin(np.arange(8.0)))
     Path("masses.csv").write_text("m\n" + "".join(f"{1 + k / 8}\n" for k in range(8)))

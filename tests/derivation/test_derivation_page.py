@@ -100,23 +100,23 @@ def compared(system: Any, method: Any) -> list[tuple[sympy.Expr, sympy.Expr]]:
 
 class TestEquations:
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-    def test_sums_are_what_is_written_out(self, method):
+    def test_rolled_sums_equal_unrolled_terms(self, method):
         assert all(abs(one - other) < 1e-18 for one, other in compared(tilted(), method))
 
-    def test_of_a_composition_too(self):
+    def test_rolled_sums_of_a_composition_equal_unrolled_terms(self):
         assert all(abs(one - other) < 1e-18 for one, other in compared(driven_duffing(), sc.Composition(8)))
 
     @pytest.mark.parametrize(
         "method", [sc.SVI(2), sc.SVI(2, "gauss-legendre:3"), sc.SCVI(2), sc.Gauss(2)], ids=lambda m: m.name
     )
-    def test_and_of_a_hamiltonian(self, method):
+    def test_rolled_sums_of_a_hamiltonian_equal_unrolled_terms(self, method):
         system = sc.HamiltonianSystem.from_text(
             name="twisted", coordinates=["q"], momenta=["p"], hamiltonian="p**2*(1 + q**2)/2 + q**4*cos(t) + p*q/3"
         )
         assert all(abs(one - other) < 1e-18 for one, other in compared(system, method))
 
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-    def test_a_name_stands_for_one_number(self, method):
+    def test_one_name_denotes_one_number(self, method):
         stages = method.paper_form(tilted())
         values: dict[str, Any] = {}
         for family in stages.families:
@@ -134,7 +134,7 @@ class TestEquations:
         system = sc.problem("henon-heiles").system
         assert_pattern_is_of_jacobian(system, method)
 
-    def test_of_constraints_whose_multipliers_are_fewer_than_coordinates(self):
+    def test_pattern_with_fewer_multipliers_than_coordinates(self):
         assert_pattern_is_of_jacobian(swing(constraints=["x**2 + y**2 - 1"]), sc.SVI(2, "gauss-lobatto:3"))
 
 
@@ -171,7 +171,7 @@ class TestPage:
         assert part.count("\u2297") == {"position": 3, "phase-space": 4}[form]
 
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-    def test_every_method_has_one_that_is_well_formed_and_needs_nothing_else(self, method):
+    def test_every_method_has_a_well_formed_self_contained_page(self, method):
         page = derivation_html(sc.problem("planar-pendulum").system, method)
         parsed = Page(page)
         assert len(parsed.all("h1")) == 1
@@ -194,7 +194,7 @@ class TestPage:
         called = {f.name for f in reached(functions, "double_pendulum_advance") if f.comment and "lanes" not in f.name}
         assert called <= set(shown)
 
-    def test_every_kind_of_sweep_is_explained(self):
+    def test_every_kind_of_iteration_is_explained(self):
         kinds = [
             each
             for each in (vars(iterations) | vars(curve_iterations)).values()
@@ -207,7 +207,7 @@ class TestPage:
         page = derivation_html(singular, sc.Gauss(2))
         assert "in turn to convergence" in page
 
-    def test_an_entry_of_the_jacobian_says_its_number(self):
+    def test_jacobian_entries_show_their_indices(self):
         pendulum, q, v, h = sc.problem("planar-pendulum").system.with_parameters(g=9.81), 0.5, 0.7, 0.1
         expected = -1.0 / h - 9.81 * h / 4 * math.cos(q + h * v / 2)
         start = Start(q=[q], velocity=[v], p=None, h=h)
@@ -244,7 +244,7 @@ class TestPage:
         assert "<msqrt><mn>3</mn></msqrt>" in page
         assert "\N{MINUS SIGN}0.57735026918962576" in page
 
-    def test_numbers_of_the_paper_stand_beside_the_equations(self):
+    def test_equation_numbers_of_the_paper_are_shown(self):
         page = kepler_page(sc.SCVI(2))
         numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
         assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
@@ -263,13 +263,13 @@ class TestPage:
         ],
         ids=["forces", "damping", "constraints"],
     )
-    def test_what_acts_beside_a_lagrangian_is_told(self, more, said):
+    def test_forces_and_constraints_of_a_lagrangian_are_shown(self, more, said):
         plain, acted_on = (derivation_html(swing(**each), sc.SVI(2, "gauss-lobatto:3")) for each in ({}, more))
         assert said in acted_on
         assert said not in plain
         Page(acted_on)
 
-    def test_a_composition_is_told_as_its_leapfrog_steps(self):
+    def test_composition_is_shown_as_its_leapfrog_steps(self):
         method = sc.Composition(8)
         assert f"{len(method.fractions)} leapfrog steps of sizes" in kepler_page(method)
 
@@ -285,7 +285,7 @@ class TestPage:
         assert "<h1>&lt;b&gt; &amp; */ q</h1>" in page
         Page(page)
 
-    def test_a_large_system_is_cut_short_and_says_so(self):
+    def test_large_system_is_abbreviated_with_a_note(self):
         system = sc.problem("outer-solar-system").system
         page = derivation_html(system, sc.SVI(8))
         assert len(page.encode()) < 1_000_000
@@ -298,7 +298,7 @@ class TestPage:
         assert count > 1000
         assert f"/* .. {count - MOST_LINES} more lines */" in page
 
-    def test_what_is_left_out_of_the_first_guess_is_counted(self):
+    def test_omitted_terms_of_the_predictor_are_counted(self):
         assert "The first 12 of 16 first values." in kepler_page(sc.SVI(8))
 
     def test_an_index_in_a_heading_is_a_variable(self):
@@ -309,7 +309,7 @@ class TestPage:
 
 
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
-def test_in_a_browser(browser, tmp_path, size, scheme):
+def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
     with opened(browser, kepler_page(sc.SCVI(2)), tmp_path / "kepler.html", size, scheme) as view:
         assert_it_asks_for_nothing(view)
         assert_nothing_sticks_out(view)
@@ -335,7 +335,7 @@ def test_in_a_browser(browser, tmp_path, size, scheme):
 
 
 class TestCommand:
-    def test_a_page_is_written(self, tmp_path):
+    def test_derive_writes_a_page(self, tmp_path):
         path = tmp_path / "page.html"
         done = CliRunner().invoke(main, ["derive", "kepler", "--method", "svi", "--degree", "2", "--html", str(path)])
         assert done.exit_code == 0, done.output
@@ -345,7 +345,7 @@ class TestCommand:
         assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
 
     @pytest.mark.parametrize("more", [["--latex"], ["--radicals"], ["-o", "text"]])
-    def test_it_is_not_mixed_with_text(self, more, tmp_path):
+    def test_html_and_text_output_are_exclusive(self, more, tmp_path):
         done = CliRunner().invoke(main, ["derive", "kepler", "--html", str(tmp_path / "page.html"), *more])
         assert done.exit_code == 2
         assert "--html excludes --latex, --radicals and -o" in done.stderr
@@ -362,7 +362,7 @@ def test_operations_are_those_of_sympy():
     assert operations(sympy.sin(x) ** 2 / 3 + x) == sympy.count_ops(sympy.sin(x) ** 2 / 3 + x) == 4
 
 
-def test_what_is_left_out_is_counted():
+def test_omitted_terms_are_counted():
     x = sympy.symbols("x:300")
     short, long = Formula(x[0] + x[1]), Formula(sympy.Add(*(s**2 for s in x)))
     left = [block.text if isinstance(block, Paragraph) else block for block in formulas([short, long, short], "row")]

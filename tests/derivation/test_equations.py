@@ -138,7 +138,7 @@ def test_closed_form_and_compiled_step_agree(system, method):
 @pytest.mark.parametrize("system", SYSTEMS[:3], ids=lambda s: s.name)
 @pytest.mark.parametrize("form", ["position", "phase-space"])
 @pytest.mark.parametrize("degree", [1, 3])
-def test_matrix_form_vanishes_where_the_scalar_form_does(system, form, degree):
+def test_matrix_form_is_zero_where_the_scalar_form_is(system, form, degree):
     """(18), (21) with Kronecker products against the written-out equations, off the solution too for (18)."""
     derived = derive(system, SpectralCollocation(degree, form=form))
     generator = np.random.default_rng(degree)
@@ -216,7 +216,7 @@ def test_latex_has_one_index_and_one_exponent_at_a_letter_and_names_the_new_stat
     assert text.count("p_{q_{2},k+1} &=") == text.count("q_{1,k+1} &=") == 1
 
 
-def test_a_weight_that_is_zero_is_shown_as_such():
+def test_zero_weight_is_shown_as_zero():
     derived = derive(planar_pendulum(), SpectralCollocation(2, form="phase-space"))
     assert {entry.symbol.name: entry.exact for entry in derived.entries}["b_2"] == 0
 

@@ -429,7 +429,7 @@ def test_the_printed_stage_equations_are_those_of_the_step(name):
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.values[0] not in WITHOUT_STAGES])
-def test_those_of_the_compiled_form_are_too(name):
+def test_printed_compiled_equations_are_those_of_the_step(name):
     step, x = solution(name, "evaluate")
     for found, expected in zip(step.end(x, *start_of(step.case)), compiled_step(name), strict=True):
         np.testing.assert_allclose(found.astype(float), expected, rtol=2e-14, atol=1e-15)

@@ -71,7 +71,7 @@ def at(text: str, i: int) -> Any:
 
 
 @pytest.mark.parametrize("system", [RING, ROTORS], ids=lambda system: system.name)
-def test_slopes_of_terms_add_up_to_forces(system):
+def test_gradients_of_terms_sum_to_forces(system):
     text = derive_sums(system, sc.SVI(2) if system is RING else sc.Gauss(2))
     added: dict[str, Any] = {"q": numbers([0] * COUNT), "p": numbers([0] * COUNT)}
     partials = re.findall(r"^    by (\w)\[i([+-]\d+)?\]: (.*)$", text, re.MULTILINE)

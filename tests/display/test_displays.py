@@ -98,26 +98,26 @@ def test_every_display_is_well_formed_and_short(name):
 
 
 class TestMethod:
-    def test_it_says_what_it_promises(self):
+    def test_method_display_lists_its_properties(self):
         shown = sc.SVI(3)._repr_html_()
         assert re.search(r">order</th><td[^>]*>6</td>", shown)
         assert re.search(r">symplectic</th><td[^>]*>yes</td>", shown)
         assert re.search(r">symplectic</th><td[^>]*>no</td>", sc.SpectralCollocation(3)._repr_html_())
 
-    def test_its_numbers_are_there_exactly_where_they_are_short(self):
+    def test_coefficients_are_exact_where_they_are_short(self):
         shown = sc.SVI(3)._repr_html_()
         assert "<msqrt><mn>15</mn></msqrt>" in shown
         assert "0.77459666924148338" in shown
         assert "msqrt" not in sc.SVI(9, "gauss-legendre:9", nodes="legendre-lobatto")._repr_html_()
 
-    def test_a_long_table_is_cut_and_says_so(self):
+    def test_long_table_is_abbreviated_with_a_note(self):
         shown = sc.SVI(20)._repr_html_()
         assert "the first 12 of 20 rows" in shown
         assert "the first 12 of 21 rows" in shown
 
 
 class TestSystem:
-    def test_its_function_is_typeset(self):
+    def test_lagrangian_is_typeset(self):
         shown = sc.problem("planar-pendulum").system.with_parameters(g=9.81)._repr_html_()
         assert "<math" in shown
         assert "<mi>L</mi>" in shown
@@ -139,7 +139,7 @@ class TestSystem:
 
 
 class TestEquations:
-    def test_they_are_typeset_with_their_numbers(self):
+    def test_equations_are_typeset_with_numbers(self):
         shown = DISPLAYED["equations"]()._repr_html_()
         assert shown.count("(27a)") == shown.count("(27b)") == 1
         assert "<math" in shown
@@ -168,7 +168,7 @@ class TestTrajectory:
         points = re.findall(r'points="([^"]*)"', trajectory()._repr_html_())
         assert all(300 < len(line.split()) <= 400 for line in points)
 
-    def test_states_without_an_energy_are_shown_without(self):
+    def test_trajectories_without_an_energy_are_displayed(self):
         run = trajectory()
         broken = sc.Trajectory(
             t=run.t,
@@ -191,7 +191,7 @@ class TestSymmetry:
         assert "Symmetry: boost of y" in shown
         assert all(word in shown for word in ("conserves", "direction", "gauge"))
 
-    def test_a_direction_that_leaves_a_coordinate_does_not_list_it(self):
+    def test_coordinates_invariant_under_a_symmetry_are_not_listed(self):
         first = sc.symmetries(falling())[0]
         assert first.name == "momentum of x"
         assert "<mi>y</mi>" not in first._repr_html_()
@@ -218,7 +218,7 @@ class TestOutcomes:
         assert kepler.reference in shown
 
 
-def test_a_sparkline_goes_from_bottom_to_top_and_leaves_out_what_is_not_finite():
+def test_sparkline_spans_the_range_and_skips_non_finite_values():
     points = [
         tuple(map(float, pair.split(",")))
         for pair in re.findall(r"[\d.]+,[\d.]+", sparkline([0.0, float("nan"), 2.0], ""))
@@ -237,7 +237,7 @@ def test_cards_escape_text():
 
 
 @pytest.mark.parametrize(("size", "scheme"), VIEWS)
-def test_in_a_browser(browser, tmp_path, size, scheme):
+def test_displays_render_in_a_browser(browser, tmp_path, size, scheme):
     displays = "\n".join(display()._repr_html_() for display in DISPLAYED.values())
     colors = ":root{color-scheme:light dark} body{color:CanvasText;background:Canvas}"
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">'

@@ -156,7 +156,7 @@ def check_read_back(expression: sympy.Expr, seed: int = 1) -> None:
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
-def test_it_reads_as_the_expression(expression):
+def test_mathml_evaluates_to_the_expression(expression):
     check_read_back(expression)
 
 
@@ -243,12 +243,12 @@ def test_all_kinds_are_well_formed_and_without_html_entities(expression):
         assert set(re.findall(r"&\w+;", text)) <= {"&lt;", "&gt;", "&amp;"}
 
 
-def test_functions_keep_their_names():
+def test_functions_have_their_standard_names():
     assert inner(Function("L_d")(x)).startswith("<mrow><msub><mi>L</mi><mi>d</mi></msub>")
 
 
 class TestTerms:
-    def test_a_short_equation_is_one_piece(self):
+    def test_short_equation_is_not_broken(self):
         assert len(mathml_terms(x + y, h)) == len(mathml_terms(x + y, h)[0]) == 1
         assert mathml_terms(sympy.Eq(h, x + y)) == mathml_terms(x + y, h)
 
@@ -260,7 +260,7 @@ class TestTerms:
         assert len(others) == 12
         assert all('<mo form="infix">' in term[0] and len(term) == 1 for term in others)
 
-    def test_a_long_left_side_is_broken_like_a_right_one(self):
+    def test_long_left_side_is_broken_like_a_right_side(self):
         total = sympy.Add(*(Symbol(f"x_{n}") * Symbol(f"y_{n}") for n in range(12)))
         terms = mathml_terms(sympy.S.Zero, total)
         assert len(terms) == 13
@@ -300,5 +300,5 @@ def test_reading_back_finds_a_wrong_sign():
         ("bA_2", "(bA)_{2}"),
     ],
 )
-def test_names_are_read_the_same_way_in_latex(name, latex):
+def test_latex_names_are_parsed_like_mathml_names(name, latex):
     assert latex_name(name) == latex

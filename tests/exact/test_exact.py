@@ -27,7 +27,7 @@ def largest_difference(left, right):
 
 
 @pytest.mark.parametrize(("digits", "h"), [(1, "0.5"), (15, "0.5"), (30, "0.5"), (50, "0.5"), (30, "20"), (30, "-2")])
-def test_the_harmonic_oscillator_to_the_digits_asked_for(digits, h):
+def test_harmonic_oscillator_has_the_requested_digits(digits, h):
     h, m, k, q0, q1 = mp.mpf(h), mp.mpf(2), mp.mpf(3), mp.mpf(1), mp.mpf("0.3")
     found = exact_discrete_lagrangian(OSCILLATOR, [1], ["0.3"], h, parameters={"m": 2, "k": 3}, digits=digits)
     w = mp.sqrt(k / m)
@@ -72,7 +72,7 @@ def test_a_kepler_ellipse_by_keplers_equation():
     assert abs(joined.action - flow.action) < mp.mpf("1e-30")
 
 
-def test_a_driven_oscillator_from_a_time_other_than_zero():
+def test_forced_oscillator_with_nonzero_initial_time():
     """q'' = -q + gamma cos(omega t): a particular solution and a rotation."""
     system = problem("duffing").system
     gamma, w, t, h = mp.mpf("0.7"), mp.mpf("1.3"), mp.mpf("0.4"), mp.mpf("0.9")
@@ -125,7 +125,7 @@ def test_momenta_and_energy_are_the_derivatives_of_the_action(name):
 
 
 @pytest.mark.parametrize("name", all_but("pumped-cart-pole"))
-def test_the_flow_joins_its_own_ends_and_runs_back(name):
+def test_flow_connects_its_end_points_and_is_reversible(name):
     system, q, v, h = CASES[name]
     momenta = oracle.Mechanics(system).momentum([oracle.mp.mpf(TIME)], *(oracle.numbers([x]) for x in (q, v)))[0]
     flow = exact_map(system, q, momenta.astype(float), h, t=TIME)
@@ -161,7 +161,7 @@ def test_long_steps_are_divided(digits):
     assert abs(flow.action - half.action - halves.action) < 100 * mp.mpf(10) ** -digits
 
 
-def test_a_guess_chooses_among_several_solutions():
+def test_initial_guess_selects_one_of_several_solutions():
     """From rest at 2 radians for 5 time units; another swing joins the same points."""
     flow = exact_map(PENDULUM, [2], [0], 5, digits=12)
     other = exact_discrete_lagrangian(PENDULUM, [2], flow.q1, 5, digits=12)
@@ -202,6 +202,6 @@ def test_equilibrium_stays():
         (lambda: exact_discrete_lagrangian(RELATIVISTIC, [0], [0.1], 0.2, guess=[2], digits=5), "give guess"),
     ],
 )
-def test_errors_say_what_to_do(call, words):
+def test_errors_state_the_remedy(call, words):
     with pytest.raises(StateError, match=words):
         call()

@@ -40,7 +40,7 @@ def test_edits_find_their_text() -> None:
     assert [edit["name"] for edit in EDITS if not (ROOT / "tests" / edit["test"].split("::")[0]).exists()] == []
 
 
-def test_what_random_faults_are_shown_to_is_there() -> None:
+def test_tests_that_run_against_random_faults_exist() -> None:
     """Tests that were moved would notice nothing, and nobody that they do not."""
     assert [name for names in NEAR.values() for name in names if not (ROOT / "tests" / name).exists()] == []
 
@@ -50,7 +50,7 @@ def test_what_random_faults_are_shown_to_is_there() -> None:
     first_of_each(EDITS, lambda edit: "one of them, of Python: those of C take thrice as long"),
     ids=lambda edit: f"{edit['group']}: {edit['name']}",
 )
-def test_an_edit_is_noticed(edit: Edit, copy: Path) -> None:
+def test_every_edit_is_detected(edit: Edit, copy: Path) -> None:
     path = copy / edit["file"]
     text = path.read_text(encoding="utf-8")
     pytest_alone = ("-m", "pytest", "-qx", "--tb=line", "-p", "no:cacheprovider", "-p", "no:xdist")

@@ -16,7 +16,7 @@ def filled(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_a_folder_takes_the_place_of_another(tmp_path: Path, before: bool) -> None:
+def test_folder_replaces_another(tmp_path: Path, before: bool) -> None:
     target = tmp_path / "run"
     if before:
         (filled(target, "old") / "old alone").write_text("")
@@ -27,7 +27,7 @@ def test_a_folder_takes_the_place_of_another(tmp_path: Path, before: bool) -> No
     assert [*tmp_path.iterdir()] == [target]
 
 
-def test_where_the_new_folder_cannot_be_moved_the_old_one_is_back(tmp_path: Path, monkeypatch) -> None:
+def test_old_folder_is_restored_if_the_new_one_cannot_be_moved(tmp_path: Path, monkeypatch) -> None:
     target = filled(tmp_path / "run", "old")
     move = Path.replace
 
@@ -49,7 +49,7 @@ def half_made(target: Path) -> None:
         raise RuntimeError
 
 
-def test_what_was_not_made_whole_changes_nothing(tmp_path: Path) -> None:
+def test_incomplete_files_change_nothing(tmp_path: Path) -> None:
     target = filled(tmp_path / "run", "old")
     with pytest.raises(RuntimeError):
         half_made(target)

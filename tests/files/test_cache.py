@@ -59,7 +59,7 @@ def spring() -> sc.Stepper:
 
 
 class TestSize:
-    def test_entries_used_least_recently_leave_when_it_is_too_large(self, folder, monkeypatch):
+    def test_least_recently_used_entries_are_removed_above_the_limit(self, folder, monkeypatch):
         for number in range(3):
             answer(number)
             os.utime(entry(folder, number), (number, number))
@@ -70,13 +70,13 @@ class TestSize:
         answer(4)
         assert held(folder) == {0, 3, 4}
 
-    def test_what_was_just_built_stays_however_small_the_limit(self, folder, monkeypatch):
+    def test_latest_entry_remains_for_any_limit(self, folder, monkeypatch):
         monkeypatch.setenv(cache.SIZE_VARIABLE, "1")
         for number in range(3):
             assert answer(number) == number
             assert held(folder) == {number}
 
-    def test_entries_are_counted_once_while_there_is_room(self, folder, monkeypatch):
+    def test_entries_are_counted_once_below_the_limit(self, folder, monkeypatch):
         """And not for each that is written: there may be thousands."""
         counted = []
         fit = cache._fit
@@ -108,7 +108,7 @@ class TestSize:
         assert cache.size_limit() == size
 
     @pytest.mark.parametrize("given", ["huge", "-1", "1X", "1e9"])
-    def test_what_is_no_size_is_named(self, given, monkeypatch):
+    def test_invalid_size_is_named(self, given, monkeypatch):
         monkeypatch.setenv(cache.SIZE_VARIABLE, given)
         with pytest.raises(BuildError, match=f"SCVI_CODEGEN_CACHE_SIZE is '{given}': it must be a size"):
             answer(0)
@@ -122,7 +122,7 @@ class TestSize:
 
 
 class TestTrust:
-    def test_a_folder_that_everyone_may_write_is_not_used(self, folder):
+    def test_world_writable_folder_is_not_used(self, folder):
         folder.mkdir()
         folder.chmod(0o777)
         with pytest.warns(CacheWarning, match=r"every user of this machine may write to it.*chmod go-w"):
@@ -172,7 +172,7 @@ class TestTrust:
         with pytest.warns(CacheWarning, match="belongs to the user number 65534"):
             assert answer(1) == 1.0
 
-    def test_an_entry_that_everyone_may_write_is_built_anew(self, folder, monkeypatch):
+    def test_world_writable_entry_is_rebuilt(self, folder, monkeypatch):
         for exposed in (entry(folder, 1), building._library(entry(folder, 1))):
             answer(1)
             forge(folder)
@@ -180,7 +180,7 @@ class TestTrust:
             assert answer(1) == 1.0
             assert not cache.exposed(exposed)
 
-    def test_a_text_that_everyone_may_write_is_made_anew(self, folder, monkeypatch):
+    def test_world_writable_source_is_regenerated(self, folder, monkeypatch):
         spring()
         (path,) = (folder / "texts").glob("*.json")
         before = path.stat().st_ino
@@ -189,14 +189,14 @@ class TestTrust:
         assert path.stat().st_ino != before
         assert not cache.exposed(path)
 
-    def test_with_a_careless_umask_nobody_else_may_write(self, folder):
+    def test_cache_is_private_under_a_permissive_umask(self, folder):
         with umask(0):
             spring()
         paths = [folder, *folder.rglob("*")]
         assert {"manifest.json", "texts"} <= {path.name for path in paths}
         assert [path for path in paths if path.stat().st_mode & 0o022] == []
 
-    def test_a_text_that_was_tampered_with_is_made_anew(self, folder, monkeypatch):
+    def test_modified_source_is_regenerated(self, folder, monkeypatch):
         first = spring()
         (path,) = (folder / "texts").glob("*.json")
         record = json.loads(path.read_text())
@@ -208,7 +208,7 @@ class TestTrust:
         assert spring().source == first.source
         assert made == [1]
 
-    def test_a_library_whose_checksum_is_wrong_is_built_anew_without_a_word(self, folder, recwarn, capfd):
+    def test_library_with_wrong_checksum_is_rebuilt_silently(self, folder, recwarn, capfd):
         answer(1)
         library = building._library(entry(folder, 1))
         data = library.read_bytes()
@@ -240,7 +240,7 @@ def umask(mask: int) -> Iterator[None]:
 
 
 class TestClearing:
-    def test_clearing_leaves_what_is_not_ours_and_counts_bytes(self, folder):
+    def test_clearing_removes_only_cache_entries_and_counts_bytes(self, folder):
         answer(1)
         spring()
         (folder / "thesis.tex").write_text("not ours")
@@ -253,14 +253,14 @@ class TestClearing:
         assert sc.cache_info().size == sc.clear_cache() == 0
         assert not folder.exists()
 
-    def test_what_killed_processes_left_is_removed_after_an_hour(self, folder):
+    def test_remains_of_killed_processes_are_removed_after_an_hour(self, folder):
         for name, age in ((".building-old", 7200), (".building-new", 60), (".removed-old", 7200)):
             (folder / name / "inside").mkdir(parents=True)
             os.utime(folder / name, (time.time() - age,) * 2)
         answer(1)
         assert {path.name for path in folder.glob(".*")} == {".building-new"}
 
-    def test_on_the_command_line(self, folder):
+    def test_cache_commands_on_the_command_line(self, folder):
         answer(1)
 
         def said(*words: str) -> str:

@@ -150,12 +150,12 @@ def test_refused_at_the_column(text: str, column: int, message: str) -> None:
     assert (caught.value.column, caught.value.text) == (column, text)
 
 
-def test_text_of_another_length_than_allowed() -> None:
+def test_text_beyond_the_maximum_length_is_rejected() -> None:
     with pytest.raises(ExpressionError, match="too long"):
         parse("x" * (MAX_CHARACTERS + 1))
 
 
-def test_a_declared_symbol_may_bear_a_word_of_python() -> None:
+def test_declared_symbols_may_be_python_keywords() -> None:
     symbol = Symbol("lambda", real=True)
     assert parse_expression("lambda**2", {"lambda": symbol}) == symbol**2
 
@@ -238,7 +238,7 @@ def test_round_trip_of_random_expressions(expression: sympy.Expr) -> None:
     ],
     ids=str,
 )
-def test_written_as(expression: sympy.Expr, text: str) -> None:
+def test_expressions_are_written_as_text(expression: sympy.Expr, text: str) -> None:
     assert format_expression(expression) == text
     assert parse(text) == expression
 
@@ -263,7 +263,7 @@ def test_written_as(expression: sympy.Expr, text: str) -> None:
     ],
     ids=str,
 )
-def test_not_written(expression: sympy.Expr, message: str) -> None:
+def test_unsupported_expressions_are_not_written(expression: sympy.Expr, message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         format_expression(expression)
 

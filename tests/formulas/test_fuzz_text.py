@@ -204,7 +204,7 @@ def test_grids_are_read_or_refused(tmp_path):
     ],
     ids=range(12),
 )
-def test_files_made_to_end_the_parser_are_refused_quickly(text, message):
+def test_files_that_attack_the_parser_are_rejected_fast(text, message):
     with guarded(), pytest.raises(ModelFileError, match=message):
         parse_model(text)
 
@@ -313,7 +313,7 @@ def code_of(text: str) -> str:
 
 
 @pytest.mark.parametrize("title", TITLES, ids=lambda title: repr(title)[:20])
-def test_the_name_of_a_system_reaches_nothing_but_comments_and_prose(title, tmp_path):
+def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
     plain = generate_package(hostile_model("plain"), tmp_path / "a" / "pendulum")
     try:
         folder = generate_package(hostile_model(title), tmp_path / "b" / "pendulum")

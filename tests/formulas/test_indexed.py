@@ -33,7 +33,7 @@ def terms(text: str) -> tuple[IndexedTerm, ...]:
         ("sum(a in 0..2, q[a])", ["q[0] + q[1] + q[2]"]),
     ],
 )
-def test_what_is_written_is_read(text: str, read: list[str] | None) -> None:
+def test_index_notation_is_parsed(text: str, read: list[str] | None) -> None:
     """Terms over the same loops are one; sums over whole numbers are written out; the text of a term is read again."""
     found = terms(text)
     if read is not None:
@@ -80,7 +80,7 @@ def test_what_is_written_is_read(text: str, read: list[str] | None) -> None:
         ("q[1.5]", "a whole number of at most 9 digits is expected here"),
     ],
 )
-def test_what_is_refused(text: str, message: str) -> None:
+def test_invalid_index_notation_is_rejected(text: str, message: str) -> None:
     """With the column, and what to write."""
     with pytest.raises(ExpressionError) as caught:
         terms(text)

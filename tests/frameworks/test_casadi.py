@@ -70,7 +70,7 @@ def test_derivatives_forward_and_back_are_those_of_runs():
     assert_allclose(along(*at).full()[:, 0], columns @ change, rtol=0, atol=1e-11 * size)
 
 
-def test_ipopt_finds_how_a_pendulum_turns_at_an_angle():
+def test_ipopt_finds_the_turning_point_of_a_pendulum():
     """Momentum at the bottom and time to the turning point, both unknown; m = l = g = 1."""
     flow, angle = casadi_flow(pendulum(), steps=12), 2.0
     p, h = ca.MX.sym("p"), ca.MX.sym("h")
@@ -161,7 +161,7 @@ def test_a_step_that_fails_fails_the_call_and_forgotten_arguments_do():
         flow(q=Q, p=P, h=H)
 
 
-def test_what_there_is_not_is_refused():
+def test_unsupported_functions_are_rejected():
     with pytest.raises(StateError, match="stepper must be a compiled stepper"):
         casadi_flow("kepler", steps=3)
     with pytest.raises(StateError, match="steps must be at least 1, not 0"):
@@ -174,7 +174,7 @@ def test_what_there_is_not_is_refused():
         ca.hessian(flow(*given)[0][0], given[0])[0]
 
 
-def test_time_and_parameters_of_a_flow_of_several_pieces():
+def test_derivatives_by_time_and_parameters_of_a_segmented_flow():
     flow = casadi_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
     given = symbols(flow)
     values = ca.vec(ca.vertcat(*flow(*given)))

@@ -107,7 +107,7 @@ def test_second_derivatives_of_a_flow_are_the_differences_of_its_gradients():
     assert_allclose(hessian, differences, rtol=1e-6)
 
 
-def test_what_has_no_such_step_says_so():
+def test_unsupported_methods_are_reported():
     with pytest.raises(MethodError, match=r"degree must be at most 3"):
         casadi_step(TOWED, SVI(2), degree=4)
     with pytest.raises(MethodError, match="no quadrature along its curve"):

@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.full, pytest.mark.usefixtures("as_users_compile")]
         ("orbit_transfer", 40, 30.4702, 1e-6, 2e-6),
     ],
 )
-def test_both_ways_find_one_cost_and_lead_where_they_say(name, steps, cost, apart, off, tmp_path):
+def test_direct_and_indirect_solutions_have_equal_cost_and_end(name, steps, cost, apart, off, tmp_path):
     pytest.importorskip("casadi", reason="needs the extra 'casadi'")
     command = [sys.executable, "-W", "error", str(FOLDER / f"{name}.py"), str(steps)]
     environment = os.environ | {"PYTHONPATH": str(FOLDER.parents[1]), "MPLBACKEND": "agg"}

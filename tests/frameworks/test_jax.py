@@ -185,7 +185,7 @@ print(float(flow(jax.numpy.array([0.5, 0.0]), jax.numpy.array([0.0, 1.6]), h=0.1
 """
 
 
-def test_another_process_computes_the_same(tmp_path):
+def test_result_is_equal_in_another_process(tmp_path):
     flow = jax_flow(kepler(), steps=5)
     here = flow(jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6]), h=H)[0][0]
     (tmp_path / "flow").write_bytes(pickle.dumps(flow))
@@ -194,7 +194,7 @@ def test_another_process_computes_the_same(tmp_path):
     assert result.stdout.split() == [float(here).hex()]
 
 
-def test_inputs_that_are_held_are_parameters():
+def test_inputs_with_zero_order_hold_are_parameters():
     system = LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2", forces={"x": "u"}, inputs=["u"]
     )
@@ -220,13 +220,13 @@ def test_motions_with_constraints_have_the_derivatives_of_their_runs():
     assert_allclose(np.concatenate(found, axis=1), run.sensitivity().state[-1, :2], rtol=0, atol=1e-12)
 
 
-def test_a_step_that_fails_says_when():
+def test_failed_step_reports_its_time():
     flow = jax_flow(kepler(), steps=5)
     with pytest.raises((RuntimeError, ValueError), match=r"step 0 at t = 0 failed: a value is infinite or NaN"):
         jax.block_until_ready(flow(jnp.zeros(2), jnp.zeros(2), h=H))
 
 
-def test_what_there_is_not_is_refused():
+def test_unsupported_functions_are_rejected():
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
     flow = jax_flow(kepler(), steps=5)
     with pytest.raises(MethodError, match=r"no forward-over-forward second derivatives.* use jax\.hessian"):
@@ -260,12 +260,12 @@ except sc.StateError as error:
 """
 
 
-def test_without_binary64_it_says_how_to_have_it():
+def test_missing_binary64_is_reported_with_the_remedy():
     result = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, check=True)
     assert "jax.config.update('jax_enable_x64', True)" in result.stdout
 
 
-def test_time_and_parameters_of_a_flow_of_several_pieces():
+def test_derivatives_by_time_and_parameters_of_a_segmented_flow():
     flow = jax_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
 
     def along(x):

@@ -50,7 +50,7 @@ UP = {
 }
 
 
-def test_least_effort_from_rest_to_rest_is_known_with_its_costates():
+def test_minimum_effort_rest_to_rest_has_the_exact_costates():
     """u = 6 - 12 t; the slopes of the cost to come are -12 by x and 12 t - 6 by p."""
     motion = optimal_control(POINT, SVI(2), steps=5, duration=1.0, cost="u**2/2", degree=1, **REST)
     assert motion.cost == pytest.approx(6.0, rel=1e-9)
@@ -86,7 +86,7 @@ def test_the_shortest_time_is_found_where_duration_is_free():
     assert_allclose(motion.coefficients["u"][:, 0], np.repeat([1.0, -1.0], 3), atol=1e-5)
 
 
-def test_what_the_end_costs_counts():
+def test_terminal_cost_is_included():
     """Far for little: x(1) less the integral of u^2 / 2 is most for u = 1 - t."""
     motion = optimal_control(
         POINT, SVI(2), steps=3, duration=1.0, start=REST["start"], end={}, cost="u**2/2", end_cost="-x", degree=1
@@ -94,7 +94,7 @@ def test_what_the_end_costs_counts():
     assert motion.cost == pytest.approx(-1 / 6, rel=1e-8)
 
 
-def test_the_motion_is_that_of_the_stepper_and_inputs_keep_their_bounds():
+def test_trajectory_is_that_of_the_stepper_and_inputs_satisfy_bounds():
     motion = optimal_control(SWING, SVI(3), degree=2, parameters={"a": 0.4}, **UP)
     stepper = compile_stepper(SWING, SVI(3), flags=QUICK_FLAGS)
     given = {"inputs": motion.inputs, "h": motion.h, "t_end": 5.0, "parameters": {"a": 0.4}}
@@ -106,7 +106,7 @@ def test_the_motion_is_that_of_the_stepper_and_inputs_keep_their_bounds():
     assert finer.cost == pytest.approx(motion.cost, rel=0.05)
 
 
-def test_bounds_between_hold_at_the_points_of_the_quadrature():
+def test_path_bounds_hold_at_the_quadrature_points():
     motion = optimal_control(POINT, SVI(2), steps=8, duration=1.0, cost="u**2", bounds={"x_dot": (None, 1.2)}, **REST)
     assert motion.p.max() < 1.3
     free = optimal_control(POINT, SVI(2), steps=8, duration=1.0, cost="u**2", **REST)
@@ -156,7 +156,7 @@ def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_what_makes_no_sense_is_said(changed, error, said):
+def test_invalid_problems_are_reported(changed, error, said):
     asked = {"system": SWING, "method": SVI(2), **UP, **changed}
     with pytest.raises(error, match=said):
         optimal_control(**asked)
@@ -175,7 +175,7 @@ ANGLE = LagrangianSystem.from_text(
 )
 
 
-def test_constraints_hold_at_all_times_and_the_optimum_is_that_of_an_angle():
+def test_constraints_hold_and_the_optimum_is_that_in_the_angle():
     """A bob on a rod, from rest below to rest at half a right angle: as with its angle alone."""
     known, turn = {"steps": 10, "duration": 2.0, "cost": "u**2", "degree": 1}, np.linspace(0.0, 0.5, 11)
     free = optimal_control(ANGLE, SVI(3), start={"a": 0.0, "a_dot": 0.0}, end={"a": 0.5, "a_dot": 0.0}, **known)
@@ -195,7 +195,7 @@ def test_constraints_hold_at_all_times_and_the_optimum_is_that_of_an_angle():
     assert_allclose(again.q, held.q, atol=1e-9)
 
 
-def test_a_blade_goes_where_it_points():
+def test_skate_moves_along_its_blade():
     """A skate, turned and pushed by inputs: constraints of velocities; it parks aside without a step aside."""
     skate = LagrangianSystem.from_text(
         name="skate",

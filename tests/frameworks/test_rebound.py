@@ -27,7 +27,7 @@ def positions(simulation) -> np.ndarray:
 
 @pytest.mark.full
 @pytest.mark.usefixtures("as_users_compile")
-def test_a_simulation_goes_the_same_way_here(simulation):
+def test_imported_simulation_has_the_trajectory_of_rebound(simulation):
     system, q, velocity, t, units = sc.from_rebound(simulation)
     assert (t, units) == (3.0, {})
     run = sc.compile_stepper(system, "svi:8").integrate(q, velocity=velocity, h=0.05, steps=1000, t=t)
@@ -38,7 +38,7 @@ def test_a_simulation_goes_the_same_way_here(simulation):
 
 @pytest.mark.full
 @pytest.mark.usefixtures("as_users_compile")
-def test_the_outer_solar_system_goes_the_same_way_there():
+def test_exported_outer_solar_system_has_the_trajectory_in_rebound():
     outer = sc.problem("outer-solar-system")
     run = sc.compile_stepper(outer.system, "svi:8").integrate(outer.q, velocity=outer.velocity, h=100.0, steps=200)
     simulation = sc.to_rebound(outer.system, outer.q, velocity=outer.velocity)
@@ -46,7 +46,7 @@ def test_the_outer_solar_system_goes_the_same_way_there():
     assert np.abs(run.q[-1] - positions(simulation)).max() < 1e-12 * np.abs(run.q).max()
 
 
-def test_there_and_back_is_the_same_to_the_bit(simulation):
+def test_export_and_import_are_bitwise_inverse(simulation):
     bodies = sc.from_rebound(simulation)
     back = sc.from_rebound(sc.to_rebound(bodies.system, bodies.q, velocity=bodies.velocity, t=bodies.t))
     assert back.q.tobytes() == bodies.q.tobytes()
@@ -89,7 +89,7 @@ ODDITIES = {
 
 
 @pytest.mark.parametrize("oddity", ODDITIES)
-def test_what_is_not_attraction_is_refused_by_name(simulation, oddity):
+def test_non_gravitational_forces_are_rejected_by_name(simulation, oddity):
     ODDITIES[oddity](simulation)
     with pytest.raises(SystemDefinitionError, match=f"this simulation has .*{oddity}"):
         sc.from_rebound(simulation)

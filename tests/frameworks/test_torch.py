@@ -105,7 +105,7 @@ def test_parameters_are_learned():
     assert mu.item() == pytest.approx(1.1, rel=1e-5)
 
 
-def test_many_motions_have_shapes_that_fit():
+def test_shapes_of_many_trajectories_broadcast():
     flow = torch_flow(kepler(), steps=5, save_every=1)
     q, p = flow(numbers([[[0.5, 0.0]], [[0.6, 0.0]]]), numbers([[0.0, 1.7]] * 3), h=0.05)
     assert q.shape == p.shape == (2, 3, 6, 2)
@@ -115,7 +115,7 @@ def test_many_motions_have_shapes_that_fit():
     assert derivative(numbers([0.9, 1.0])).shape == (2, 6, 2)
 
 
-def test_what_there_is_not_is_refused():
+def test_unsupported_functions_are_rejected():
     flow, q, p = torch_flow(kepler(), steps=5), numbers([0.5, 0.0]), numbers([0.0, 1.6])
     with pytest.raises(MethodError, match="no forward-over-forward second derivatives"):
         torch.func.jacfwd(torch.func.jacfwd(lambda q: flow(q, p, h=0.05)[0].sum()))(q)
@@ -129,7 +129,7 @@ def test_what_there_is_not_is_refused():
         flow(numbers([0.0, 0.0]), p, h=0.05)
 
 
-def test_time_and_parameters_of_a_flow_of_several_pieces():
+def test_derivatives_by_time_and_parameters_of_a_segmented_flow():
     flow = torch_flow(pumped.stepper(), steps=pumped.STEPS, save_every=pumped.EVERY)
 
     def along(x):

@@ -97,5 +97,5 @@ def test_solutions_are_those_of_the_full_matrix(bandwidth, sites, blocks):
         assert np.max(np.abs(found - expected)) < 1e-14 * np.linalg.cond(matrix)
 
 
-def test_a_singular_matrix_is_said():
+def test_singular_matrix_is_reported():
     assert solved(1, 6, 1, np.diag([1.0, 2.0, 0.0, 1.0, 1.0, 1.0]), np.ones(6)) is None

@@ -53,7 +53,7 @@ def test_separable_systems_iterate_on_positions_but_for_the_printed_form(sample)
     assert isinstance(fixed_point(system, SCVI(1, variational=False)), SeparableIteration)
 
 
-def test_more_points_than_lanes_are_left_to_newton(sample):
+def test_more_points_than_lanes_use_newton(sample):
     system = sample("double-pendulum").system
     assert fixed_point(system, SpectralCollocation(32)) is not None
     assert fixed_point(system, SpectralCollocation(33)) is None
@@ -71,7 +71,7 @@ def test_a_run_is_newtons(sample, compiled, name, method):
 
 
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(3), PRINTED[0]], **named)
-def test_motion_from_rest_needs_no_newton(sample, compiled, method):
+def test_start_from_rest_does_not_need_newton(sample, compiled, method):
     """Velocities that vanish are no measure of what is small."""
     q, p = sample("double-pendulum").state
     steps = [
@@ -81,7 +81,7 @@ def test_motion_from_rest_needs_no_newton(sample, compiled, method):
 
 
 @pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
-def test_the_velocity_kept_from_the_last_step_yields_to_other_parameters(sample, compiled, method):
+def test_stored_velocity_is_recomputed_for_new_parameters(sample, compiled, method):
     stepper = compiled("pumped-cart-pole", method, solver="fixed-point")
     run = stepper.start(*sample("pumped-cart-pole").state, h=0.05)
     run.record(5)

@@ -31,7 +31,7 @@ def scaling():
 
 
 @pytest.mark.parametrize("h", [0.26, 0.3, 0.45, 0.6])
-def test_a_slow_sweep_ends_where_newtons_iteration_does(h):
+def test_slow_fixed_point_iteration_agrees_with_newton(h):
     method = SpectralCollocation(1, form="phase-space")
     exact = Q[0] / (1 - h), P[0] / (1 + h)
     found = compile_stepper(scaling(), method, flags=QUICK_FLAGS).step(Q, P, h)
@@ -53,7 +53,7 @@ def test_long_steps_of_an_oscillator_alone_and_in_an_ensemble(method):
             assert abs(found - float(q[0])) < 2 * STEPS * ROUNDING
 
 
-def test_slow_sweeps_are_not_taken_for_rounding():
+def test_slow_convergence_is_not_mistaken_for_rounding():
     """Near its limit the iteration of a coupled system stops shrinking a while, at 1e-10 of the state, and fails."""
     heavy = LagrangianSystem.from_text(
         name="heavy", coordinates=["x"], lagrangian="x_dot**2*(1 + x**2/100)/2 - x**2/2", parameters={}
@@ -154,7 +154,9 @@ TABLE = [
     ids=[x[0] for x in TABLE],
 )
 @pytest.mark.parametrize("after", [0, 1])
-def test_verdicts_on_a_sweep(tmp_path_factory, after, change, last, before, tolerance, absolute, k, expected):
+def test_convergence_criterion_of_the_fixed_point_iteration(
+    tmp_path_factory, after, change, last, before, tolerance, absolute, k, expected
+):
     """Where the change before the last is not given, the last sweep did not contract."""
     verdict = header(tmp_path_factory.getbasetemp(), after).verdict
     assert verdict(change, last, before, tolerance, absolute, k) == expected
@@ -162,7 +164,7 @@ def test_verdicts_on_a_sweep(tmp_path_factory, after, change, last, before, tole
 
 @pytest.mark.parametrize("after", [0, 1])
 @pytest.mark.parametrize("rate", [0.01, 0.1, 0.3, 0.6])
-def test_what_is_left_when_sweeps_end_is_a_quarter_of_the_tolerance(tmp_path_factory, after, rate):
+def test_residual_at_convergence_is_a_quarter_of_the_tolerance(tmp_path_factory, after, rate):
     """Changes that shrink by one rate: what all sweeps to come, but those that follow anyway, would add up to.
 
     At most; up to half of it where they contract slowly, for 1 / (1 - r) is taken from squares.
@@ -182,7 +184,7 @@ def test_guesses_are_continued_from_two_steps_after_one_that_was_near(tmp_path_f
 
 
 @pytest.mark.parametrize("absolute", [0.0, 0.25])
-def test_sizes_are_inverted_and_what_rests_at_zero_has_one(tmp_path_factory, absolute):
+def test_inverse_sizes_are_finite_for_zero_coordinates(tmp_path_factory, absolute):
     scales = header(tmp_path_factory.getbasetemp(), 0).scales
     for sizes in ([4.0, 0.5, 0.0], [0.0, 2.0**-40, 8.0], [0.0, 0.0, 0.0], [1.0, np.inf, 2.0]):
         found = np.array(sizes)
@@ -203,7 +205,7 @@ HEAVY_TOP = (
 )
 
 
-def test_sweeps_of_rotations_that_contract_by_turns_end_at_rounding():
+def test_rotating_fixed_point_iterations_converge_to_rounding():
     """Factors of contraction are complex: one change may be as large as the last, though two are a hundredth of it."""
     system = HamiltonianSystem.from_text(name="top", coordinates=["w", "x", "y", "z"], hamiltonian=HEAVY_TOP)
     stepper = compile_stepper(system, SVI(8), solver="fixed-point", flags=QUICK_FLAGS)

@@ -64,7 +64,7 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     return np.hstack([run.q, run.p]), np.array([many.q, many.p])
 
 
-def test_a_loop_over_bonds_steps_as_its_terms_written_out() -> None:
+def test_loop_over_bonds_equals_its_unrolled_terms() -> None:
     system, bonds = chain(6)
     looped = looped_force(system, "force_lanes", bonds)
     found, expected, own = (states(system, force) for force in (looped, unrolled(looped), None))
@@ -88,7 +88,7 @@ def test_the_code_of_a_loop_does_not_grow_with_its_table() -> None:
 
 
 @pytest.mark.parametrize("row", [(0,), (0, 6), (-1, 0), (0, 1, 2)])
-def test_places_beyond_the_arguments_are_refused(row: tuple[int, ...]) -> None:
+def test_indices_beyond_the_arguments_are_rejected(row: tuple[int, ...]) -> None:
     system, bonds = chain(6)
     with pytest.raises(ValueError, match="must have 2 indices from 0 to 5"):
         looped_force(system, "force", [*bonds, row])

@@ -44,7 +44,7 @@ def stepper(name: str, solver: str) -> Stepper:
 
 
 @pytest.mark.parametrize(("name", "solver"), EXPECTED)
-def test_runs_take_as_many_iterations_as_they_did(name, solver):
+def test_iteration_counts_are_those_recorded(name, solver):
     given, expected = case(name), EXPECTED[name, solver]
     counts = [
         int(stepper(name, solver).integrate(given.q, given.p, h=given.h / part, steps=STEPS).iterations.sum())
@@ -54,7 +54,7 @@ def test_runs_take_as_many_iterations_as_they_did(name, solver):
 
 
 @pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
-def test_lanes_take_as_many_sweeps_as_single_runs(name):
+def test_lanes_use_as_many_iterations_as_single_runs(name):
     """From the same state in every lane: guesses from one step and from two are as good in a block."""
     given, own = case(name), stepper(name, "fixed-point")
     for part in (1, 8, 64):
@@ -69,7 +69,7 @@ def test_lanes_take_as_many_sweeps_as_single_runs(name):
 
 
 @pytest.mark.parametrize("name", CONTINUED)
-def test_two_former_steps_say_more_than_one(name):
+def test_predictor_from_two_steps_is_better_than_from_one(name):
     """What one sweep leaves to be done after the first step, and after the third: another table serves then."""
     given, left = case(name), []
     for steps in (1, 3):
@@ -86,7 +86,7 @@ def test_two_former_steps_say_more_than_one(name):
     assert left[1] < left[0] / 4
 
 
-def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
+def test_newton_factors_are_reused_in_the_next_short_step():
     given = case("chain/svi-4")
     run = stepper("chain/svi-4", "newton").start(given.q, given.p, h=given.h / 64)
     run.advance(3)
@@ -94,14 +94,14 @@ def test_factors_of_newtons_matrix_serve_the_next_step_where_steps_are_short():
 
 
 @pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (23, 87))])
-def test_steps_that_choose_their_length_are_guessed_by_the_one_before(name, expected):
+def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
     """By Newton's iteration, where it was as long: steps, and iterations of all."""
     given = case(name)
     run = stepper(name, "newton").integrate(given.q, given.p, t_end=10 * given.h, tolerance=1e-6)
     assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
 
 
-def test_kept_factors_take_two_looks_where_nothing_is_left_to_do():
+def test_reused_factors_need_two_updates_at_convergence():
     """Factors of another point must have shrunk an update once before one that is small says anything."""
     own = problem("fput-chain").system
     rest = [0.0] * own.dimension

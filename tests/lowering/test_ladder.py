@@ -39,7 +39,7 @@ def test_coefficients_have_106_bits(method):
 
 @pytest.mark.parametrize("system", [KEPLER, sc.problem("double-pendulum").system])
 @pytest.mark.parametrize("degree", [2, 8])
-def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree):
+def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degree):
     fixed_point = program_of(system, sc.SVI(degree)).fixed_point
     ladder, same = predictor_of(fixed_point), predictor_of(fixed_point).reach
     for found, wanted in (
@@ -52,7 +52,7 @@ def test_without_a_change_a_guess_is_that_of_steps_of_one_length(system, degree)
 
 
 @pytest.mark.parametrize("method", [sc.SVI(6), sc.SpectralCollocation(6)])
-def test_a_guess_follows_a_polynomial_across_changes_of_length(method):
+def test_predictor_follows_a_polynomial_across_step_size_changes(method):
     system = sc.problem("double-pendulum").system
     fixed_point = program_of(system, method).fixed_point
     ladder, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)

@@ -136,7 +136,7 @@ CATALOGUE = ["planar-pendulum", "duffing", "kepler", "double-pendulum", "spheric
 
 @pytest.mark.parametrize("name", CATALOGUE)
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), SpectralCollocation(2), Gauss(2)], ids=lambda m: m.name)
-def test_kernels_of_systems_have_the_values_and_slopes_of_their_formulas(name, method):
+def test_kernels_have_the_values_and_derivatives_of_their_formulas(name, method):
     system = problem(name).system
     program = lowered(system, method)
     points = random.Random(name)
@@ -170,7 +170,7 @@ def test_a_difference_and_its_negative_are_one_subtraction():
     assert counts["-"] == 1
 
 
-def test_negative_odd_half_powers_are_functions_of_their_own():
+def test_negative_half_integer_powers_are_separate_functions():
     r2 = x**2 + y**2
     half = sympy.Rational(1, 2)
     counts = kernel_of(*(r2 ** (-n * half) for n in (1, 3, 5, 7)), r2 ** (-9 * half), a / r2).operation_counts()
@@ -179,7 +179,7 @@ def test_negative_odd_half_powers_are_functions_of_their_own():
     assert "pow" not in counts
 
 
-def test_the_slopes_of_kepler_cost_no_division():
+def test_gradient_of_kepler_has_no_division():
     system = kepler()
     forces = gradient(system.lagrangian, system.coordinates)
     partials = jacobian(tuple(forces.values()), system.coordinates)
@@ -207,7 +207,7 @@ def test_odd_quarter_powers_share_a_root_of_a_root():
     assert positive.operation_counts() == {"sqrt": 2, "*": 4, "+": 1}  # 0 at 0
 
 
-def test_whole_powers_are_products_and_other_powers_are_calls():
+def test_integer_powers_are_products_and_others_are_calls():
     assert set(kernel_of(x**7 + y**-4).operation_counts()) == {"*", "/", "+"}
     assert kernel_of(x ** sympy.Rational(1, 3)).operation_counts() == {"pow": 1}
     assert kernel_of(x**y).operation_counts() == {"pow": 1}
@@ -232,7 +232,7 @@ def test_a_chain_of_256_masses_lowers_without_recursion():
     assert sum(kernel.operation_counts().values()) < 256 * 16
 
 
-def test_a_long_sum_is_cut_into_temporaries_and_keeps_its_value():
+def test_long_sum_is_split_into_temporaries_with_equal_value():
     values = [sympy.Rational(k, 8) for k in range(1, 1500)]
     kernel = kernel_of(sympy.Add(*(c * x ** (k % 30) for k, c in enumerate(values)), *(y**k for k in range(2, 40))))
     assert max(map(depth, kernel.temporaries)) <= DEEPEST_EXPRESSION + 1
@@ -325,13 +325,13 @@ def test_printed_numbers_read_back_as_the_same_double(number):
     assert any(mark in text for mark in ".e")
 
 
-def test_the_whole_catalogue_lowers():
+def test_every_catalogue_entry_is_lowered():
     for name in PROBLEMS:
         assert lowered(problem(name).system, SVI(2)).kernels
 
 
 @pytest.mark.parametrize(("method", "symmetric"), [(SVI(2), True), (RadauIIA(2), False)])
-def test_notes_say_whether_a_method_is_symmetric(method, symmetric):
+def test_notes_state_whether_a_method_is_symmetric(method, symmetric):
     notes = lowered(problem("kepler").system, method).notes
     assert ("symmetric" in notes, "not symmetric" in notes) == (symmetric, not symmetric)
     assert notes[0] == ("no order claimed" if method.order is None else f"order {method.order}")

@@ -94,7 +94,7 @@ def test_rows_are_exchanged_within_the_band(method):
     np.testing.assert_allclose(turn.T @ first[1], second[1], rtol=0, atol=1e-13)
 
 
-def test_memory_grows_with_the_length_of_a_chain_not_with_its_square():
+def test_memory_grows_linearly_with_the_length_of_a_chain():
     sizes = [workspace_size(lowered(fput_chain(n), SVI(8))) for n in (32, 64, 128)]
     assert sizes[2] - sizes[1] == pytest.approx(2 * (sizes[1] - sizes[0]), rel=1e-3)
     assert sizes[2] < 10**5
@@ -109,10 +109,10 @@ def test_a_mass_matrix_that_is_all_there_is_to_invert_is_no_larger_than_it_must_
 class TestKeptFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
-    def test_there_are_enough(self, method):
+    def test_runs_reuse_enough_factors(self, method):
         assert chain(method).interface.unknowns >= LEAST_REUSED_UNKNOWNS
 
-    def test_a_run_goes_on_bit_for_bit_however_it_is_cut(self, method):
+    def test_run_split_into_calls_is_bitwise_equal(self, method):
         q, p = state()
         expected = chain(method).integrate(q, p, h=0.15, steps=60)
         run = chain(method).start(q, p, h=0.15)
@@ -123,7 +123,7 @@ class TestKeptFactors:
         assert np.array_equal(last.p[-1], expected.p[-1])
         assert last.iterations[-1] == expected.iterations[-1]
 
-    def test_one_does_whose_springs_change_with_time_cut_anywhere(self, method):
+    def test_run_with_time_dependent_springs_split_anywhere_is_bitwise_equal(self, method):
         """Factors are made again where and when they were made: with all that their matrix depends on."""
         q, p = state()
         stepper = chain(method, pumped=True)
@@ -135,13 +135,13 @@ class TestKeptFactors:
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
 
-    def test_a_step_does_not_know_what_was_before(self, method):
+    def test_step_does_not_depend_on_preceding_calls(self, method):
         q, p = state()
         first = chain(method).step(q, p, 0.2)
         chain(method).integrate(-q, p, h=0.4, steps=5)
         assert np.array_equal(chain(method).step(q, p, 0.2), first)
 
-    def test_a_step_that_fails_leaves_the_run_as_it_was(self, method):
+    def test_failed_step_does_not_change_the_run(self, method):
         q, p = state()
         run = chain(method).start(q, p, h=0.15)
         run.record(10)

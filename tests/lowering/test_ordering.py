@@ -38,11 +38,11 @@ def test_a_grid_is_as_wide_as_its_shorter_side():
     assert bandwidth(pairs, places(pairs, 100)) <= 6
 
 
-def test_where_all_meet_there_is_nothing_to_order():
+def test_dense_coupling_is_not_reordered():
     assert places([(i, j) for i in range(6) for j in range(6)], 6) == tuple(range(6))
 
 
-def test_coordinates_that_meet_nobody():
+def test_uncoupled_coordinates_are_ordered():
     assert places([], 3) == (0, 1, 2)
     assert places([(1, 1)], 3) == (0, 1, 2)
     assert sorted(places([(0, 4), (4, 2)], 6)) == list(range(6))

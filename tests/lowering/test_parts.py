@@ -28,7 +28,7 @@ def kernel(temporaries, results):
     return Kernel(name="k", arguments=1, temporaries=tuple(temporaries), results=tuple(results), values=len(results))
 
 
-def test_parts_are_of_about_equal_size_and_keep_only_what_is_read_later(cut_after):
+def test_functions_have_similar_sizes_and_return_only_needed_values(cut_after):
     cut_after(10)
     u, w = Load("u", 0), [Load("w", k) for k in range(40)]
     sums = [Operation("+", (w[k - 1] if k else u, Constant(1.0))) for k in range(40)]
@@ -38,7 +38,7 @@ def test_parts_are_of_about_equal_size_and_keep_only_what_is_read_later(cut_afte
     assert cutting.kept_length(cut) == 2  # the one that is read, and the one that is written meanwhile
 
 
-def test_a_short_kernel_stays_whole():
+def test_short_kernel_is_not_split():
     whole = kernel([], [Operation("*", (Load("u", 0), Load("u", 0)))])
     (part,) = cutting.parts(whole)
     assert (part.name, part.statements) == ("k", tuple(whole.statements()))
@@ -47,7 +47,7 @@ def test_a_short_kernel_stays_whole():
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "fput-chain"])
-def test_the_same_motion_to_the_bit(name, solver, cut_after, monkeypatch, tmp_path):
+def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, monkeypatch, tmp_path):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     chosen = sc.problem(name)
     found = []

@@ -76,7 +76,7 @@ CASES = [
 
 @pytest.mark.parametrize(("make", "method"), CASES)
 @pytest.mark.usefixtures("few")
-def test_steps_energies_and_ensembles_are_those_of_the_system_written_out(make, method, monkeypatch):
+def test_steps_energies_and_ensembles_equal_those_of_unrolled_terms(make, method, monkeypatch):
     system = make("in_loops", 5)
     assert module.rolled(system) is not None
     looped = sc.compile_stepper(system, method, **FLAGS)
@@ -95,7 +95,7 @@ def test_steps_energies_and_ensembles_are_those_of_the_system_written_out(make, 
 
 
 @pytest.mark.usefixtures("few")
-def test_symmetries_are_those_of_the_system_written_out(monkeypatch):
+def test_symmetries_equal_those_of_unrolled_terms(monkeypatch):
     looped = symmetries(bodies("in_loops", 14))
     monkeypatch.setattr(module, "MIN_GROUP_SIZE", 10**6)
     module.rolled.cache_clear()
@@ -115,7 +115,7 @@ def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_t
     assert sizes[0] == sizes[1]
 
 
-def test_few_terms_and_constraints_stay_written_out():
+def test_few_terms_and_constraints_remain_unrolled():
     assert module.rolled(bodies("few", 5)) is None
     rods = [f"(x{i} - x{i + 1})**2 + (y{i} - y{i + 1})**2 + (z{i} - z{i + 1})**2 = 1" for i in range(46)]
     assert module.rolled(bodies("held", 47, constraints=rods)) is None

@@ -20,7 +20,7 @@ from scvi_codegen.tables.precision import mp
 METHODS = (SCVI(3), SCVI(2, "gauss-lobatto:3"), SVI(4, "clenshaw-curtis:5"), SpectralCollocation(3), RadauIIA(3))
 
 
-def test_tables_have_their_promised_digits_and_exact_zeros_and_ones():
+def test_tables_have_the_documented_digits_and_exact_zeros_and_ones():
     third, small = mp.one / 3, mp.mpf(10) ** -39
     zero, near_third, near_small, one = lower_vector((mp.mpf(10) ** -41, third, small, 1 - mp.mpf(10) ** -58))
     assert (zero, one) == (0, 1)
@@ -37,7 +37,7 @@ def test_constants_are_exact_until_a_target_rounds_them():
             exact_number(wrong)
 
 
-def test_targets_round_to_the_nearest_number_once():
+def test_coefficients_are_rounded_once_to_nearest():
     generator = np.random.default_rng(7)
     numerators, denominators = (generator.integers(1, 10**9, 500) for _ in range(2))
     for p, q in zip(numerators.tolist(), denominators.tolist(), strict=True):
@@ -57,7 +57,7 @@ def test_targets_round_to_the_nearest_number_once():
     assert SINGLE.rounded(halfway) == 1 + 2.0**-23
 
 
-def test_a_program_knows_more_digits_than_a_double():
+def test_program_has_more_digits_than_a_double():
     fixed_point = program_of(kepler(), SVI(3)).fixed_point
     product = [x for row in fixed_point.product for x in row[: fixed_point.points]]
     assert all(mp.mpf(DOUBLE.rounded(x)) != x for x in product)
@@ -65,7 +65,7 @@ def test_a_program_knows_more_digits_than_a_double():
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 @pytest.mark.parametrize("system", [kepler(), double_pendulum()], ids=lambda system: system.name)
-def test_no_generated_table_holds_a_zero_that_is_none(system, method):
+def test_generated_tables_contain_no_spurious_zeros(system, method):
     source, _ = generate_source(system, method)
     assert re.findall(r"\b\d[\d.]*e-(?:[4-9]\d|[12]\d\d)\b", source.code) == []
 

@@ -40,7 +40,7 @@ def test_steps_are_those_of_60_digits_up_to_the_rounding_of_positions(method):
             assert max(abs(exact.p - p)) < 4 * h * STIFFNESS * EPSILON
 
 
-def test_what_has_not_converged_is_still_refused():
+def test_unconverged_steps_are_rejected():
     stepper = compile_stepper(spring_pendulum(), SVI(1), solver="newton", flags=QUICK_FLAGS)
     with pytest.raises(StepFailedError, match="did not converge"):
         stepper.step([1.0, 0.0], [0.0, 100.0], 0.1, options=SolverOptions(max_iterations=2))

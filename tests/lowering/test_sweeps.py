@@ -79,7 +79,7 @@ def close(found, expected) -> bool:
 
 
 @pytest.mark.parametrize("system", [tangle(), pumped_cart_pole()], ids=lambda system: system.name)
-def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_to_first_order(system):
+def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
     stepper, (force, momentum, mass) = iterated(system), functions(system)
     assert "support/followed_corrections.h" in stepper.source.files
     F_q, F_v, P_q = partials(system)
@@ -97,7 +97,7 @@ def test_velocities_follow_momenta_by_the_whole_mass_and_what_changes_with_them_
 @pytest.mark.parametrize(
     "system", [problem("charged-particle").system, leaning(), relativistic()], ids=lambda system: system.name
 )
-def test_where_masses_are_the_same_everywhere_velocities_follow_momenta_and_forces_are_those_where_they_end(system):
+def test_constant_masses_update_velocities_and_forces_at_the_same_iterate(system):
     stepper, (force, momentum, mass) = iterated(system), functions(system)
     assert "support/corrections.h" in stepper.source.files
     for q0, v0 in states(system.dimension):
@@ -108,7 +108,7 @@ def test_where_masses_are_the_same_everywhere_velocities_follow_momenta_and_forc
         assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
 
 
-def test_of_many_coordinates_no_slopes_are_asked_for():
+def test_many_coordinates_do_not_request_the_jacobian():
     """They are the square of their number; a chain of nine has masses that depend on where it is."""
     names = [f"a{k}" for k in range(9)]
     coupled = " + ".join(f"{a}_dot**2 + {a}_dot*{b}_dot*cos({a} - {b})" for a, b in itertools.pairwise([*names, "a0"]))

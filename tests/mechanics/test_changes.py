@@ -46,7 +46,7 @@ def test_changes_follow_the_variational_equations():
     assert forms_of(varied).separable
 
 
-def test_names_that_are_taken_are_left_alone():
+def test_reserved_names_are_avoided():
     system = LagrangianSystem.from_text(
         name="taken", coordinates=["x", "x_change_1"], lagrangian="(x_dot**2 + x_change_1_dot**2)/2 - x**2*x_change_1"
     )
@@ -62,7 +62,7 @@ def test_masses_that_move_have_no_changes_of_this_kind():
 
 
 @pytest.mark.parametrize("method", [SVI(5), SVI(3, "gauss-lobatto:5"), Gauss(3)], ids=["svi", "other points", "gauss"])
-def test_changes_by_sweeps_are_the_derivative_of_the_computed_motion(method):
+def test_tangents_by_iteration_are_the_derivative_of_the_computed_flow(method):
     """Steps commute with differentiation: the tangent map of the run, also of a Hamiltonian, and symplectic."""
     kepler, (q, p) = problem("kepler").system, ([0.5, 0.0], [0.0, 3**0.5])
     tangent = compile_stepper(kepler, method, flags=QUICK_FLAGS).integrate(q, p, h=0.1, steps=63).tangent()[-1]
@@ -78,6 +78,6 @@ def test_changes_by_sweeps_are_the_derivative_of_the_computed_motion(method):
     assert np.abs(found.T @ omega @ found - omega).max() < 1e-14 * np.abs(found).max() ** 2
 
 
-def test_what_has_no_changes_of_its_own_is_refused():
+def test_systems_without_variational_equations_are_rejected():
     with pytest.raises(SystemDefinitionError, match=r"variational equations of 'double pendulum' cannot.*run.tangent"):
         variational_system(problem("double-pendulum").system, 2)

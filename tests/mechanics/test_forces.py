@@ -38,7 +38,7 @@ def test_forces_and_dissipation_add_up():
     assert driven(forces={"x": "0"}) == driven()
 
 
-def test_from_sympy_as_from_text():
+def test_sympy_input_equals_text_input():
     t, c = sympy.symbols("t c")
     x, y = dynamicsymbols("x y")
     L = sympy.Symbol("m") * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 - x**2 * y**2
@@ -120,7 +120,7 @@ def test_symmetries_are_those_of_the_forced_motion():
     assert [str(each.momentum_map) for each in symmetries(dragged)] == ["p_x + x/2"]
 
 
-def test_what_needs_an_action_refuses_forces():
+def test_functions_that_need_an_action_reject_forces():
     system = driven(forces={"x": "-c*x_dot"})
     with pytest.raises(SystemDefinitionError, match="forces act on 'driven'"):
         reparametrise(system, "1 + x**2")
@@ -132,7 +132,7 @@ def test_what_needs_an_action_refuses_forces():
         discretise(hamiltonian_of(system), SCVI(2))
 
 
-def test_model_files_hold_forces():
+def test_model_files_contain_forces():
     text = """
         [system]
         name = "driven pendulum"

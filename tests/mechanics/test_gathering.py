@@ -107,12 +107,12 @@ def test_parameters_that_all_have_in_common_stay():
         ),
     ],
 )
-def test_what_is_refused(system, message):
+def test_unsupported_systems_are_rejected(system, message):
     with pytest.raises(SystemDefinitionError, match=message):
         sc.roll_sums(system)
 
 
-def test_inputs_keep_their_names():
+def test_inputs_retain_their_names():
     q = [f"q{i}" for i in range(4)]
     springs = "".join(f" - ({b} - {a})**2/2" for a, b in pairwise(q))
     system = sc.LagrangianSystem.from_text(
@@ -141,7 +141,7 @@ def test_inputs_keep_their_names():
 
 
 @pytest.mark.parametrize("term", ["3", "3*sin(t)", "g", "g*cos(t) + x*0 + 2"])
-def test_terms_without_coordinates_leave_a_system_that_can_be_run(term):
+def test_terms_without_coordinates_give_a_runnable_system(term):
     written = lagrangian(["x", "y"], f"x_dot**2/2 - x**2/2 + y_dot**2/2 - y**2/2 + {term}", g=2.0)
     found = sc.roll_sums(written)
     assert {name: table.shape[1] for name, table in found.tables.items()} == {

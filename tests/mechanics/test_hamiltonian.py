@@ -122,7 +122,7 @@ def test_refused_systems(changes: dict[str, object], message: str) -> None:
         HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
 
 
-def test_model_files_hold_a_hamiltonian() -> None:
+def test_model_files_contain_a_hamiltonian() -> None:
     model = Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5)
     text = dump_model(model)
     assert 'hamiltonian = "p*q"' in text
@@ -174,7 +174,7 @@ def test_legendre_there_and_back(name: str) -> None:
     assert abs(again.lagrangian.evalf(40, subs=point) - system.lagrangian.evalf(40, subs=point)) < 1e-30
 
 
-def test_what_has_no_legendre_transform_is_named() -> None:
+def test_missing_legendre_transform_is_named() -> None:
     with pytest.raises(SystemDefinitionError, match="velocities do not determine momenta"):
         lagrangian_of(hyperbolic())
     assert equivalent_lagrangian(hyperbolic()) is None
@@ -213,7 +213,7 @@ def test_transforms_and_energy_are_those_of_the_lagrangian(sample) -> None:
     assert np.abs(two.discrete_legendre_minus(q, q1, 0.1)[1] - p).max() < 1e-12
 
 
-def test_compositions_take_a_separable_hamiltonian(sample) -> None:
+def test_compositions_accept_a_separable_hamiltonian(sample) -> None:
     system = sample("kepler").system
     q, p = sample("kepler").state
     one, two = (
@@ -252,7 +252,7 @@ def test_a_hamiltonian_without_a_lagrangian(method, error) -> None:
     [SVI(3, "gauss-legendre:4"), SCVI(2), SpectralCollocation(2), Gauss(2, form="position")],
     ids=lambda method: method.name,
 )
-def test_methods_that_need_a_lagrangian_say_so(method) -> None:
+def test_methods_that_need_a_lagrangian_are_reported(method) -> None:
     for make in (compile_stepper, derive):
         with pytest.raises(MethodError, match="as many quadrature points as its degree"):
             make(hyperbolic(), method)
@@ -283,7 +283,7 @@ def vortex_rates(state: np.ndarray, strength: np.ndarray) -> np.ndarray:
     return np.concatenate([u, strength * v])
 
 
-def test_point_vortices_against_gauss_written_out() -> None:
+def test_point_vortices_agree_with_gauss_by_hand() -> None:
     entry = problem("point-vortices")
     strength = np.array(entry.system.defaults)
     stepper = compile_stepper(entry.system, SVI(2), flags=QUICK)

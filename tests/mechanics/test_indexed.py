@@ -76,7 +76,7 @@ def test_a_chain_between_walls_has_no_momentum() -> None:
     assert not momentum_maps(system("q[N]", f"{kinetic}{springs} - q[0]**2 - q[N-1]**2"))
 
 
-def test_what_is_written_out() -> None:
+def test_unrolled_system_has_one_coordinate_per_element() -> None:
     """Every element with its own coordinates, parameters and places."""
     net = IndexedSystem.from_text(
         name="net",
@@ -103,7 +103,9 @@ def test_what_is_written_out() -> None:
         ({"N": 3}, {"tables": {"x": [[1]]}}, "the tables of 'chain' are none"),
     ],
 )
-def test_what_cannot_be_written_out(sizes: dict[str, int], beside: dict[str, object], message: str) -> None:
+def test_systems_that_cannot_be_unrolled_are_rejected(
+    sizes: dict[str, int], beside: dict[str, object], message: str
+) -> None:
     """Sizes, tables and parameters are those of the system."""
     chain = IndexedSystem.from_text(
         name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
@@ -112,7 +114,7 @@ def test_what_cannot_be_written_out(sizes: dict[str, int], beside: dict[str, obj
         unroll_sums(chain, sizes, **beside)
 
 
-def test_what_is_derived_is_shown() -> None:
+def test_derived_terms_are_displayed() -> None:
     """A slope for every slot; the formula as a mathematician writes it."""
     net = system(
         "q[N]",
@@ -138,7 +140,7 @@ def test_what_is_derived_is_shown() -> None:
         assert part in shown
 
 
-def test_sums_of_sympy_are_read() -> None:
+def test_sympy_sums_are_read() -> None:
     """Rings, pairs, tables, several indices and decimals, as from text."""
     q, v, bonds, k = map(sympy.IndexedBase, ("q", "q_dot", "bonds", "k"))
     i, j, b, N, B = sympy.symbols("i j b N B", integer=True)
@@ -173,7 +175,7 @@ def test_sums_of_sympy_are_read() -> None:
         ("i", "(j, i + 1, N - 1), (i, 1, N - 2)"),
     ],
 )
-def test_sums_of_sympy_that_are_refused(index: str, limits: str) -> None:
+def test_unsupported_sympy_sums_are_rejected(index: str, limits: str) -> None:
     """Other rings, other limits, and what leaves its array."""
     q, v = map(sympy.IndexedBase, ("q", "q_dot"))
     i, j, N = sympy.symbols("i j N", integer=True)
@@ -233,7 +235,7 @@ def test_forces_and_what_they_conserve() -> None:
     assert system("q[N]", ring, forces={"q[0]": "cos(t)"}).velocities == ()
 
 
-def test_forces_are_written_out() -> None:
+def test_forces_are_unrolled() -> None:
     """At every place, of every component, and at one place."""
     found = unroll_sums(
         system(

@@ -108,7 +108,7 @@ def test_auxiliary_speeds_are_zero_and_what_they_bring_does_no_work() -> None:
     assert taken(method) == text("q1", "m*q1_dot**2/2 - k*q1**2/2")
 
 
-def test_forces_that_depend_on_time_are_inputs_or_held() -> None:
+def test_time_dependent_forces_are_inputs_or_set_to_zero_order_hold() -> None:
     force = dynamicsymbols("F")
     method = kanes_method(Q1, loads=(force - K * Q1,))
     driven = taken(method, inputs=[force])
@@ -128,7 +128,7 @@ def test_weights_and_springs_become_a_potential_and_dampers_stay_forces() -> Non
     assert np.ptp(run.energy()) < 1e-12
 
 
-def test_what_rolls_is_held_by_forces_that_do_no_work() -> None:
+def test_rolling_constraint_forces_do_no_work() -> None:
     mechanism = MECHANISMS["rolling disc"]()
     system = mechanism.system()
     power = sympy.Add(*(f * v for f, v in zip(system.forces, system.velocities, strict=True)))
@@ -155,7 +155,7 @@ def test_potential_energies_count_as_in_the_equations() -> None:
     assert LagrangianSystem.from_system(system, name="taken", parameters=NAMED) == with_energy
 
 
-def test_what_is_said_of_velocities_is_a_constraint_unless_the_configuration_says_it() -> None:
+def test_velocity_constraints_implied_by_configuration_constraints_are_dropped() -> None:
     options = {"q": (Q1,), "u": (U1,), "kd": [Q1.diff(T) - U1, Q2.diff(T) - U2], "u_dependent": [U2]}
     rate = [U1 - 2 * Q1 * U2]
     configuration = {"q_dependent": [Q2], "configuration_constraints": [Q2 - Q1**2]}
@@ -189,7 +189,7 @@ def test_a_bicycle_has_the_constraints_of_its_wheels() -> None:
         (lambda: "KanesMethod", "method must be a KanesMethod of sympy.physics.mechanics"),
     ],
 )
-def test_what_is_missing_is_named(method: Any, message: str) -> None:
+def test_missing_parts_are_named(method: Any, message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         taken(method())
 
@@ -240,7 +240,7 @@ DISTANCE = (sympy.sin(X) + A * sympy.sin(Y)) ** 2 + (2 - sympy.cos(X) - A * symp
     ],
     ids=str,
 )
-def test_potentials_are_found_from_their_slopes(potential: sympy.Expr) -> None:
+def test_potentials_are_recovered_from_their_gradients(potential: sympy.Expr) -> None:
     variables = (X, Y, Z)
     found = potential_of([-potential.diff(q) for q in variables], variables)
     assert found is not None
@@ -252,5 +252,5 @@ def test_potentials_are_found_from_their_slopes(potential: sympy.Expr) -> None:
 @pytest.mark.parametrize(
     "forces", [(Y, -X), (Y, 2 * X), (-X / (X**2 + Y**2) + Y, -Y / (X**2 + Y**2)), (Y * sympy.tan(X), 0)]
 )
-def test_what_has_no_potential_has_none(forces: tuple[sympy.Expr, ...]) -> None:
+def test_nonconservative_forces_have_no_potential(forces: tuple[sympy.Expr, ...]) -> None:
     assert potential_of(list(map(sympy.sympify, forces)), (X, Y)) is None

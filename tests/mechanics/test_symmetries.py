@@ -157,7 +157,7 @@ def test_masses_that_differ_between_the_axes():
     assert formulas(system)["angular momentum of u, w"] == "m*u*p_w - M*w*p_u"
 
 
-def test_sums_of_parameters_in_coefficients():
+def test_symmetries_with_sums_of_parameters_in_coefficients():
     system = LagrangianSystem.from_text(
         name="trolley",
         coordinates=["x", "y"],
@@ -170,7 +170,7 @@ def test_sums_of_parameters_in_coefficients():
     assert turn.formula == "x*p_y - y*p_x - (a + b)*p_y"
 
 
-def test_long_numbers_in_a_formula_come_back_to_the_last_digit():
+def test_long_decimal_numbers_are_exact():
     system = LagrangianSystem.from_text(
         name="measured",
         coordinates=["x"],
@@ -179,7 +179,7 @@ def test_long_numbers_in_a_formula_come_back_to_the_last_digit():
     assert symmetries(system)[1].momentum_map.coeff(Symbol("x", real=True)) == sympy.Rational("1.00000597682")
 
 
-def test_other_linear_coordinates():
+def test_symmetries_in_other_linear_coordinates():
     """Kepler's problem in x = 2 u + w, y = u - 3 w: the rotation has no simple form there."""
     system = LagrangianSystem.from_text(
         name="skew",
@@ -203,7 +203,7 @@ def test_magnetic_fields_have_gauges():
 
 @pytest.mark.parametrize("axes", ["xy", "xyz"])
 @pytest.mark.parametrize("gravity", [False, True])
-def test_three_bodies_have_the_whole_galilean_group(axes, gravity):
+def test_three_bodies_have_the_full_galilean_group(axes, gravity):
     """Translations, rotations and boosts, 5 in the plane, 9 in space; energy would be the tenth."""
     found = formulas(bodies(axes, gravity=gravity))
     turns = ["angular momentum"] if axes == "xy" else [f"angular momentum {axis}" for axis in axes]
@@ -213,7 +213,7 @@ def test_three_bodies_have_the_whole_galilean_group(axes, gravity):
         assert found["linear momentum y"] == "p_a_y + p_b_y + p_c_y"
 
 
-def test_more_than_twelve_coordinates_are_tried_as_a_whole():
+def test_more_than_twelve_coordinates_are_searched_together():
     chain = " ".join(f"+ cos(q{k} - q{(k + 1) % 14})" for k in range(14))
     kinetic = " + ".join(f"M*q{k}_dot**2/2" for k in range(14))
     closed = LagrangianSystem.from_text(
@@ -235,7 +235,7 @@ def test_more_than_twelve_coordinates_are_tried_as_a_whole():
 
 
 @pytest.mark.parametrize("axis", "xyz")
-def test_each_rotation_turns_about_the_axis_it_is_named_for(axis):
+def test_each_rotation_is_about_the_axis_in_its_name(axis):
     others = [name for name in "xyz" if name != axis]
     (symmetry,) = symmetries(particle(f"({others[0]}**2 + {others[1]}**2)**2 + {axis}**2/3", "xyz"))
     assert symmetry.name == f"angular momentum {axis}"
@@ -327,7 +327,7 @@ def rate(system: MechanicalSystem, symmetry: Symmetry) -> sympy.Expr:
 
 
 @pytest.mark.parametrize("system", [particle("m*g*y", g=9.81), magnetic(), particle("1/sqrt(x**2 + y**2)")], ids=str)
-def test_each_is_conserved_identically(system):
+def test_each_momentum_map_is_conserved_identically(system):
     for symmetry in symmetries(system):
         assert rate(system, symmetry) == 0
         assert forms_of(system).euler_lagrange
@@ -335,7 +335,7 @@ def test_each_is_conserved_identically(system):
         assert sympy.expand(sympy.Add(*products) - symmetry.gauge - symmetry.momentum_map) == 0
 
 
-def test_searching_takes_no_time_to_speak_of():
+def test_symmetry_search_is_fast():
     for name in (*PROBLEMS, "fput-chain:64"):
         system = problem(name).system
         symmetries.cache_clear()
@@ -401,13 +401,13 @@ DIAGONAL = Tableau(name="two midpoints", A=((QUARTER, 0), (HALF, QUARTER)), b=(H
     ],
     ids=lambda value: getattr(value, "name", None),
 )
-def test_what_methods_claim_to_conserve(method, polynomials, curve, quadrature):
+def test_conservation_claims_of_methods(method, polynomials, curve, quadrature):
     """GNI, theorems IV.2.1 and IV.2.2; Gauss methods are variational, their curves of degree s."""
     claim = method.exactness
     assert (claim.polynomials, claim.curve, claim.quadrature) == (polynomials, curve, quadrature)
 
 
-def test_a_gauge_of_ones_own():
+def test_user_defined_gauge():
     cart = problem("cart-pole").system
     found = check_symmetry(cart, ["t", 0], gauge="(M + m)*x + m*l*sin(theta)", name="centre of mass")
     assert str(found) == "centre of mass = -l*m*sin(theta) + p_x*t - x*(M + m)"
@@ -432,7 +432,7 @@ def test_a_gauge_that_is_not_quadratic_is_found(name):
     assert check_symmetry(system, direction, gauge=found.gauge).momentum_map == found.momentum_map
 
 
-def test_what_is_not_decided_is_not_denied():
+def test_undecided_symmetries_are_not_denied():
     drift = "exp(x**2)*sin(x)"
     system = LagrangianSystem.from_text(
         name="drift", coordinates=["x"], lagrangian=f"x_dot**2/2 + {drift}*x_dot", parameters={}
@@ -495,7 +495,7 @@ def test_values_are_those_of_the_formulas(quickly_compiled):
     assert np.array_equal(stepper.momentum_maps(q[0], p[0], t[0], {"m": 2.5}), values[0])
 
 
-def test_without_symmetries_nothing_is_emitted(quickly_compiled):
+def test_without_symmetries_no_code_is_generated(quickly_compiled):
     entry = problem("henon-heiles")
     stepper = quickly_compiled(entry.system, SVI(2))
     assert "momentum_maps" not in stepper.source.header + stepper.source.code
@@ -518,7 +518,7 @@ EXACT = [
 
 
 @pytest.mark.parametrize(("name", "method"), EXACT, ids=lambda value: getattr(value, "name", value))
-def test_what_a_method_is_said_to_conserve_it_conserves(quickly_compiled, name, method):
+def test_claimed_conservation_is_measured(quickly_compiled, name, method):
     system, q, p = SYSTEMS[name]
     stepper = quickly_compiled(system, method)
     errors = np.abs(stepper.integrate(q, p, h=0.05, steps=400).momentum_errors()).max(axis=0)
@@ -539,7 +539,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("name", "method", "broken"), BROKEN, ids=lambda value: getattr(value, "name", value))
-def test_what_is_not_promised_may_be_broken(quickly_compiled, name, method, broken):
+def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, broken):
     """Where the promise would be wrong; 100 times the round-off bound."""
     system, q, p = SYSTEMS[name]
     stepper = quickly_compiled(system, method)
@@ -576,7 +576,7 @@ def test_a_given_generator_is_tracked(quickly_compiled):
     assert 0 < np.abs(run.momentum_errors()[:, 1]).max() < 1e-11
 
 
-def test_rotations_of_phase_space_are_kept(quickly_compiled):
+def test_phase_space_rotations_are_conserved(quickly_compiled):
     run = quickly_compiled(ROTATOR, SVI(3)).integrate([1.0], [0.5], h=0.1, steps=400)
     assert np.abs(run.momentum_errors()).max() < ROUNDOFF
     outside = quickly_compiled(CYLINDER, SVI(3)).integrate([2.0, -1.5], [0.0, 0.5], h=0.1, steps=400)
@@ -584,7 +584,7 @@ def test_rotations_of_phase_space_are_kept(quickly_compiled):
     assert np.abs(outside.momentum_errors()).max() < ROUNDOFF
 
 
-def test_ensembles_track_them_with_parameters_of_their_own(quickly_compiled):
+def test_ensembles_track_momentum_maps_with_individual_parameters(quickly_compiled):
     stepper = quickly_compiled(particle("k*(x**2 + y**2)**2", k=1.0), SVI(2))
     q, p = np.array([[1.0, 0.2], [0.3, 0.4]]), np.array([[0.1, 0.9], [0.5, -0.2]])
     runs = stepper.integrate_ensemble(q, p, h=0.05, steps=20, parameters={"k": [0.5, 2.0]})
@@ -602,7 +602,7 @@ def test_derivations_show_them():
     assert "conserved" not in derive(problem("henon-heiles").system, SVI(1)).to_text()
 
 
-def test_headers_say_what_is_conserved():
+def test_headers_list_conserved_quantities():
     source, interface = generate_source(magnetic(), RadauIIA(2))
     assert " *   momentum of x = p_x - B*e*y - E*e*t\n" in source.header
     assert " *   boost of z = m*z - p_z*t (not guaranteed by this method)\n" in source.header
@@ -624,13 +624,13 @@ def test_singular_values_are_called_large_only_if_they_are(smallest):
     assert said or smallest < 1e-6
 
 
-def test_where_nothing_is_conserved_no_singular_values_are_computed(monkeypatch):
+def test_without_conserved_quantities_no_singular_values_are_computed(monkeypatch):
     tilted = particle("sin(x*y) + x**4 + cos(y) + x*cos(t)")
     monkeypatch.setattr(np.linalg, "svd", None)
     assert symmetries(tilted) == ()
 
 
-def test_of_one_forms_whose_forces_depend_on_velocities_nothing_is_claimed():
+def test_no_claims_for_one_forms_with_velocity_dependent_forces():
     """A Lagrangian a(q) p . v - H, as a system of one's own may have it: no TypeError from floats of symbols."""
 
     @dataclass(frozen=True, slots=True, kw_only=True)

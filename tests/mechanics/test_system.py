@@ -48,7 +48,7 @@ def test_fields_from_text() -> None:
     assert system.lagrangian == m * (vx**2 + vy**2) / 2 - x * y * cos(t) / 10
 
 
-def test_text_comes_back() -> None:
+def test_text_round_trip() -> None:
     system = from_text("x y", "(x_dot**2 + y_dot**2)/2 + mu/sqrt(x**2 + y**2) - 0.3*x*t", mu=1)
     assert from_text("x y", system.to_text(), mu=1) == system
 
@@ -86,7 +86,7 @@ def test_unevaluated_derivatives_are_carried_out() -> None:
     assert from_sympy(height**2 / 2 + Q1.diff(T) ** 2 / 2, Q1) == from_text("q1", "2*q1**2*q1_dot**2 + q1_dot**2/2")
 
 
-def test_floats_become_the_rationals_they_are_written_as() -> None:
+def test_floats_become_the_rationals_of_their_decimals() -> None:
     lagrangian = 0.5 * V**2.0 - 0.1 * X**2 + sympy.Float("0.1234567890123456789012345", 30) * X
     system = from_sympy(lagrangian, X)
     x, v = real("x x_dot")
@@ -94,7 +94,7 @@ def test_floats_become_the_rationals_they_are_written_as() -> None:
     assert not system.lagrangian.atoms(sympy.Float)
 
 
-def test_unevaluated_nodes_are_evaluated_so_that_text_comes_back() -> None:
+def test_unevaluated_nodes_are_evaluated_for_the_text_round_trip() -> None:
     x, v = real("x x_dot")
     system = from_sympy(sympy.Mul(2, v**2 + x, evaluate=False), x)
     assert from_text("x", system.to_text()) == system
@@ -128,7 +128,7 @@ def test_numbers_of_all_kinds_as_defaults() -> None:
         assert from_text("x", "k*x_dot**2", k=value).defaults == (2.0,)
 
 
-def test_with_parameters() -> None:
+def test_with_parameters_replaces_values() -> None:
     system = from_text("x", "m*x_dot**2/2 - k*x**2", m=1, k=2)
     assert system.with_parameters(k=3) == from_text("x", "m*x_dot**2/2 - k*x**2", m=1, k=3)
     assert system.defaults == (1.0, 2.0)
@@ -150,7 +150,7 @@ def lagranges_method(**options: Any) -> LagrangesMethod:
     return LagrangesMethod(lagrangian, [Q1, Q2], **options)
 
 
-def test_lagranges_method_gives_its_own_equations_of_motion() -> None:
+def test_lagranges_method_has_equal_equations_of_motion() -> None:
     method = lagranges_method()
     system = LagrangianSystem.from_lagranges_method(method, name="system", parameters=PHYSICS)
     assert system.defaults == (1.5, 2.0, 9.81)
@@ -337,7 +337,7 @@ def test_regular_lagrangians_of_all_kinds_are_accepted(lagrangian: str) -> None:
     assert from_text("x y", lagrangian).dimension == 2
 
 
-def test_an_unused_parameter_is_kept() -> None:
+def test_unused_parameter_is_retained() -> None:
     with pytest.warns(SystemDefinitionWarning, match="parameter 'spare' is not used"):
         assert from_text("x", "x_dot**2", spare=3).parameters == real("spare")
 

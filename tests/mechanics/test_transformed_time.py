@@ -89,7 +89,7 @@ def test_legendre_transform_of_one_is_the_other(system: sc.LagrangianSystem, mon
         assert abs(one - other) <= mp.mpf(10) ** -50 * (1 + abs(one))
 
 
-def test_monitors_by_name_in_kepler_s_problem() -> None:
+def test_named_time_transformations_of_keplers_problem() -> None:
     x, y, m, mu = map(symbol, ("x", "y", "m", "mu"))
     square = x**2 + y**2
     for name, expected in (
@@ -155,7 +155,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_has_no_monitor_is_refused(name: str) -> None:
+def test_systems_without_a_time_transformation_are_rejected(name: str) -> None:
     system, monitor, message = REFUSED[name]
     with pytest.raises(SystemDefinitionError, match=message):
         sc.reparametrise(system, monitor)
@@ -170,6 +170,6 @@ def test_what_has_no_monitor_is_refused(name: str) -> None:
         ({"x": "u + y", "y": "u + y"}, ["u", "w"], "y"),
     ],
 )
-def test_what_is_no_change_of_coordinates_is_refused(old: dict[str, str], new: list[str], message: str) -> None:
+def test_invalid_coordinate_changes_are_rejected(old: dict[str, str], new: list[str], message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         sc.change_coordinates(KEPLER, old, coordinates=new)

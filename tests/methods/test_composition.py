@@ -69,7 +69,7 @@ def test_energy_does_not_drift():
     assert error[-2000:].max() < 1.5 * error[:2000].max()
 
 
-def test_many_bodies():
+def test_composition_of_many_bodies():
     entry = problem("outer-solar-system")
     stepper = compile_stepper(outer_solar_system(), Composition(10))
     p = stepper.momentum(entry.q, entry.velocity)
@@ -77,7 +77,7 @@ def test_many_bodies():
     assert np.abs(run.energy() / run.energy()[0] - 1).max() < 1e-12
 
 
-def test_momenta_at_rest_are_no_velocities():
+def test_momenta_at_rest_are_not_velocities():
     """L + 3 v has the same motion, and momenta that are larger by 3; leapfrog steps of p / m would be others."""
     plain, shifted = (
         LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian=f"q_dot**2/2 - q**4/4{more}")

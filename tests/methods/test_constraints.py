@@ -64,7 +64,7 @@ def swung():
 
 
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
-def test_the_order_is_2s_and_constraints_hold_to_rounding(s, swung):
+def test_order_is_2s_and_constraints_hold_to_rounding(s, swung):
     stepper, errors = compile_stepper(rod(), lobatto(s)), []
     for steps in (12, 24):
         run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=1.2 / steps, steps=steps)
@@ -138,7 +138,7 @@ def test_steps_are_symplectic_on_the_tangent_bundle_of_the_circle():
     assert after == pytest.approx(before, rel=1e-8)
 
 
-def test_energy_is_bounded_and_momenta_are_kept():
+def test_energy_is_bounded_and_momenta_are_conserved():
     """A spherical pendulum of two rods: energy without drift over 20,000 steps, the angular momentum to rounding."""
     system = LagrangianSystem.from_text(
         name="two rods in space",
@@ -158,7 +158,7 @@ def test_energy_is_bounded_and_momenta_are_kept():
     assert max(np.abs(part).max() for part in run.constraint_values()) < 1e-13
 
 
-def test_the_first_guess_goes_on_with_the_velocity_at_the_end():
+def test_predictor_uses_the_velocity_at_the_end_of_the_step():
     """Two rods in space, RATTLE: 6.7 iterations a step where velocities and multipliers were guessed to stay."""
     rods = LagrangianSystem.from_text(
         name="two rods",
@@ -217,7 +217,7 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
     ],
 )
 @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
-def test_constraints_that_depend_on_each_other_where_they_hold_are_named(method, third, said):
+def test_constraints_dependent_on_the_manifold_are_named(method, third, said):
     """Generic points do not show it: G loses rank on the constraint manifold alone."""
     system = LagrangianSystem.from_text(
         name="loop",
@@ -254,7 +254,7 @@ def test_initial_states_are_projected_or_refused():
 
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
-def test_what_is_off_the_constraints_is_so_in_any_units(unit):
+def test_constraint_violation_is_independent_of_units(unit):
     """A slide in metres, an angle in radians: how far they are off is told, and refused, whatever the metre is."""
 
     def crank(metre):
@@ -290,7 +290,7 @@ def test_what_is_off_the_constraints_is_so_in_any_units(unit):
         assert found[0] == found[1]
 
 
-def test_parts_of_steps_events_and_chosen_steps():
+def test_dense_output_events_and_adaptive_steps_with_constraints():
     stepper = compile_stepper(rod(), lobatto(4))
     run = stepper.integrate(on_circle(1.3), [0.0, 0.0], h=0.05, steps=40, events="x")
     q, p = run.at([0.333, 1.234])
@@ -300,7 +300,7 @@ def test_parts_of_steps_events_and_chosen_steps():
 
 
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
-def test_the_error_of_a_step_is_told_by_the_velocity_at_its_end(s):
+def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
     """Told by the curve alone it was 1500 times too much with degree 3 (the median), and not told with degree 1."""
     pendulum = LagrangianSystem.from_text(
         name="angle", coordinates=["a"], lagrangian="l**2*a_dot**2/2 + g*l*cos(a)", parameters={"g": G, "l": 1.5}
@@ -350,7 +350,7 @@ def test_positions_do_not_follow_constraints_that_jump():
         assert run.parameters[0] == 0.0
 
 
-def test_from_sympy_and_from_lagranges_method():
+def test_constraints_from_sympy_and_lagranges_method():
     x, y = dynamicsymbols("x y")
     t, m, length = dynamicsymbols._t, sympy.Symbol("m"), sympy.Symbol("l")
     L = m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 - m * sympy.Float("9.81") * y
@@ -378,7 +378,7 @@ def test_from_sympy_and_from_lagranges_method():
         ("x - y", "list of texts"),
     ],
 )
-def test_what_is_no_constraint(constraints, said):
+def test_invalid_constraints_are_rejected(constraints, said):
     with pytest.raises(SystemDefinitionError, match=said):
         LagrangianSystem.from_text(
             name="plane",
@@ -389,7 +389,7 @@ def test_what_is_no_constraint(constraints, said):
         )
 
 
-def test_a_constraint_said_twice_is_named():
+def test_duplicate_constraint_is_named():
     with pytest.raises(SystemDefinitionError, match=r"'x\*z - 1' is redundant|'2\*x\*z - 2' is redundant"):
         LagrangianSystem.from_text(
             name="space",
@@ -402,12 +402,12 @@ def test_a_constraint_said_twice_is_named():
 @pytest.mark.parametrize(
     "method", [SVI(2), Gauss(2), SCVI(2), StoermerVerlet(), SVI(2, "gauss-lobatto:4")], ids=lambda one: one.name
 )
-def test_methods_that_do_not_keep_constraints_are_refused(method):
+def test_methods_without_constraint_support_are_rejected(method):
     with pytest.raises(MethodError, match=r"SVI\(4, 'gauss-lobatto:5'\)"):
         compile_stepper(rod(), method)
 
 
-def test_in_transformed_time_constraints_and_orders_stay():
+def test_time_transformation_preserves_constraints_and_orders():
     """A bead on a circle past a centre; multipliers are forces in the time as it is."""
     bead = LagrangianSystem.from_text(
         name="bead",
@@ -429,7 +429,7 @@ def test_in_transformed_time_constraints_and_orders_stay():
     assert_allclose(run.multipliers()[-1], plain.multipliers()[-1], rtol=1e-5)
 
 
-def test_of_a_hamiltonian_they_are_those_of_its_lagrangian():
+def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
     """Also in model files: the same momenta, the same motion."""
     text = {"name": "rod", "coordinates": ["x", "y"], "parameters": {"m": 2.0, "g": G, "l": 1.5}}
     formula, circle = "(p_x**2 + p_y**2)/(2*m) + m*g*y", ["x**2 + y**2 = l**2"]
@@ -457,7 +457,7 @@ def test_of_a_hamiltonian_they_are_those_of_its_lagrangian():
         HamiltonianSystem.from_text(hamiltonian=formula, constraints=circle, **text)
 
 
-def test_what_constraints_do_not_go_with():
+def test_unsupported_combinations_with_constraints_are_rejected():
     rolling = LagrangianSystem.from_text(
         name="blade", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2", constraints=["x_dot = y*y_dot"]
     )

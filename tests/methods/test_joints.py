@@ -34,7 +34,7 @@ def reduced(lagrangian: str, start: list[float], velocity: list[float], t: np.nd
     return run.at(t)[0]
 
 
-def test_a_dumbbell_flies_as_its_centre_and_turns_evenly():
+def test_free_dumbbell_has_uniform_translation_and_rotation():
     run = ran(JOINTS.dumbbell())
     (one, other), t, turning = run.q.reshape(-1, 2, 2).transpose(1, 0, 2), run.t, 2.0 / 0.8
     centre = np.column_stack([0.6 + 2.0 * t, 4.5 * t - G * t**2 / 2])
@@ -125,7 +125,7 @@ def by_joints() -> np.ndarray:
     return pulls
 
 
-def test_the_members_of_the_bridge_carry_what_the_method_of_joints_says():
+def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     run = JOINTS.bridge().run(0.1, 1, "svi:1")
     pulls = JOINTS.pulls(run)
     assert np.abs(run.q - run.q[0]).max() < 1e-13
@@ -146,7 +146,7 @@ def test_the_bridge_swings_as_a_pendulum():
     assert_allclose(run.q.reshape(len(run), -1, 2) - JOINTS.PLACES, moved[:, np.newaxis].repeat(9, axis=1), atol=1e-9)
 
 
-def test_a_state_with_coordinates_at_0_is_met():
+def test_state_with_zero_coordinates_is_projected():
     """There an update far below the rounding of the others still changes g, a little less each time."""
     hook = JOINTS.bent_pendulum()
     q, p = compile_stepper(hook.system, "svi:2").project(hook.q, [0.0] * 4)

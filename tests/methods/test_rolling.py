@@ -57,7 +57,7 @@ def test_the_order_is_2s_and_the_step_is_symmetric(s, steps):
         assert_allclose(free.q[-1], end.y[:3, -1], atol=1e-11)
 
 
-def test_chaplygins_sleigh_turns_into_its_track():
+def test_chaplygin_sleigh_agrees_with_its_closed_form():
     """Without springs: speed V tanh(k t), rate of turning W sech(k t), k = m d V / J; from a turn on the spot."""
     m, j, d, turning = 1.3, 0.7, 0.2, 0.9
     speed = np.sqrt(j / m) * turning
@@ -70,7 +70,7 @@ def test_chaplygins_sleigh_turns_into_its_track():
     assert_allclose(np.hypot(*run.velocity.T[:2]), speed * np.tanh(k * run.t), atol=1e-10)
 
 
-def test_a_disk_rolls_in_circles_and_keeps_what_nothing_pushes():
+def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
     disk = LagrangianSystem.from_text(
         name="rolling disk",
         coordinates=["x", "y", "a", "b"],
@@ -102,7 +102,7 @@ def test_energy_does_not_drift():
     assert abs(energy[-500:].mean() - energy[:500].mean()) < 1e-8
 
 
-def test_beside_constraints_of_positions_and_in_motion():
+def test_holonomic_and_moving_nonholonomic_constraints_combine():
     """On a slope x = 4 z: the same as with z left out; and dragged, x_dot = cos(t)."""
     common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
     skate = "x_dot*sin(a) - y_dot*cos(a)"
@@ -142,7 +142,7 @@ def test_beside_constraints_of_positions_and_in_motion():
     assert_allclose(run.multipliers()[:, 0], -np.sin(run.t), atol=1e-13)
 
 
-def test_from_sympys_mechanics():
+def test_nonholonomic_constraints_from_sympy_mechanics():
     x, y, a = dynamicsymbols("x y a")
     m, j, d, k = sympy.symbols("m J d k")
     vx, vy, w = (q.diff() for q in (x, y, a))
@@ -157,7 +157,7 @@ def test_from_sympys_mechanics():
     assert_allclose(one.step(START[0], p, 0.1), other.step(START[0], p, 0.1), rtol=1e-14)
 
 
-def test_what_is_refused():
+def test_invalid_nonholonomic_constraints_are_rejected():
     skate = {"name": "skate", "coordinates": ["x", "y"], "lagrangian": "x_dot**2 + y_dot**2"}
     with pytest.raises(SystemDefinitionError, match="not linear in the velocity x_dot"):
         LagrangianSystem.from_text(**skate, constraints=["x_dot**2 = y"])
@@ -180,7 +180,7 @@ def test_what_is_refused():
     assert_allclose(q, [0.0, 0.0, 0.5], atol=0.0)
 
 
-def test_the_derivation_shows_what_is_said_of_velocities():
+def test_derivation_shows_nonholonomic_constraints():
     text = derive(sleigh(), lobatto(1)).to_text()
     assert "0 = x_dot*sin(a) - y_dot*cos(a)" in text
     assert "lambda_1" in text

@@ -94,7 +94,7 @@ def test_the_map_is_symplectic_and_symmetric():
     assert np.abs(step(step(state), -0.3, 0.3) - state).max() < 1e-15
 
 
-def test_a_logarithmic_hamiltonian_keeps_the_ellipse():
+def test_logarithmic_hamiltonian_preserves_the_ellipse():
     """Of Mikkola and Tanikawa, and Preto and Tremaine: second order in time alone, the orbit is exact."""
     system = HamiltonianSystem.from_text(
         name="logarithmic",
@@ -111,7 +111,7 @@ def test_a_logarithmic_hamiltonian_keeps_the_ellipse():
     assert run.q[-1, 2] > 10 * np.pi
 
 
-def test_what_is_not_separable_is_refused():
+def test_nonseparable_hamiltonians_are_rejected():
     with pytest.raises(MethodError, match="requires a separable system"):
         compiled(problem("double-pendulum").system, StoermerVerlet(DRIFTS_FIRST))
     timed = HamiltonianSystem.from_text(name="timed", coordinates=["x"], hamiltonian="p_x**4*cos(t) + p_x**2 + x**2")
@@ -121,19 +121,19 @@ def test_what_is_not_separable_is_refused():
         StoermerVerlet("kick")
 
 
-def test_there_is_no_discrete_lagrangian_of_drifts_first():
+def test_drift_first_sequences_have_no_discrete_lagrangian():
     stepper = compiled(DUFFING, StoermerVerlet(DRIFTS_FIRST))
     with pytest.raises(MethodError, match="no discrete Lagrangian"):
         stepper.discrete_lagrangian([0.1], [0.2], 0.1)
 
 
-def test_where_the_velocity_is_no_number_the_step_fails():
+def test_step_fails_where_the_velocity_is_nan():
     falling = HamiltonianSystem.from_text(name="root", coordinates=["x"], hamiltonian="p_x*sqrt(p_x) + x")
     with pytest.raises(StepFailedError, match="infinite or NaN"):
         compiled(falling, StoermerVerlet(DRIFTS_FIRST)).integrate([0.0], [1.0], h=0.5, steps=20)
 
 
 @pytest.mark.parametrize("method", [StoermerVerlet(DRIFTS_FIRST), Composition(8, DRIFTS_FIRST), Composition(10)])
-def test_a_specification_says_the_sequence(method):
+def test_specification_contains_the_sequence(method):
     assert method_from_specification(method.specification()) == method
     assert method.name.endswith(DRIFTS_FIRST) == method.drifts_first

@@ -105,7 +105,7 @@ def test_states_are_those_of_the_stepper_bit_for_bit(name, tmp_path):
     assert_allclose(np.array(found), expected, rtol=0, atol=0)
 
 
-def test_inputs_are_held_and_parameters_may_change_on_the_way(fmu):
+def test_inputs_are_zero_order_hold_and_parameters_may_change(fmu):
     model, one = pushed(), Slave(fmu)
     assert one.start(0.5, u=0.25, w=0.1) == OK
     run = stepper_of(model).start(model.q, velocity=model.velocity, h=H, t=0.5, parameters={"w_0": 0.1, "u_0": 0.25})
@@ -122,7 +122,7 @@ def test_inputs_are_held_and_parameters_may_change_on_the_way(fmu):
     assert one.get("q_dot") == [run.p[0] / (2.5 + w)]
 
 
-def test_communication_steps_of_any_length_are_equal_parts(fmu):
+def test_communication_steps_of_any_length_are_divided_equally(fmu):
     one, stepper = Slave(fmu), stepper_of(pushed())
     assert one.start(0.5) == OK
     assert one.step(0.5, 0.25) == OK
@@ -133,7 +133,7 @@ def test_communication_steps_of_any_length_are_equal_parts(fmu):
     assert_allclose(one.get("t"), 0.751, rtol=1e-15)
 
 
-def test_a_million_communication_points_of_rounded_times_are_met(fmu):
+def test_million_rounded_communication_points_are_reached(fmu):
     """An importer adds its step to its time; both drift apart by rounding, and no error comes of it."""
     one, t = Slave(fmu), 0.5
     assert one.start(t) == OK
@@ -145,7 +145,7 @@ def test_a_million_communication_points_of_rounded_times_are_met(fmu):
     assert one.step(t, 0.3) == ERROR
 
 
-def test_a_state_that_is_kept_goes_on_bit_for_bit_also_from_bytes(fmu):
+def test_saved_fmu_state_continues_bitwise_also_from_bytes(fmu):
     one, other = Slave(fmu), Slave(fmu)
     assert one.start(0.5) == one.step(0.5, 3 * H) == OK
     state = one.kept()
@@ -166,7 +166,7 @@ def test_a_state_that_is_kept_goes_on_bit_for_bit_also_from_bytes(fmu):
     assert other.from_bytes(b"x" + data[1:], c_void_p()) == ERROR
 
 
-def test_a_step_that_fails_is_discarded_and_nothing_has_changed(fmu):
+def test_failed_step_is_discarded_without_side_effects(fmu):
     one = Slave(fmu)
     assert one.start(0.5) == one.step(0.5, H) == OK
     before = one.get("t", "q", "p_q")
@@ -183,7 +183,7 @@ def test_a_step_that_fails_is_discarded_and_nothing_has_changed(fmu):
     assert one.get("t", "q", "p_q") == before
 
 
-def test_calls_that_are_not_allowed_are_errors_that_say_why(fmu):
+def test_forbidden_calls_are_errors_with_a_reason(fmu):
     one = Slave(fmu)
     assert one.step(0.5, H) == one.call("ExitInitializationMode") == one.call("Terminate") == ERROR
     assert one.set(q=0.1, q_dot=0.0) == one.start(0.5) == OK
@@ -242,7 +242,7 @@ def test_the_instantiation_token_identifies_the_model():
     assert all(each == f"{{{uuid.UUID(each)}}}" for each in tokens)
 
 
-def test_discards_are_logged_where_that_is_wanted(fmu):
+def test_discards_are_logged_if_requested(fmu):
     one = Slave(fmu, logging=False)
     assert one.start(0.5, u=float("inf")) == OK
     assert one.step(0.5, H) == DISCARD
@@ -263,7 +263,7 @@ def test_initial_states_far_off_their_constraints_are_refused(tmp_path):
     assert "violate the constraints" in far.said[-1][2]
 
 
-def test_the_description_has_what_the_standard_asks_for(fmu):
+def test_description_has_the_elements_required_by_the_standard(fmu):
     root = fmu.description
     assert [part.tag for part in root] == [
         *("CoSimulation", "LogCategories", "DefaultExperiment", "ModelVariables", "ModelStructure"),
@@ -296,7 +296,7 @@ def test_a_model_given_by_momenta_has_these_at_the_start(tmp_path):
     assert one.get("q_dot") == [2.0]
 
 
-def test_names_are_told_apart(tmp_path):
+def test_names_are_made_unique(tmp_path):
     system = LagrangianSystem.from_text(
         name="names",
         coordinates=["q"],
@@ -344,7 +344,7 @@ def test_all_functions_of_the_standard_are_there(fmu):
     assert len(exported) == 75
 
 
-def test_models_and_names_that_do_not_serve_are_refused(tmp_path):
+def test_unsuitable_models_and_names_are_rejected(tmp_path):
     model = pushed()
     for wrong, words in (
         (replace(model, h=None, tolerance=1e-6), "fixed step size"),
@@ -386,7 +386,7 @@ MAGIC = {"x86_64-windows": b"MZ", "aarch64-darwin": b"\xcf\xfa\xed\xfe\x0c\0\0\1
 class TestPlatforms:
     """Libraries for other machines, by the cross compiler of the extra ``compiler``."""
 
-    def test_each_has_a_place_of_its_own(self, tmp_path, monkeypatch):
+    def test_each_platform_has_its_folder(self, tmp_path, monkeypatch):
         monkeypatch.setattr(fmu_module, "library_for", lambda name, source, *, flags: f"{name} {flags}".encode())
         here = fmu_module._this_platform()
         path = generate_fmu(pushed(), tmp_path / "push.fmu", platforms=tuple(TARGETS), flags=("-O1",))
@@ -396,7 +396,7 @@ class TestPlatforms:
         assert found == {f"binaries/{name}/push{ends[name.partition('-')[2]]}" for name in {*TARGETS, here}}
         assert archive.read("binaries/aarch64-windows/push.dll") == b"aarch64-windows ('-O1',)"
 
-    def test_what_is_no_platform_or_cannot_be_made_is_said_and_leaves_nothing(self, tmp_path, monkeypatch):
+    def test_unknown_or_unbuildable_platforms_are_reported_without_files(self, tmp_path, monkeypatch):
         with pytest.raises(PackageError, match=r"'windows' is not a platform .* x86_64-windows"):
             generate_fmu(pushed(), tmp_path / "push.fmu", platforms=("windows",))
         monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
@@ -408,7 +408,7 @@ class TestPlatforms:
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.full
-    def test_they_are_libraries_of_their_machines_with_all_functions(self, tmp_path):
+    def test_platform_binaries_export_all_functions(self, tmp_path):
         pytest.importorskip("ziglang", reason="pip install 'scvi-codegen[compiler]'")
         first, second = (
             zipfile.ZipFile(generate_fmu(rod(), part / "rod.fmu", platforms=tuple(MAGIC)))
@@ -425,12 +425,12 @@ class TestPlatforms:
 class TestByFMPy:
     """The same through an importer of others."""
 
-    def test_it_finds_no_fault_and_the_schema_holds(self, fmu, tmp_path):
+    def test_fmpy_validates_the_model_and_the_schema(self, fmu, tmp_path):
         validation = pytest.importorskip("fmpy.validation", reason="FMPy is not installed")
         path = generate_fmu(pushed(), tmp_path / "pushed.fmu")
         assert validation.validate_fmu(str(path)) == []
 
-    def test_it_simulates_as_the_stepper_does(self, tmp_path):
+    def test_fmpy_simulates_as_the_stepper(self, tmp_path):
         fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed")
         model = pushed()
         path = generate_fmu(model, tmp_path / "pushed.fmu")

@@ -58,7 +58,7 @@ def net(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_a_file_says(net: Path) -> None:
+def test_model_file_is_read_completely(net: Path) -> None:
     """Formulas at every place, a table from a file, and the run by hand."""
     model = sc.load_indexed_model(net, {"parameters": {"k": 3.0}, "run": {"span": 0.2}})
     angle = 2 * np.pi * np.arange(3) / 3
@@ -100,7 +100,7 @@ def test_the_solver(net: Path) -> None:
         ('"svi:2"', '"stoermer-verlet"'),
     ],
 )
-def test_what_has_no_newton(net: Path, old: str, new: str) -> None:
+def test_unsupported_newton_is_rejected(net: Path, old: str, new: str) -> None:
     """As without a file."""
     net.write_text(net.read_text().replace(old, new, 1))
     model = sc.load_indexed_model(net, {"method": {"solver": "newton"}})
@@ -161,7 +161,7 @@ def test_an_index_means_one_thing() -> None:
         ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not supported for indexed systems"),
     ],
 )
-def test_what_is_refused(net: Path, old: str, new: str, message: str) -> None:
+def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str) -> None:
     """With the path, and the key at fault."""
     text = net.read_text()
     assert old in text
@@ -171,7 +171,7 @@ def test_what_is_refused(net: Path, old: str, new: str, message: str) -> None:
     assert str(caught.value).startswith(str(net))
 
 
-def test_each_kind_has_its_reader(net: Path, tmp_path: Path) -> None:
+def test_each_kind_of_file_has_its_loader(net: Path, tmp_path: Path) -> None:
     """An error names the other."""
     with pytest.raises(sc.ModelFileError, match="load_indexed_model"):
         sc.load_model(net)
@@ -180,7 +180,7 @@ def test_each_kind_has_its_reader(net: Path, tmp_path: Path) -> None:
         sc.load_indexed_model(tmp_path / "kepler.toml")
 
 
-def test_steps_that_choose_their_length(net: Path) -> None:
+def test_tolerance_selects_adaptive_steps(net: Path) -> None:
     """With a tolerance, or without a step; a step laid over it takes its place."""
     given = {"tolerance": 1e-6, "span": -3.0}
     net.write_text(net.read_text().replace("step = 0.1\nsteps = 4", "tolerance = 1e-6\nspan = -3.0"))
@@ -197,7 +197,9 @@ def test_steps_that_choose_their_length(net: Path) -> None:
     assert sc.load_indexed_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
 
 
-def test_the_example_frees_its_memory_and_refuses_places_outside(net: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
+    net: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Tables are files beside the program: whoever edits them gets a message, and no access outside an array."""
     monkeypatch.chdir(net.parent)
     invoked = CliRunner().invoke(main, ["generate", str(net), "-o", "net_svi"])

@@ -52,7 +52,7 @@ def kepler(**changes: object) -> Model:
     return replace(Model.from_problem(problem("kepler")), **changes)
 
 
-def test_reads_what_the_file_says():
+def test_model_file_is_read():
     model = parse_model(PENDULUM)
     assert model.system.name == "pendulum"
     assert [symbol.name for symbol in model.system.coordinates] == ["q"]
@@ -134,7 +134,7 @@ def test_methods_without_a_name_are_refused_rather_than_changed():
             dump_model(kepler(method=method))
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path):
+def test_failed_save_does_not_change_the_old_file(tmp_path):
     path = tmp_path / "model.toml"
     save_model(kepler(), path)
     own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
@@ -245,13 +245,13 @@ def test_mistakes_are_named(old, new, message, tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_forces_are_for_systems_that_are_written_out():
+def test_forces_require_an_explicit_system():
     with pytest.raises(ModelFileError, match=r"\[forces\] are not supported for a system of the catalogue"):
         parse_model('[system]\ncatalogue = "kepler"\n[forces]\nq1 = "-q1_dot"\n')
 
 
 @pytest.mark.parametrize("more", [{"damping": "m/4"}, {"forces": {"q": "-m*q_dot**3"}}, {"dissipation": "q_dot**2"}])
-def test_what_acts_on_a_system_survives_a_round_trip(more):
+def test_forces_and_constraints_survive_a_round_trip(more):
     formula = "m*q_dot**2/2 + cos(q)"
     system = LagrangianSystem.from_text(
         name="pendulum", coordinates=["q"], lagrangian=formula, parameters={"m": 2.0}, **more
@@ -272,7 +272,7 @@ def test_all_that_is_missing_is_named_at_once():
         parse_model("run = 3\n" + PENDULUM[: PENDULUM.index("[run]")])
 
 
-def test_without_a_method_it_is_the_default():
+def test_missing_method_selects_the_default():
     text = PENDULUM.replace('[method]\nmethod = "svi"\ndegree = 3\n', "")
     assert text != PENDULUM
     assert parse_model(text).method == SVI(8)
@@ -291,7 +291,7 @@ def test_sections_laid_over_a_file_supply_and_replace():
         parse_model(PENDULUM, {"parameters": {"nu": 1.0}})
 
 
-def test_a_faulty_formula_is_pointed_at_and_the_cause_is_kept():
+def test_faulty_formula_is_marked_and_the_cause_is_chained():
     with pytest.raises(ModelFileError, match="column 20") as caught:
         parse_model(PENDULUM.replace("cos(q)", "cos(x)"))
     assert isinstance(caught.value.__cause__, ExpressionError)
@@ -307,7 +307,7 @@ def test_unreadable_files_are_errors_of_the_model_file(tmp_path):
         load_model(tmp_path / "binary.toml")
 
 
-def test_models_made_in_python_are_checked_and_take_arrays():
+def test_models_from_python_are_checked_and_accept_arrays():
     model = kepler(q=np.array([0.5, 0.0]), steps=np.int64(7), span=None, h=np.float64(0.5))
     assert model == kepler(steps=7, span=None, h=0.5)
     assert hash(model) == hash(kepler(steps=7, span=None, h=0.5))
@@ -322,7 +322,7 @@ def test_models_made_in_python_are_checked_and_take_arrays():
             kepler(**changes)
 
 
-def test_step_count_is_the_whole_number_nearest_to_the_span():
+def test_step_count_is_the_integer_nearest_to_the_span():
     assert kepler(h=0.3, span=1.0).step_count == 3
     assert kepler(h=-0.3, span=1.0).step_count == 3
     assert kepler(h=5.0, span=1.0).step_count == 1

@@ -52,7 +52,7 @@ def _write(path, header):
     path.write_text("\n".join([header, "", *(f"{t!r}, {u!r}" for t, u in zip(T, U, strict=True))]) + "\n")
 
 
-def test_a_model_is_driven_as_by_hand(file, monkeypatch, tmp_path):
+def test_model_with_inputs_equals_integrate(file, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path.parent)  # paths are relative to the model file
     model = load_model(file)
     assert model.inputs == {"u": InputTable(T, U, "cubic"), "w": InputTable((0.0, 3.0), (0.0, 0.3), "linear")}
@@ -85,7 +85,7 @@ def test_momenta_are_those_with_the_inputs_at_the_start():
         "q_dot**2/2 - (u + w - q)**2 - (u - w)/2*q + 3*(u + 1)*q",
     ],
 )
-def test_formulas_are_written_with_the_names_of_inputs(lagrangian, tmp_path):
+def test_formulas_use_the_names_of_inputs(lagrangian, tmp_path):
     system = LagrangianSystem.from_text(
         name="pushed", coordinates=["q"], lagrangian=lagrangian, inputs=["u", "w"], forces={"q": "-2*u"}
     )
@@ -95,7 +95,7 @@ def test_formulas_are_written_with_the_names_of_inputs(lagrangian, tmp_path):
     assert load_model(tmp_path / "model.toml") == model
 
 
-def test_files_are_written_complete_in_themselves(file, tmp_path):
+def test_saved_files_are_self_contained(file, tmp_path):
     model = load_model(file)
     (tmp_path / "tables" / "u.csv").unlink()
     text = dump_model(model)
@@ -110,7 +110,7 @@ def test_columns_of_a_table(file, header):
     assert load_model(file).inputs["u"] == InputTable(T, U, "cubic")
 
 
-def test_one_file_holds_several_inputs(file):
+def test_one_file_contains_several_inputs(file):
     np.savez(file.parent / "both.npz", t=T, u=U, w=np.arange(6.0), fine=np.arange(12.0), note=np.array(3.0))
     text = MODEL.replace("tables/u.csv", "both.npz").replace(
         "{ t = [0, 3.0], values = [0.0, 0.3] }", '{ file = "both.npz" }'
@@ -133,7 +133,7 @@ def test_one_file_holds_several_inputs(file):
         ("t,u\n", "at least one line of numbers"),
     ],
 )
-def test_what_is_said_of_a_faulty_table(file, table, said):
+def test_faulty_table_is_reported(file, table, said):
     (file.parent / "tables" / "u.csv").write_text(table)
     with pytest.raises(ModelFileError, match=said) as caught:
         load_model(file)
@@ -151,13 +151,13 @@ def test_what_is_said_of_a_faulty_table(file, table, said):
         ({"t": [0.0, 1.0], "u": [0.0, 1j]}, "u must be real numbers, not complex128"),
     ],
 )
-def test_what_is_said_of_a_faulty_archive(file, arrays, said):
+def test_faulty_archive_is_reported(file, arrays, said):
     np.savez(file.parent / "u.npz", **arrays)
     with pytest.raises(ModelFileError, match=said):
         parse_model(MODEL.replace("tables/u.csv", "u.npz"), folder=file.parent)
 
 
-def test_what_is_said_of_a_file_that_is_none(file):
+def test_unreadable_file_is_reported(file):
     for name, said in {"none.csv": "cannot be read", "u.txt": ".csv or .npz", "tables/u.npz": "no arrays"}.items():
         (file.parent / "tables" / "u.npz").write_text("not an archive")
         with pytest.raises(ModelFileError, match=f"u: {name}: .*{said}"):
@@ -179,12 +179,12 @@ def test_what_is_said_of_a_file_that_is_none(file):
         ("{ file = 3 }", "file must be a path"),
     ],
 )
-def test_what_is_said_of_an_entry(entry, said):
+def test_invalid_entry_is_reported(entry, said):
     with pytest.raises(ModelFileError, match=said):
         parse_model(MODEL.replace('{ file = "tables/u.csv", kind = "cubic" }', entry))
 
 
-def test_what_is_no_input_of_the_system():
+def test_names_that_are_not_inputs_are_rejected():
     with pytest.raises(ModelFileError, match="'v' is not an input of 'pushed pendulum', whose inputs are u, w"):
         parse_model(
             MODEL.replace('u = { file = "tables/u.csv", kind = "cubic" }', "v = { t = [0, 1], values = [0, 1] }")

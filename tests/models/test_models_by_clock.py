@@ -31,7 +31,7 @@ def invoke(*words: str, status: int = 0) -> str:
 
 
 @pytest.mark.parametrize("monitor", ["frequency", "(q1**2 + q2**2)**(3/4)"])
-def test_files_hold_the_monitor(monitor: str) -> None:
+def test_files_contain_the_time_transformation(monitor: str) -> None:
     found = catalogue_model("kepler", {"system": {"monitor": monitor}, "parameters": {"mu": 1.5}})
     text = dump_model(found)
     assert f'monitor = "{monitor}"' in text
@@ -77,7 +77,7 @@ def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> Non
     assert "to t = -5;" in back
 
 
-def test_the_command_line_finds_a_step_and_tells_when_it_does_not_serve() -> None:
+def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
     said = invoke("run", "kepler", "--monitor", "frequency", "--span", "50", "--tolerance", "1e-8")
     error = float(said.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
@@ -87,7 +87,7 @@ def test_the_command_line_finds_a_step_and_tells_when_it_does_not_serve() -> Non
 
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
 @pytest.mark.parametrize("system", [{}, {"monitor": "frequency"}], ids=["t", "tau"])
-def test_what_takes_one_step_takes_the_first_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
+def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
     """As certificates do: of tau in transformed time."""
     model = catalogue_model("kepler", {"run": run, "system": system})
     stepper = model.stepper()
@@ -102,7 +102,7 @@ def test_what_takes_one_step_takes_the_first_of_the_run(run: dict[str, float], s
     assert (h < 0.0) == (run.get("span", 1.0) < 0.0)
 
 
-def test_folders_hold_a_number_of_steps(tmp_path: Path) -> None:
+def test_folders_contain_a_number_of_steps(tmp_path: Path) -> None:
     folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--monitor", "frequency")
     assert "give --step and --steps" in invoke(*by_clock, "--step", "0.2", "--span", "9", "-o", folder, status=2)
     assert "50 steps in tau (all)" in invoke(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)

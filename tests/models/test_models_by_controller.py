@@ -60,7 +60,7 @@ def plain(model: sc.Model) -> sc.Stepper:
     return sc.compile_stepper(model.system, model.method)
 
 
-def test_files_hold_the_controller_and_its_monitor(shaken: Path, tmp_path: Path) -> None:
+def test_files_contain_the_controller_and_its_time_transformation(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     assert model.system.clock is None
     assert (model.monitor, model.h, model.covered) == ("(x**2 + y**2)**(3/4)", 0.1, 12.0)
@@ -70,7 +70,7 @@ def test_files_hold_the_controller_and_its_monitor(shaken: Path, tmp_path: Path)
     assert sc.load_model(shaken, {"run": {"tolerance": 1e-9}}).h is None
 
 
-def test_the_controller_of_a_monitor_can_be_exchanged() -> None:
+def test_controller_of_a_time_transformation_can_be_replaced() -> None:
     both = {"system": {"monitor": "frequency"}, "run": {"controller": "reversible", "step": 0.2, "span": 5.0}}
     reversible = catalogue_model("kepler", both)
     symplectic = parse_model(dump_model(reversible), {"run": {"controller": "symplectic"}})
@@ -78,7 +78,7 @@ def test_the_controller_of_a_monitor_can_be_exchanged() -> None:
     assert parse_model(dump_model(symplectic), {"run": {"controller": "reversible"}}) == reversible
 
 
-def test_the_command_line_takes_the_steps_of_the_library(shaken: Path, tmp_path: Path) -> None:
+def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path) -> None:
     model, orbit = sc.load_model(shaken), tmp_path / "orbit.npz"
     said = invoke("run", str(shaken), "-o", str(orbit))
     assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in said
@@ -105,7 +105,7 @@ def test_the_command_line_finds_the_step_of_tau(shaken: Path) -> None:
     assert "use another monitor" in invoke("run", "kepler", *far, *words, status=1)
 
 
-def test_a_folder_is_gone_on_with(shaken: Path, tmp_path: Path) -> None:
+def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
     folder = str(tmp_path / "shaken.run")
     assert "of 0.1 in tau from t = 0 to t = 12;" in invoke("run", str(shaken), "-o", folder)
     assert "to t = 20;" in invoke("run", "--resume", folder, "--span", "20")
@@ -116,7 +116,7 @@ def test_a_folder_is_gone_on_with(shaken: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-8])
-def test_the_longest_step_keeps_the_tolerance_and_a_longer_one_does_not(unit: float, tolerance: float) -> None:
+def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(unit: float, tolerance: float) -> None:
     kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
     stepper = sc.compile_stepper(kepler, sc.SVI(8), monitor=f"{unit}*(q1**2 + q2**2)**(3/4)")
     h = largest_step(stepper, *start, 20.0, tolerance)
@@ -125,7 +125,7 @@ def test_the_longest_step_keeps_the_tolerance_and_a_longer_one_does_not(unit: fl
     assert largest_step(stepper, *start, -20.0, tolerance) == h
 
 
-def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
+def test_integrate_uses_the_controller(shaken: Path) -> None:
     model = sc.load_model(shaken)
     state: Any = [*model.q, *(model.p or ())]
     exact = plain(model).integrate(model.q, model.p, t_end=12.0)
@@ -144,7 +144,7 @@ def test_one_call_integrates_by_the_controller(shaken: Path) -> None:
         sc.solve_ivp(model.stepper(), (0.0, 1.0), state, h=0.1, controller="reversible")
 
 
-def test_inputs_are_met_at_their_breakpoints() -> None:
+def test_steps_end_at_breakpoints_of_inputs() -> None:
     system = sc.LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**4/4 + x*u", inputs=["u"]
     )
@@ -178,11 +178,11 @@ def test_inputs_are_met_at_their_breakpoints() -> None:
         ("run FILE --controller symplectic", "depends on time"),
     ],
 )
-def test_what_does_not_go_with_it_is_said(shaken: Path, words: str, said: str) -> None:
+def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, said: str) -> None:
     assert said in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
 
 
-def test_a_model_says_what_it_is_not(shaken: Path, tmp_path: Path) -> None:
+def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     with pytest.raises(ModelFileError, match="reversible controller"):
         _ = model.step_count

@@ -71,7 +71,7 @@ def test_a_single_file_computes_the_same_bits(tmp_path):
     assert load_package(single).step([0.5], [0.0], 0.1) == load_package(many).step([0.5], [0.0], 0.1)
 
 
-def test_a_single_file_in_the_place_of_many_leaves_none_of_them(pendulum, tmp_path):
+def test_single_file_replaces_the_files_of_a_folder(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     generate_package(pendulum, folder, single_file=True)
     assert list(folder.glob("support/*")) == []
@@ -84,7 +84,7 @@ def test_equal_models_give_equal_bytes(pendulum, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["planar-pendulum", "kepler", "spherical-pendulum"])
-def test_is_a_python_package_that_steps_as_the_compiled_system_without_sympy(name, tmp_path):
+def test_package_steps_as_the_compiled_system_without_sympy(name, tmp_path):
     model = model_of(name, method=Gauss(2))
     stepper = compile_stepper(model.system, model.method)
     p = model.momenta(stepper)
@@ -105,7 +105,7 @@ def test_load_package_gives_an_equal_stepper(pendulum, tmp_path):
     assert np.array_equal(ours.energy(), theirs.energy())
 
 
-def test_the_c_text_is_compiled_as_it_stands(pendulum, tmp_path):
+def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "pendulum_svi.c").write_text("#error edited\n")
     with pytest.raises(BuildError, match="edited"):
@@ -150,7 +150,7 @@ def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compil
         (1.5, "auto", "the step from t = 1.5 failed: the iteration converged to a spurious solution"),
     ],
 )
-def test_a_loop_in_c_takes_newtons_iteration_where_the_fixed_point_fails(h, solver, reported, tmp_path):
+def test_c_program_falls_back_to_newton_where_the_fixed_point_fails(h, solver, reported, tmp_path):
     """Two stiff springs with forces: omega h = 5 and more, where the fixed-point iteration diverges."""
     needs("make", "cc")
     system = LagrangianSystem.from_text(
@@ -220,7 +220,7 @@ def test_names_of_the_user_do_not_reach_the_program_text(tmp_path):
     subprocess.run([sys.executable, "-c", "import pendulum_svi"], cwd=tmp_path, check=True)
 
 
-def test_other_files_are_kept_and_own_files_are_replaced(pendulum, tmp_path):
+def test_other_files_remain_and_generated_files_are_replaced(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "notes.txt").write_text("mine")
     generate_package(replace(pendulum, method=SVI(2)), folder)
@@ -259,7 +259,7 @@ def test_files_of_others_and_edited_files_are_overwritten_only_by_force(pendulum
         ("x" * 80, "x" * 64),
     ],
 )
-def test_folder_names_that_do_not_serve_are_refused_with_one_that_does(pendulum, tmp_path, name, hint):
+def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_path, name, hint):
     with pytest.raises(PackageError, match=f"'{hint}'"):
         generate_package(pendulum, tmp_path / name)
     assert not (tmp_path / name).exists()
@@ -272,20 +272,20 @@ def test_a_dot_means_the_name_of_the_folder_one_is_in(pendulum, tmp_path, monkey
     assert (tmp_path / "here" / "here.c").is_file()
 
 
-def test_folders_that_cannot_be_written_are_named(pendulum, tmp_path):
+def test_unwritable_folders_are_named(pendulum, tmp_path):
     (tmp_path / "taken").write_text("a file")
     with pytest.raises(PackageError, match="taken"):
         generate_package(pendulum, tmp_path / "taken")
 
 
-def test_methods_that_no_file_can_hold_are_generated_without_a_model_file(pendulum, tmp_path):
+def test_methods_without_text_form_are_generated_without_a_model_file(pendulum, tmp_path):
     own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
     folder = generate_package(replace(pendulum, method=SVI(1, own)), tmp_path / "own")
     assert not (folder / "model.toml").exists()
     assert load_package(folder).dimension == 1
 
 
-def test_nothing_of_an_older_integrator_stays(pendulum, tmp_path):
+def test_files_of_an_older_integrator_are_removed(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "certificate.json").write_text("{}")
     (folder / "notes.txt").write_text("mine")

@@ -36,7 +36,7 @@ def exact_end(model: sc.Model) -> np.ndarray:
 
 
 @pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_the_example_goes_to_the_end_by_them(model, tmp_path, solver):
+def test_adaptive_example_reaches_the_end_time(model, tmp_path, solver):
     lines = output(generate_package(model, tmp_path / "controlled", solver=solver))
     states = np.array([[float(word) for word in line.split()] for line in lines if not line.startswith("#")])
     assert np.allclose(states[:, 0], np.linspace(0.0, SPAN, 21), rtol=1e-15)
@@ -60,7 +60,7 @@ def test_the_folder_has_them_in_python_too(model, tmp_path):
 
 
 @pytest.mark.parametrize(("precision", "error"), [("double", 1e-6), ("single", 1e-2)])
-def test_a_microcontroller_has_them_where_the_model_asks(model, tmp_path, precision, error):
+def test_microcontroller_code_has_adaptive_steps_if_requested(model, tmp_path, precision, error):
     folder = generate_package(replace(model, tolerance=1e-5), tmp_path / "board", embedded=precision)
     flags = f"{STRICT} -Wdouble-promotion" if precision == "single" else STRICT
     subprocess.run(["cc", "-c", *flags.split(), "-ffreestanding", "board.c"], cwd=folder, check=True)
@@ -70,7 +70,7 @@ def test_a_microcontroller_has_them_where_the_model_asks(model, tmp_path, precis
     assert "advance_to" not in (fixed / "fixed.c").read_text()
 
 
-def test_a_method_that_has_none_says_so(model, tmp_path):
+def test_method_without_adaptive_steps_is_reported(model, tmp_path):
     with pytest.raises(MethodError, match="give a step h"):
         generate_package(replace(model, method=sc.StoermerVerlet()), tmp_path / "verlet")
     assert not (tmp_path / "verlet").exists()

@@ -44,7 +44,7 @@ def states_printed(folder, flags=STRICT):
 @pytest.mark.covering
 @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(0.03, 0.0), (-0.07, 2.55)])
-def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
+def test_example_equals_integrate_bitwise(model, method, h, t, tmp_path):
     model = replace(model, method=method, h=h, t=t)
     states, printed = states_printed(generate_package(model, tmp_path / "pushed"))
     stepper = compile_stepper(model.system, method, flags=PORTABLE_FLAGS)
@@ -60,7 +60,7 @@ def test_the_example_is_drive_to_the_bit(model, method, h, t, tmp_path):
     assert abs(float(apart)) < 1e-2
 
 
-def test_steps_that_choose_their_length_go_from_breakpoint_to_breakpoint(model, tmp_path):
+def test_adaptive_steps_end_at_breakpoints(model, tmp_path):
     model = replace(model, h=None, tolerance=None)
     states, _ = states_printed(generate_package(model, tmp_path / "pushed"))
     stepper = compile_stepper(model.system, model.method)
@@ -69,7 +69,7 @@ def test_steps_that_choose_their_length_go_from_breakpoint_to_breakpoint(model, 
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_stretches_of_c_are_those_of_python(model, seed):
+def test_segments_in_c_equal_those_in_python(model, seed):
     """Breakpoints anywhere, some of them together, or a rounding apart; steps that are longer than pieces."""
     generator = np.random.default_rng(seed)
     times = np.unique(np.concatenate([[-0.1, 3.1], generator.uniform(0.0, 3.0, 12), 0.1 * np.arange(9)]))
@@ -96,7 +96,7 @@ def test_stretches_of_c_are_those_of_python(model, seed):
     assert (theirs.t, theirs.q, theirs.p) == (ours.t, ours.q, ours.p)
 
 
-def test_a_step_much_longer_than_the_way_is_cut_there(model):
+def test_step_longer_than_the_segment_is_shortened(model):
     stepper = compile_stepper(model.system, model.method)
     given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
     inputs = checked_inputs(stepper.interface, given)
@@ -124,7 +124,7 @@ def _tables(stepper, inputs):
     return table, kept
 
 
-def test_a_folder_is_driven_from_python_too(model, tmp_path):
+def test_folder_with_inputs_runs_from_python(model, tmp_path):
     folder = generate_package(model, tmp_path / "pushed")
     assert load_model(folder / "model.toml") == model
     given = {"inputs": dict(model.inputs), "h": 0.03, "t_end": 2.3}
@@ -134,7 +134,7 @@ def test_a_folder_is_driven_from_python_too(model, tmp_path):
     assert "pushed_next_steps" in (folder / "README.md").read_text()
 
 
-def test_without_data_the_inputs_are_nought(model, tmp_path):
+def test_inputs_without_data_are_zero(model, tmp_path):
     folder = generate_package(replace(model, inputs={}), tmp_path / "still")
     states, _ = states_printed(folder)
     run = compile_stepper(model.system, model.method).integrate(
@@ -144,7 +144,7 @@ def test_without_data_the_inputs_are_nought(model, tmp_path):
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_on_a_microcontroller(model, precision, tmp_path):
+def test_inputs_on_a_microcontroller(model, precision, tmp_path):
     folder = generate_package(model, tmp_path / "pushed", embedded=precision)
     states, _ = states_printed(folder, STRICT.replace("-Wconversion", ""))
     run = compile_stepper(model.system, model.method).integrate(

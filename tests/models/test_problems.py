@@ -114,7 +114,7 @@ def test_outer_solar_system_is_newtons() -> None:
     assert speed**2 / 2 - defaults["G"] / np.linalg.norm(q[1]) < 0
 
 
-def test_outer_solar_system_is_quick_to_define() -> None:
+def test_outer_solar_system_is_defined_fast() -> None:
     sympy.core.cache.clear_cache()
     with at_most(2_000_000):
         outer_solar_system()
@@ -131,7 +131,7 @@ def test_chain_forces(n: int) -> None:
     assert system.defaults == (0.25, 0.5)
 
 
-def test_a_long_chain_is_quick_to_define() -> None:
+def test_long_chain_is_defined_fast() -> None:
     with at_most(5_000_000):
         entry = problem("fput-chain:256")
     assert entry.name == "fput-chain:256"
@@ -139,7 +139,7 @@ def test_a_long_chain_is_quick_to_define() -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_every_entry_starts_from_a_finite_state_and_its_text_comes_back(name: str) -> None:
+def test_every_entry_has_a_finite_state_and_a_text_round_trip(name: str) -> None:
     entry = problem(name)
     system = entry.system
     assert entry.name == name
@@ -162,7 +162,7 @@ def test_every_entry_starts_from_a_finite_state_and_its_text_comes_back(name: st
         assert system == HamiltonianSystem.from_text(**common, momenta=momenta, hamiltonian=system.to_text())
 
 
-def test_states_that_the_titles_promise() -> None:
+def test_states_have_the_properties_in_their_titles() -> None:
     kepler, henon, relativistic = problem("kepler"), problem("henon-heiles"), problem("relativistic-particle")
     radius, speed = np.linalg.norm(kepler.q), np.linalg.norm(kepler.velocity)
     axis = 1 / (2 / radius - speed**2)

@@ -24,7 +24,7 @@ def stepper() -> Stepper:
     return load_package(FOLDER)
 
 
-def test_its_states_are_those_of_version_0_1(stepper):
+def test_states_are_those_of_version_0_1(stepper):
     run = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5)
     assert (run.t[-1], run.q[-1, 0], run.p[-1, 0]) == pytest.approx(END, rel=1e-13)
     many = stepper.integrate_ensemble([[0.5], [0.4]], [[0.0], [0.1]], h=0.25, steps=40, t=0.5)
@@ -32,7 +32,7 @@ def test_its_states_are_those_of_version_0_1(stepper):
     assert np.array_equal(many.q[:, 0], run.q)
 
 
-def test_its_runs_are_saved_and_restored_where_they_stand(stepper):
+def test_runs_of_version_0_1_are_saved_and_restored(stepper):
     run = stepper.start([0.5], [0.0], h=0.25, t=0.5)
     run.advance(15)
     assert run.t == 0.5 + 15 * 0.25
@@ -41,7 +41,7 @@ def test_its_runs_are_saved_and_restored_where_they_stand(stepper):
         assert (again.t, again.q[0], again.p[0]) == pytest.approx(END, rel=1e-13)
 
 
-def test_there_are_states_between_and_crossings(stepper):
+def test_dense_output_and_events_of_version_0_1(stepper):
     run = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5, save_every=4)
     assert run.at(float(END[0]))[0] == pytest.approx(END[1], rel=1e-13)
     crossings = stepper.integrate([0.5], [0.0], h=0.25, steps=40, t=0.5, events="q").events[0]
@@ -49,7 +49,7 @@ def test_there_are_states_between_and_crossings(stepper):
     assert np.allclose(run.at(crossings.t)[0], 0.0, atol=1e-12)
 
 
-def test_it_is_imported_as_the_package_it_is():
+def test_version_0_1_is_imported_as_a_package():
     code = "import pendulum_verlet as p; print(*p.stepper.step([0.5], [0.0], 0.25)[0])"
     shown = subprocess.run([sys.executable, "-c", code], cwd=FOLDER.parent, capture_output=True, text=True, check=True)
     assert float(shown.stdout) == pytest.approx(0.5, abs=0.02)

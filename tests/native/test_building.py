@@ -88,7 +88,7 @@ def test_a_hit_runs_no_compiler(cache, monkeypatch):
     assert commands == []
 
 
-def test_a_second_load_in_one_process_touches_nothing(cache):
+def test_second_load_in_one_process_does_no_io(cache):
     first = building.load(source(), flags=FAST)
     shutil.rmtree(cache)
     assert building.load(source(), flags=FAST) is first
@@ -98,7 +98,7 @@ def test_a_second_load_in_one_process_touches_nothing(cache):
 @pytest.mark.parametrize(
     "changed", [{"flags": ("-O1",)}, {"source": source("double tiny_answer(void)\n{\n  return 43.0;\n}\n")}], ids=str
 )
-def test_another_text_or_flag_is_another_entry(changed, cache):
+def test_different_source_or_flag_is_a_different_entry(changed, cache):
     answer()
     building.load(**{"source": source(), "flags": FAST, **changed})
     assert len(entries(cache)) == 2
@@ -136,7 +136,7 @@ def other_cffi(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "change", [other_compiler, compiler_renewed, compiler_of_several_words, more_flags, other_cffi]
 )
-def test_whatever_code_depends_on_outside_its_text_has_a_part_in_its_name(change, tmp_path, monkeypatch):
+def test_cache_key_contains_everything_the_binary_depends_on(change, tmp_path, monkeypatch):
     monkeypatch.setenv("CC", compiler_saying(tmp_path, "1.0"))
     monkeypatch.delenv(building.FLAGS_VARIABLE, raising=False)
     before = building.fingerprint(source(), flags=FAST)
@@ -145,7 +145,7 @@ def test_whatever_code_depends_on_outside_its_text_has_a_part_in_its_name(change
     assert building.fingerprint(source(), flags=FAST) != before
 
 
-def test_a_compiler_of_several_words_is_told_apart_by_them_and_by_what_it_says(tmp_path, monkeypatch):
+def test_compilers_with_arguments_are_distinguished_by_command_and_version(tmp_path, monkeypatch):
     found = set()
     for version, word in (("1.0", "-pipe"), ("1.1", "-pipe"), ("1.0", "-m32")):
         monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, version)} {word}")
@@ -185,7 +185,7 @@ def test_code_for_this_processor_alone_is_not_taken_for_that_of_another(where, t
 @pytest.mark.parametrize(
     "line", ["model name\t: other", "flags\t\t: fpu avx512f", "Features\t: sve", "CPU part\t: 0xd40"]
 )
-def test_processors_are_told_apart_by_all_that_tuning_looks_at(line, monkeypatch):
+def test_processors_are_distinguished_by_tuning_features(line, monkeypatch):
     def processor(text: str) -> str:
         monkeypatch.setattr(Path, "read_text", lambda self: text)
         return fingerprint._processor.__wrapped__()
@@ -244,7 +244,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_entry_is_built_anew(damage, cache, monkeypatch):
+def test_damaged_entry_is_rebuilt(damage, cache, monkeypatch):
     answer()
     (entry,) = entries(cache)
     DAMAGE[damage](entry)
@@ -270,7 +270,7 @@ LOADING = "import test_building; print(test_building.answer())"
 
 @pytest.mark.parametrize("changed", [of_another_processor, of_another_system])
 @pytest.mark.skipif(sys.platform == "darwin", reason="the header is that of ELF files")
-def test_a_foreign_library_with_a_fitting_manifest_is_built_anew(changed, cache):
+def test_foreign_library_with_matching_manifest_is_rebuilt(changed, cache):
     answer()
     (entry,) = entries(cache)
     library = building._library(entry)
@@ -293,7 +293,7 @@ def test_a_foreign_library_with_a_fitting_manifest_is_built_anew(changed, cache)
     assert library.read_bytes() != data
 
 
-def test_a_cache_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch):
+def test_unwritable_cache_is_replaced_by_a_temporary_folder(tmp_path, monkeypatch):
     blocking = tmp_path / "file"
     blocking.write_text("no folder can be made below a file, by root neither")
     monkeypatch.setenv(building.CACHE_VARIABLE, str(blocking / "cache"))
@@ -301,7 +301,7 @@ def test_a_cache_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_pa
     assert blocking.read_text().startswith("no folder")
 
 
-def test_without_any_writable_folder_the_error_says_so(tmp_path, monkeypatch):
+def test_missing_writable_folder_is_reported(tmp_path, monkeypatch):
     blocking = tmp_path / "file"
     blocking.touch()
     monkeypatch.setenv(building.CACHE_VARIABLE, str(blocking / "cache"))
@@ -364,7 +364,7 @@ def test_a_cc_that_is_not_there_is_named(monkeypatch):
         answer()
 
 
-def test_a_cc_that_does_not_compile_is_shown_with_what_it_said(monkeypatch):
+def test_output_of_a_failing_cc_is_shown(monkeypatch):
     monkeypatch.setenv("CC", f"{sys.executable} -c 'import sys; sys.exit(\"I am no compiler\")'")
     with pytest.raises(BuildError, match="I am no compiler"):
         answer()
@@ -384,7 +384,7 @@ def without_compilers(monkeypatch) -> None:
     monkeypatch.setattr(compilers.shutil, "which", lambda _: None)
 
 
-def test_without_a_compiler_the_error_says_what_to_install(monkeypatch):
+def test_missing_compiler_names_what_to_install(monkeypatch):
     without_compilers(monkeypatch)
     monkeypatch.setattr(compilers.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(
@@ -438,7 +438,7 @@ def test_a_compiler_for_another_machine_is_named(tmp_path, monkeypatch):
         answer()
 
 
-def test_compiler_errors_are_shown_with_the_offending_lines():
+def test_compiler_errors_show_the_offending_lines():
     broken = source("double tiny_answer(void)\n{\n  return forty_two;\n}\n")
     with pytest.raises(BuildError) as error:
         building.load(broken, flags=FAST)
@@ -447,19 +447,19 @@ def test_compiler_errors_are_shown_with_the_offending_lines():
     assert "return forty_two;" in str(error.value)
 
 
-def test_a_text_that_is_refused_leaves_nothing_in_the_cache(cache):
+def test_rejected_source_adds_nothing_to_the_cache(cache):
     with pytest.raises(BuildError):
         building.load(source("this is not C\n"), flags=FAST)
     assert entries(cache) == []
 
 
-def test_nothing_is_printed(capfd):
+def test_build_prints_nothing(capfd):
     answer()
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_passes_of_gcc_are_left_out_of_what_other_compilers_are_asked(compiler, monkeypatch):
+def test_gcc_only_passes_are_not_given_to_other_compilers(compiler, monkeypatch):
     """Of text that is cut into functions, as large systems are: clang refuses what it does not know."""
     needs(compiler)
     monkeypatch.setenv("CC", compiler)

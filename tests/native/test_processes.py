@@ -72,7 +72,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="pr
 
 @needs_proc
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL], ids=lambda number: number.name)
-def test_what_ends_python_ends_the_compiler_and_its_children(slow_compiler, number):
+def test_ending_python_ends_the_compiler_and_its_children(slow_compiler, number):
     process = subprocess.Popen([sys.executable, "-c", COMPILING], stderr=subprocess.PIPE)
     child = child_of(slow_compiler)
     os.kill(process.pid, number)
@@ -82,7 +82,7 @@ def test_what_ends_python_ends_the_compiler_and_its_children(slow_compiler, numb
 
 
 @needs_proc
-def test_a_compiler_that_takes_too_long_is_ended(slow_compiler, monkeypatch):
+def test_compiler_is_ended_after_a_timeout(slow_compiler, monkeypatch):
     monkeypatch.setattr(building, "COMPILE_SECONDS", 1)
     with pytest.raises(BuildError, match="stopped after 1 s"):
         building.load(Source(prefix="tiny", header="", code="", declarations=""))
@@ -95,7 +95,7 @@ def test_output_status_and_temporary_files_are_those_of_the_program(tmp_path):
     assert process.returncode == 3
 
 
-def test_where_there_is_no_shell_the_program_is_started_alone(tmp_path):
+def test_without_a_shell_the_program_starts_directly(tmp_path):
     told = [sys.executable, "-c", "import os, sys; print(os.environ['TEMP']); sys.exit('no')"]
     with _alone(told, tmp_path) as process:
         assert process.communicate(timeout=300) == (f"{tmp_path}\n", "no\n")
@@ -119,7 +119,7 @@ exit 1
 """Compiles nothing before another compiles, too."""
 
 
-def test_parts_are_compiled_at_the_same_time(tmp_path, monkeypatch):
+def test_files_are_compiled_concurrently(tmp_path, monkeypatch):
     script, folder = tmp_path / "meeting-cc", tmp_path / "met"
     folder.mkdir()
     script.write_text(MEETING_COMPILER.format(folder=folder))
@@ -145,7 +145,7 @@ def told(monkeypatch, seconds: float, patience: float) -> list[str]:
     return said
 
 
-def test_work_that_takes_long_is_spoken_of_and_other_is_not(monkeypatch, caplog):
+def test_only_slow_work_is_announced(monkeypatch, caplog):
     caplog.set_level(logging.INFO, "scvi_codegen")
     assert told(monkeypatch, 0.3, 0.05) == ["deriving"]
     assert told(monkeypatch, 0.0, 0.5) == []
@@ -158,7 +158,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(("stream", "shown"), [(Terminal(), "scvi-codegen: {} ...\n"), (io.StringIO(), "")])
-def test_compiling_is_spoken_of_on_a_terminal_alone(slow_compiler, monkeypatch, stream, shown):
+def test_compiling_is_announced_only_on_a_terminal(slow_compiler, monkeypatch, stream, shown):
     monkeypatch.setattr(building, "COMPILE_SECONDS", 0.5)
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.05)
     monkeypatch.setattr(sys, "stderr", stream)

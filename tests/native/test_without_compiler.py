@@ -46,7 +46,7 @@ def in_python(environment: dict[str, str], *words: str) -> subprocess.CompletedP
 
 @pytest.mark.full
 @needs_wheel
-def test_a_machine_without_a_compiler_takes_the_one_from_the_wheel(tmp_path):
+def test_machine_without_a_compiler_uses_the_one_from_the_wheel(tmp_path):
     environment = bare_machine(tmp_path)
     assert not any(shutil.which(name, path=environment["PATH"]) for name in ("cc", "gcc", "clang"))
     ran = in_python(environment, "-c", RUN)
@@ -66,7 +66,7 @@ def broken(code: str) -> str:
     return str(error.value)
 
 
-def test_a_compiler_without_its_headers_leads_to_the_one_from_the_wheel(tmp_path, monkeypatch):
+def test_compiler_without_headers_is_replaced_by_the_one_from_the_wheel(tmp_path, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     said = broken("#include <no_such_header.h>\n")
     assert "no_such_header.h" in said

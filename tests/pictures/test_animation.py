@@ -38,7 +38,7 @@ class TestShapes:
         save_every = shape.points(run.q, run.p)
         assert np.allclose(np.linalg.norm(np.diff(save_every, axis=1), axis=2), [2.0, 0.5])
 
-    def test_a_pendulum_measured_from_above_stands_at_zero(self):
+    def test_angle_from_the_upright_position_is_drawn_upright_at_zero(self):
         run = run_with("m*l**2*q_dot**2/2 - m*g*l*cos(q)", ["q"], m=1.0, l=3.0, g=9.81)
         (places,) = shape_of(run).points(np.array([[0.0]]), np.zeros((1, 1)))
         assert np.allclose(places, [[0.0, 0.0], [0.0, 3.0]])
@@ -56,7 +56,7 @@ class TestShapes:
         ],
         ids=["spring", "two wells", "free", "apart", "angles between", "up and down", "no numbers"],
     )
-    def test_what_only_looks_like_pendulums_is_none(self, lagrangian, coordinates):
+    def test_systems_that_resemble_pendulums_are_not_drawn_as_such(self, lagrangian, coordinates):
         assert not shape_of(run_with(lagrangian, coordinates)).joined
 
     def test_bodies_are_points_with_names(self):
@@ -64,13 +64,13 @@ class TestShapes:
         assert shape.names == ("sun", "jupiter", "saturn", "uranus", "neptune", "pluto")
         assert shape.points(np.arange(18.0)[np.newaxis], np.zeros((1, 18))).shape == (1, 6, 3)
 
-    def test_chains_stand_side_by_side(self):
+    def test_chains_are_drawn_next_to_each_other(self):
         shape = shape_of(run_of("fput-chain", 2))
         (places,) = shape.points(np.arange(8.0)[np.newaxis], np.zeros((1, 8)))
         assert shape.joined
         assert np.array_equal(places, np.stack([np.arange(1.0, 9.0), np.arange(8.0)], axis=1))
 
-    def test_one_coordinate_moves_in_its_phase_plane_and_two_in_theirs(self):
+    def test_one_coordinate_uses_its_phase_plane_and_two_their_plane(self):
         oscillator, kepler = run_of("harmonic-oscillator"), run_of("kepler")
         assert np.array_equal(
             shape_of(oscillator).points(oscillator.q, oscillator.p)[:, 0], np.hstack([oscillator.q, oscillator.p])
@@ -102,12 +102,12 @@ class TestFilm:
         shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
         assert shown.count("data:image/png") == 4
 
-    def test_a_film_goes_backward_as_its_run_does(self):
+    def test_animation_of_a_backward_run_is_backward(self):
         run = run_of("kepler", 10)
         back = run.stepper.integrate(run.q[-1], run.p[-1], h=-run.h, steps=10)
         assert list(back.animate(seconds=1.0).frames) == list(range(11))
 
-    def test_files_are_whole_films(self, tmp_path):
+    def test_files_are_complete_animations(self, tmp_path):
         run = run_of("kepler", 4)
         run.animate(tmp_path / "film.gif", seconds=0.2)
         run.animate(tmp_path / "film.html", seconds=0.2)
@@ -118,7 +118,7 @@ class TestFilm:
         assert "<script" in (tmp_path / "film.html").read_text(encoding="utf-8")
         assert sorted(file.name for file in tmp_path.iterdir()) == ["film.gif", "film.html"]
 
-    def test_places_may_be_given(self):
+    def test_positions_may_be_supplied(self):
         run = run_of("spherical-pendulum", 3)
 
         def bob(q: np.ndarray) -> np.ndarray:
@@ -138,11 +138,11 @@ class TestFilm:
             ({"positions": lambda q: q}, r"shape \(n, k, 2\) or \(n, k, 3\)"),
         ],
     )
-    def test_what_is_wrong_is_said(self, arguments, words):
+    def test_invalid_arguments_are_reported(self, arguments, words):
         with pytest.raises(StateError, match=words):
             run_of("kepler").animate(**arguments)
 
-    def test_without_ffmpeg_a_film_that_needs_it_is_refused(self, monkeypatch, tmp_path):
+    def test_missing_ffmpeg_is_rejected_where_needed(self, monkeypatch, tmp_path):
         from matplotlib.animation import writers
 
         monkeypatch.setattr(writers, "is_available", lambda name: False)

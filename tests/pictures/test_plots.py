@@ -62,7 +62,7 @@ def test_equal_trajectories_give_equal_bytes(kepler, tmp_path, suffix):
         ("fput-chain:12", ["q over time", "relative energy error"]),
     ],
 )
-def test_each_kind_of_system_gets_its_panels(name, titles):
+def test_each_kind_of_system_has_its_panels(name, titles):
     figure = plot_trajectory(trajectory_of(name))[0].figure
     assert [axes.get_title() for axes in figure.axes if axes.get_title()] == titles
     assert figure.axes[len(titles) - 1].get_yscale() == "log"
@@ -117,7 +117,7 @@ def test_coordinates_are_grouped_into_bodies(names, expected):
     assert [(body.name, body.columns) for body in bodies(names)] == expected
 
 
-def test_other_suffixes_and_missing_matplotlib_are_errors_before_the_run(monkeypatch):
+def test_unknown_suffix_and_missing_matplotlib_fail_before_the_run(monkeypatch):
     with pytest.raises(StateError, match=r"\.png or \.svg"):
         check_plot_path("orbit.gif")
     find = importlib.util.find_spec
@@ -126,7 +126,7 @@ def test_other_suffixes_and_missing_matplotlib_are_errors_before_the_run(monkeyp
         check_plot_path("orbit.png")
 
 
-def test_a_picture_that_fails_leaves_nothing_behind(kepler, tmp_path, monkeypatch):
+def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     def fail(trajectory: Trajectory, axes: object) -> None:
         raise RuntimeError("no picture")
 
@@ -167,13 +167,13 @@ def test_a_section_has_the_states_at_the_crossings(orbits, tmp_path):
     ("arguments", "words"),
     [({"axes": ("y", "z")}, "'z' is neither"), ({"axes": ("y", "p_y"), "event": 2}, "no event 2")],
 )
-def test_a_section_says_what_it_lacks(orbits, arguments, words, tmp_path):
+def test_section_reports_missing_arguments(orbits, arguments, words, tmp_path):
     with pytest.raises(StateError, match=words):
         plot_section(orbits[0], tmp_path / "section.png", **arguments)
 
 
 class TestOnePicture:
-    def test_it_is_drawn_on_the_axes_given_and_returned(self, kepler, orbits):
+    def test_picture_is_drawn_on_the_supplied_axes(self, kepler, orbits):
         _, given = pyplot.subplots(2, 2)
         assert plot_motion(kepler, ax=given[0, 0]) is given[0, 0]
         assert plot_energy(kepler, ax=given[0, 1]) is given[0, 1]
@@ -181,12 +181,12 @@ class TestOnePicture:
         assert plot_section(orbits, axes=("y", "p_y"), ax=given[1, 1]) is given[1, 1]
         assert all(axes.lines for axes in given.flat)
 
-    def test_without_axes_it_is_a_figure_that_a_notebook_shows(self, kepler):
+    def test_without_axes_a_figure_is_returned(self, kepler):
         axes = kepler.plot.energy()
         assert pyplot.gcf() is axes.figure
         assert mpl.rcParams["axes.grid"] is False
 
-    def test_with_a_path_it_is_a_file_and_no_figure_stays(self, kepler, tmp_path):
+    def test_path_writes_a_file_and_closes_the_figure(self, kepler, tmp_path):
         kepler.plot.momentum_maps(tmp_path / "maps.svg")
         assert "angular momentum" in (tmp_path / "maps.svg").read_text(encoding="utf-8")
         assert pyplot.get_fignums() == []
@@ -198,7 +198,7 @@ class TestOnePicture:
         for line, orbit in zip(drawn, orbits, strict=True):
             assert np.array_equal(line.get_xydata(), np.stack([orbit.q[:, 1], orbit.p[:, 1]], axis=1))
 
-    def test_energies_of_several_share_an_axis_that_holds_them(self, orbits):
+    def test_energies_of_several_runs_share_axes_that_contain_them(self, orbits):
         axes = plot_energy(orbits)
         low, high = axes.get_ylim()
         values = np.concatenate([line.get_ydata() for line in axes.lines])
@@ -212,7 +212,7 @@ class TestOnePicture:
         largest = np.abs(kepler.momentum_errors()).max(axis=0)
         assert [np.nanmax(line.get_ydata()) for line in axes.lines] == list(largest)
 
-    def test_what_cannot_be_drawn_is_said(self, kepler, orbits):
+    def test_unsupported_pictures_are_reported(self, kepler, orbits):
         with pytest.raises(StateError, match="'Henon-Heiles system' has no known symmetry"):
             plot_momentum_maps(orbits[0])
         with pytest.raises(StateError, match="'z' is neither a coordinate nor a momentum"):

@@ -174,7 +174,7 @@ def test_verlet_is_the_leapfrog_of_separable_systems(sample, compiled, name):
     assert relative(compiled(name, StoermerVerlet()).step(q, p, H, T), expected) < TOLERANCE
 
 
-def test_the_oracle_tells_apart_what_should_differ(sample):
+def test_oracle_distinguishes_neighbouring_methods_and_times(sample):
     """The comparison has teeth: neighbouring methods and a slightly other time are far outside the tolerance."""
     case = sample("pumped-cart-pole")
     q, p = case.state

@@ -61,14 +61,14 @@ def test_steppers_work_on_lesser_processors(tmp_path, level):
 
 @pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="the sanitizers are preloaded")
-def test_sanitizers_find_nothing(tmp_path):
+def test_sanitizers_report_no_error(tmp_path):
     libraries = " ".join(map(sanitizer_library, ("libasan.so", "libubsan.so")))
     options = "detect_leaks=0:allocator_may_return_null=1"  # the interpreter keeps what it has; too much is refused
     files = files_named("stepper", "fuzz_steppers", "constraints", "indexed_newton")
     run_stepper_tests(tmp_path, SANITIZERS, *files, CC="gcc", LD_PRELOAD=libraries, ASAN_OPTIONS=options)
 
 
-def test_a_build_with_wanted_flags_is_another_one(tmp_path, monkeypatch):
+def test_different_flags_give_a_different_build(tmp_path, monkeypatch):
     """Flags of the environment are part of the name in the cache, and reach the compiler."""
     from scvi_codegen.compiler import compile_stepper
     from scvi_codegen.methods import StoermerVerlet

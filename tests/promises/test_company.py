@@ -89,7 +89,7 @@ def at_once(processes: list[subprocess.Popen[str]]) -> list[tuple[str, str]]:
     return [process.communicate(timeout=300) for process in processes]
 
 
-def test_many_processes_compile_the_same_and_others_into_an_empty_cache(folder):
+def test_concurrent_processes_compile_into_an_empty_cache(folder):
     results = at_once([loading(folder, i % 4) for i in range(PROCESSES)])
     assert results == [(f"{i % 4}.0\n", "") for i in range(PROCESSES)]
     found = sorted(path.name for path in folder.iterdir())
@@ -98,7 +98,7 @@ def test_many_processes_compile_the_same_and_others_into_an_empty_cache(folder):
 
 
 @pytest.mark.parametrize("rounds", [1, pytest.param(12, marks=pytest.mark.full)])
-def test_entries_that_leave_while_others_load_them_disturb_nobody(folder, rounds):
+def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
     """With room for one entry, each process throws out what the others have just built."""
     numbers = [[(first + i) % 3 for i in range(rounds * 3)] for first in range(4)]
     results = at_once([loading(folder, *order, **{cache.SIZE_VARIABLE: "1"}) for order in numbers])
@@ -143,7 +143,7 @@ def killed(folder: Path, seconds: float, generator: random.Random) -> None:
 
 
 @pytest.mark.parametrize("times", [3, pytest.param(40, marks=pytest.mark.full)])
-def test_a_process_killed_while_it_compiles_leaves_a_cache_that_works(folder, times, monkeypatch):
+def test_killed_compilation_leaves_a_usable_cache(folder, times, monkeypatch):
     generator, left = random.Random(times), 0
     for _ in range(times):
         killed(folder, 0.1, generator)
@@ -170,7 +170,7 @@ print(run.q[-1].tobytes().hex(), run.p[-1].tobytes().hex())
 
 
 @pytest.mark.full
-def test_many_processes_derive_compile_and_run_at_once(folder):
+def test_concurrent_processes_derive_compile_and_run(folder):
     names = ("kepler", "planar-pendulum", "henon-heiles", "double-pendulum")
     command = [sys.executable, "-W", "error", "-c", COMPILING]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -221,7 +221,7 @@ def test_copies_of_steppers_runs_and_trajectories_are_equal(kepler, duplicate, t
     np.testing.assert_array_equal(recorded.q[:], trajectory.q)
 
 
-def test_a_copy_of_a_run_goes_its_own_way(kepler):
+def test_copy_of_a_run_is_independent(kepler):
     run = kepler.start(*STATE, h=0.05)
     other = copy.deepcopy(run)
     run.record(50)
@@ -256,7 +256,7 @@ def test_threads_derive_at_once(folder):
 
 @pytest.mark.parametrize("method", ["fork", "spawn", pytest.param("forkserver", marks=pytest.mark.full)])
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_steppers_travel_to_other_processes(kepler, finals, method):
+def test_steppers_are_pickled_to_other_processes(kepler, finals, method):
     with multiprocessing.get_context(method).Pool(2) as pool:
         assert pool.starmap(final, [(kepler, p) for p in MOMENTA[:4]]) == finals[:4]
 

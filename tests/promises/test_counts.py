@@ -13,12 +13,12 @@ from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
 
 
 @pytest.mark.parametrize("value", [3, np.int64(3), np.uint8(3), sympy.Integer(3)])
-def test_whole_numbers_of_any_kind_become_ints(value):
+def test_integers_of_any_kind_become_ints(value):
     assert type(checked_count(value, "n", least=3, most=3)) is int
 
 
 @pytest.mark.parametrize("value", [True, np.True_, 3.0, "3", None, [3]])
-def test_nothing_else_is_one(value):
+def test_non_integers_are_rejected(value):
     with pytest.raises(StateError, match="n must be a whole number, not"):
         checked_count(value, "n", least=0)
 
@@ -31,7 +31,7 @@ def test_nothing_else_is_one(value):
         (LARGEST_COUNT + 1, "n must be at most 5, not 9007199254740992"),
     ],
 )
-def test_what_is_out_of_range_is_named_with_the_end_it_passes(value, message):
+def test_out_of_range_values_are_named_with_the_bound(value, message):
     with pytest.raises(MethodError, match=message):
         checked_count(value, "n", least=2, most=5, error=MethodError)
 

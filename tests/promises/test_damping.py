@@ -129,7 +129,7 @@ def test_order_is_that_without_damping(method, order, counts):
     assert errors[1] < 1e-4
 
 
-def test_momentum_maps_shrink_exactly_and_work_is_told():
+def test_momentum_maps_decay_exactly_and_work_is_reported():
     """The angular momentum of a body about a centre; damping takes energy to the order of the method."""
     system = LagrangianSystem.from_text(
         name="slowed body",
@@ -153,7 +153,7 @@ def test_momentum_maps_shrink_exactly_and_work_is_told():
     assert taken < 1e-9
 
 
-def test_steps_that_choose_their_length_ensembles_and_hamiltonians():
+def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
     """Lanes with rates of their own; H, its Lagrangian, forces beside; what is held by constraints."""
     hamiltonian = HamiltonianSystem.from_text(
         name="damped from H",
@@ -203,7 +203,7 @@ def test_constrained_motion_is_that_of_the_angle():
     assert np.log2(errors[0] / errors[1]) > 3.7
 
 
-def test_the_certificate_says_so():
+def test_certificate_reports_damping():
     certificate = verify(damped(), SVI(2), [0.3, -0.4], [0.5, 0.7], h=0.1, flags=QUICK_FLAGS)
     assert certificate.passed, certificate.to_text()
     assert not certificate.not_measured
@@ -246,7 +246,7 @@ def test_a_rate_may_be_a_number_in_a_model_file(written):
         parse_model(text.replace(f"damping = {written}", "damping = true"))
 
 
-def test_who_does_not_take_it():
+def test_unsupported_systems_reject_damping():
     for method in (SCVI(2), SpectralCollocation(3), SVI(2, "hermite:2"), Gauss(2, form="position")):
         with pytest.raises(MethodError, match=r"does not support the damping of 'damped'.*use an SVI"):
             compile_stepper(damped(), method)

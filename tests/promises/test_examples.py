@@ -92,7 +92,7 @@ def test_every_example_is_tried_here():
 
 
 @pytest.mark.parametrize("name", ENERGY_ERRORS)
-def test_model_files_run_and_keep_their_energy(name, tmp_path):
+def test_model_files_run_and_conserve_energy(name, tmp_path):
     output = tmp_path / "run.npz"
     result = CliRunner().invoke(main, ["run", str(EXAMPLES / f"{name}.toml"), "-o", str(output)])
     assert result.exit_code == 0, result.output
@@ -104,7 +104,7 @@ def test_model_files_run_and_keep_their_energy(name, tmp_path):
         assert len(written["t"]) == model.step_count // model.save_every + 1
 
 
-def test_the_ring_keeps_its_energy_and_momentum(tmp_path):
+def test_ring_conserves_energy_and_momentum(tmp_path):
     output = tmp_path / "run.npz"
     words = ["run", str(EXAMPLES / "fput_ring.toml"), "--steps", "100", "-o", str(output)]
     result = CliRunner().invoke(main, words)
@@ -114,7 +114,7 @@ def test_the_ring_keeps_its_energy_and_momentum(tmp_path):
         assert np.ptp(written["maps"]) < 1e-14
 
 
-def test_the_shaken_tower_moves_as_its_equations_say(tmp_path):
+def test_shaken_tower_agrees_with_dop853(tmp_path):
     """By DOP853 from breakpoint to breakpoint of SciPy's spline through the same table."""
     result = CliRunner().invoke(main, ["run", str(EXAMPLES / "shaken_tower.toml"), "-o", str(tmp_path / "run.csv")])
     assert result.exit_code == 0, result.output
@@ -132,7 +132,7 @@ def test_the_shaken_tower_moves_as_its_equations_say(tmp_path):
     assert last[:5] == pytest.approx([8.0, *state], abs=1e-8)
 
 
-def test_kepler_conservation_tells_the_methods_apart(output_of):
+def test_kepler_conservation_distinguishes_the_methods(output_of):
     errors = {
         line[:32].strip(): [float(word) for word in line[32:].split()]
         for line in output_of("kepler_conservation").splitlines()[1:]
@@ -143,7 +143,7 @@ def test_kepler_conservation_tells_the_methods_apart(output_of):
     assert min(errors["explicit Euler"]) > 0.1
 
 
-def test_eccentric_comet_keeps_its_energy(output_of):
+def test_eccentric_comet_conserves_energy(output_of):
     rows = [line[12:].split() for line in output_of("eccentric_comet").splitlines()[1:]]
     (stretched, regular) = ([float(word) for word in row] for row in rows)
     assert stretched[1] > 1000 * stretched[2]
@@ -159,7 +159,7 @@ def test_a_field_in_two_parts_has_the_bits_of_one(output_of):
     assert len(times) in (4, 5)  # the last where others had the cores
 
 
-def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):
+def test_every_step_size_selection_has_its_documented_accuracy(output_of):
     """Over a thousand periods; in docs/steps.md ten thousand."""
     rows = [line[28:].split() for line in output_of("which_step").splitlines()[1:]]
     steps, _, energy, _, error = zip(*(map(float, row) for row in rows), strict=True)
@@ -170,12 +170,12 @@ def test_every_way_to_choose_steps_is_as_good_as_it_says(output_of):
     assert max(error[way] for way in (controlled, transformed, reversible)) < 1e-8 < error[fixed]
 
 
-def test_a_comet_that_all_but_hits_the_sun_comes_back(output_of):
+def test_comet_returns_after_a_near_collision(output_of):
     errors = [float(line.split()[-1]) for line in output_of("collisions_in_space").splitlines()[1:]]
     assert max(errors) < 1e-11
 
 
-def test_leapfrog_keeps_an_ellipse_by_its_logarithm(output_of):
+def test_leapfrog_with_logarithmic_hamiltonian_preserves_an_ellipse(output_of):
     rows = [line.split() for line in output_of("logarithmic_hamiltonian").splitlines()[1:]]
     _, away, period = zip(*(map(float, row) for row in rows), strict=True)
     assert max(away) < 1e-14
@@ -183,7 +183,7 @@ def test_leapfrog_keeps_an_ellipse_by_its_logarithm(output_of):
 
 
 @many_steps
-def test_halo_orbits_are_the_published_ones_and_their_family_turns(output_of, tmp_path):
+def test_halo_orbits_and_their_bifurcations_are_the_published_ones(output_of, tmp_path):
     output = output_of("halo_orbits")
     away = [float(found) for found in re.findall(r"(\S+) from the published orbit", output)]
     assert len(away) == 4
@@ -203,7 +203,7 @@ def test_the_map_of_henon_and_heiles_is_half_chaotic(output_of, tmp_path):
     assert (tmp_path / "henon_heiles_map.png").stat().st_size > 10_000
 
 
-def test_curves_and_quadratures_win_where_they_say(output_of):
+def test_curves_and_quadratures_have_their_documented_advantages(output_of):
     errors = [float(line.split()[-1]) for line in output_of("curves_and_quadratures").splitlines() if "e-" in line]
     polynomials, harmonics, smooth, splines, trapezoid, hermite, more = errors
     assert harmonics < polynomials / 100
@@ -225,13 +225,13 @@ def test_custom_sympy_system_finds_the_bifurcation(output_of):
     assert 0 < float(fast[0]) < float(fast[1])
 
 
-def test_a_mechanism_from_joints_moves_as_sympy_says(output_of):
+def test_mechanism_from_joints_agrees_with_sympy(output_of):
     output = output_of("mechanism_from_joints")
     assert float(re.search(r"unaccounted for: (\S+)", output)[1]) < 1e-12
     assert float(re.search(r"after 10 s: (\S+)", output)[1]) < 1e-11
 
 
-def test_inspect_derivation_shows_equations_latex_and_radicals_in_a_process_of_its_own(tmp_path):
+def test_inspect_derivation_runs_in_a_separate_process(tmp_path):
     path = os.pathsep.join([str(EXAMPLES.parent), os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(
         [sys.executable, "-W", "error", str(EXAMPLES / "inspect_derivation.py")],
@@ -248,7 +248,7 @@ def test_inspect_derivation_shows_equations_latex_and_radicals_in_a_process_of_i
 
 
 @many_steps
-def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(output_of, tmp_path):
+def test_poincare_section_lies_on_the_section_and_conserves_energy(output_of, tmp_path):
     lines = output_of("poincare_section").splitlines()
     assert len(lines) == 3
     for line in lines:
@@ -261,7 +261,7 @@ def test_poincare_section_cuts_at_the_section_and_keeps_the_energy(output_of, tm
     }
 
 
-def test_hanging_chain_comes_to_rest_as_a_catenary(output_of):
+def test_damped_hanging_chain_converges_to_a_catenary(output_of):
     output = output_of("hanging_chain")
     assert float(re.search(r"off their length by (\S+)", output)[1]) < 1e-16
     a = brentq(lambda a: 2.0 * a * np.sinh(0.5 / a) - 1.2, 0.1, 10.0)
@@ -272,7 +272,7 @@ def test_hanging_chain_comes_to_rest_as_a_catenary(output_of):
     assert float(carried) == pytest.approx(float(weight), abs=1e-5)
 
 
-def test_joints_carry_what_they_say(output_of):
+def test_joint_forces_are_the_documented_ones(output_of):
     output = output_of("joints")
     forces = re.findall(r"(\d+\.\d+), (?:by its turning|with a constant acceleration) (\S+)", output)
     assert len(forces) == 2
@@ -295,7 +295,7 @@ def test_a_cart_balances_its_pole(output_of):
     assert float(re.search(r"ends (\S+) away", output)[1]) < 1e-12
 
 
-def test_the_orbit_of_ceres_tells_the_mass_of_jupiter(output_of, tmp_path):
+def test_orbit_of_ceres_determines_the_mass_of_jupiter(output_of, tmp_path):
     """To two thousandths of the published one, as far as the approximate orbits of the planets let it."""
     output = output_of("ceres_orbit")
     found, published = map(float, re.search(r"1/(\S+) of the Sun; 1/(\S+) by other", output).groups())

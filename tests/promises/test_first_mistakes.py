@@ -52,7 +52,7 @@ def stepper():
     ],
     ids=lambda part: part if isinstance(part, str) else None,
 )
-def test_of_a_run(given, said, stepper):
+def test_first_mistakes_with_runs(given, said, stepper):
     with pytest.raises(ScviCodegenError) as caught:
         stepper.integrate(**{"h": 0.1, "steps": 3} | given)
     assert said in str(caught.value)
@@ -69,13 +69,13 @@ def test_of_a_run(given, said, stepper):
     ],
     ids=["a constant", "a force"],
 )
-def test_of_a_system(given, said):
+def test_first_mistakes_with_systems(given, said):
     with pytest.raises(ScviCodegenError) as caught:
         sc.LagrangianSystem.from_text(**TEXT | given)
     assert said in str(caught.value)
 
 
-def test_a_system_may_be_given_by_place_and_one_coordinate_by_a_number(stepper):
+def test_system_accepts_positional_arguments_and_scalar_states(stepper):
     for kind, formula in ((sc.LagrangianSystem, TEXT["lagrangian"]), (sc.HamiltonianSystem, "p_q**2/2 - cos(q)")):
         by_name = {"lagrangian": formula} if kind is sc.LagrangianSystem else {"hamiltonian": formula}
         assert kind.from_text("swing", ["q"], formula) == kind.from_text(name="swing", coordinates=["q"], **by_name)
@@ -88,7 +88,7 @@ def test_a_system_may_be_given_by_place_and_one_coordinate_by_a_number(stepper):
         sc.compile_stepper(sc.problem("kepler").system, "svi:2", flags=QUICK_FLAGS).energy(1.0, 0.5)
 
 
-def test_a_mass_of_0_and_steps_that_vanish_are_explained():
+def test_zero_mass_and_step_size_underflow_are_explained():
     text = {"lagrangian": "m*q_dot**2/2 - q**2/2", "parameters": {"m": 1.0}}
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT | text), "svi:2", flags=QUICK_FLAGS)
     for given, said in (
@@ -103,7 +103,7 @@ def test_a_mass_of_0_and_steps_that_vanish_are_explained():
     ("name", "meant"),
     [("verlet", "stoermer-verlet"), ("leapfrog", "stoermer-verlet"), ("midpoint", "gauss:1"), ("svl:4", "svi")],
 )
-def test_of_a_method(name, meant, stepper):
+def test_first_mistakes_with_methods(name, meant, stepper):
     with pytest.raises(ScviCodegenError, match=f"did you mean '{meant}'"):
         sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT), name)
 
@@ -124,7 +124,7 @@ def test_of_a_method(name, meant, stepper):
         ("", "", "-o nowhere/run.npz", "there is no folder 'nowhere'"),
     ],
 )
-def test_of_a_file_and_of_the_command(old, new, words, said, tmp_path, monkeypatch):
+def test_first_mistakes_with_files_and_commands(old, new, words, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("swing.toml").write_text(MODEL.replace(old, new, 1))
     result = CliRunner().invoke(main, ["run", "swing.toml", *words.split()])
@@ -132,7 +132,7 @@ def test_of_a_file_and_of_the_command(old, new, words, said, tmp_path, monkeypat
     assert said in result.stderr
 
 
-def test_of_the_name_of_a_command():
+def test_first_mistakes_with_command_names():
     result = CliRunner().invoke(main, ["runn", "kepler"])
     assert result.exit_code == 2
     assert "there is no command 'runn'; did you mean 'run'? Known: bench," in result.stderr

@@ -134,7 +134,7 @@ def test_order_of_every_method_is_that_without_forces(quickly_compiled, case):
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", [SVI(3), Gauss(3), SpectralCollocation(4, form="phase-space")], ids=lambda m: m.name)
-def test_a_hamiltonian_with_forces_takes_the_same_step(quickly_compiled, method):
+def test_hamiltonian_with_forces_has_the_same_step(quickly_compiled, method):
     system = radial()
     own, other = (quickly_compiled(each, method) for each in (system, hamiltonian_of(system)))
     q, v = STATES[radial]
@@ -144,7 +144,7 @@ def test_a_hamiltonian_with_forces_takes_the_same_step(quickly_compiled, method)
 
 
 @pytest.mark.parametrize("method", [SVI(2), SCVI(2)], ids=lambda method: method.name)
-def test_forces_without_torque_keep_the_angular_momentum(quickly_compiled, method):
+def test_forces_without_torque_conserve_angular_momentum(quickly_compiled, method):
     stepper = quickly_compiled(radial(), method)
     q, v = STATES[radial]
     run = stepper.integrate(q, velocity=v, h=0.05, steps=400)
@@ -154,7 +154,7 @@ def test_forces_without_torque_keep_the_angular_momentum(quickly_compiled, metho
     assert np.abs(run.momentum_errors()).max() < 1e-14
 
 
-def test_compositions_take_forces_of_place_and_time(quickly_compiled):
+def test_compositions_accept_forces_of_position_and_time(quickly_compiled):
     """x'' = -x + sin(2 t): the solution from rest is (2 sin t - sin 2t) / 3."""
     system = LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "sin(2*t)"}

@@ -108,7 +108,7 @@ def calls(stepper: Stepper) -> dict[str, Callable[[Any, Any], Any]]:
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:the matrix subclass")
 @pytest.mark.parametrize("name", ["step", "integrate", "momentum", "velocity", "energy", "action"])
-def test_a_state_in_any_clothes_is_itself_and_nothing_else_is_a_state(name, kepler):
+def test_states_in_any_container_are_accepted_and_others_rejected(name, kepler):
     call = calls(kepler)[name]
     expected = call(Q, P)
     for dress in CLEAN.values():
@@ -121,7 +121,7 @@ def test_a_state_in_any_clothes_is_itself_and_nothing_else_is_a_state(name, kepl
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning", "ignore:the matrix subclass")
-def test_an_ensemble_in_any_clothes_is_itself_and_nothing_else_is_one(kepler):
+def test_ensembles_in_any_container_are_accepted_and_others_rejected(kepler):
     def final(q: Any, p: Any) -> np.ndarray:
         return kepler.integrate_ensemble(q, p, h=0.125, steps=3, threads=1).q[-1]
 
@@ -301,7 +301,7 @@ def test_an_oscillator_of_any_size_with_any_step_is_right_or_refused(kind, solve
     assert done > 100
 
 
-def test_an_ensemble_of_any_sizes_is_right_or_says_which_are_not():
+def test_ensemble_with_any_sizes_is_correct_or_reports_failures():
     stepper = prepared(compile_stepper(oscillator("lagrangian"), SVI(2), flags=QUICK_FLAGS))
     random = Random(3)
     q, p = (np.array([[random.choice((-1, 1)) * random.choice(SIZES)] for _ in range(200)]) for _ in "qp")
@@ -356,7 +356,7 @@ def test_any_state_is_stepped_to_a_finite_one_or_refused(name, method):
 
 
 @pytest.mark.full
-def test_many_more_states():
+def test_any_state_full_sample():
     for kind in ("lagrangian", "hamiltonian"):
         for solver in ("auto", "newton", "fixed-point"):
             stepper = prepared(compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS))

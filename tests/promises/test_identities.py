@@ -88,7 +88,7 @@ def test_svi_with_as_many_gauss_points_as_its_degree_is_gauss_collocation(sample
 
 
 @pytest.mark.parametrize("name", ANY)
-def test_one_more_gauss_point_is_another_map(sample, compiled, name):
+def test_additional_gauss_point_changes_the_map(sample, compiled, name):
     two, three = (compiled_map(sample, compiled, name, SVI(2, f"gauss-legendre:{g}")) for g in (2, 3))
     assert distance(two, three) > 1e-9
 
@@ -107,13 +107,13 @@ def test_svi_with_as_many_lobatto_points_as_its_degree_is_the_lobatto_pair(sampl
 @pytest.mark.covering
 @pytest.mark.parametrize("name", CONSTANT_MASS)
 @pytest.mark.parametrize("s", [1, 2, 3])
-def test_for_constant_mass_one_more_lobatto_point_is_the_next_pair(sample, compiled, name, s):
+def test_constant_mass_additional_lobatto_point_is_the_next_pair(sample, compiled, name, s):
     expected = oracle_map(sample, name, oracle.partitioned, **oracle.lobatto_pair(s + 1))
     assert distance(compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")), expected) < ROUND_OFF
 
 
 @pytest.mark.parametrize("name", ["double-pendulum", "charged-particle", "pumped-cart-pole"])
-def test_for_other_lagrangians_one_more_lobatto_point_is_not(sample, compiled, name):
+def test_other_lagrangians_additional_lobatto_point_is_not_the_next_pair(sample, compiled, name):
     differences = [
         distance(
             compiled_map(sample, compiled, name, SVI(s, f"gauss-lobatto:{s + 1}")),
@@ -174,7 +174,7 @@ def test_scvi_of_degree_one_is_svi_of_degree_one(sample, compiled, name, quadrat
         assert distance(scvi, svi) < ROUND_OFF
 
 
-def test_with_three_nodes_they_are_three_maps(sample, compiled):
+def test_three_nodes_give_three_maps(sample, compiled):
     methods = SVI(2, "gauss-legendre:3"), SCVI(2, "gauss-legendre:3"), SCVI(2, "gauss-legendre:3", variational=False)
     svi, scvi, printed = (compiled_map(sample, compiled, "kepler", method) for method in methods)
     assert min(distance(svi, scvi), distance(svi, printed), distance(scvi, printed)) > 1e-8
@@ -238,7 +238,7 @@ def test_scvi_on_symmetric_abscissae_is_reversible(sample, compiled, name, famil
 
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole"])
-def test_others_are_not(sample, compiled, name):
+def test_other_methods_are_not_reversible(sample, compiled, name):
     for method in (SVI(2, "gauss-radau-left:2"), SCVI(2), SpectralCollocation(2), SCVI(2, variational=False)):
         assert reversal_defect(sample, compiled, name, method) > 1e-8
 
@@ -257,12 +257,12 @@ def test_the_abscissae_of_nodes_give_the_scvi_on_those_nodes(sample, compiled, n
 @pytest.mark.covering
 @pytest.mark.parametrize("s", [2, 3, 4])
 @pytest.mark.parametrize("name", CONSTANT_MASS)
-def test_for_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):
+def test_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):
     maps = [compiled_map(sample, compiled, name, method) for method in (SCVI(s, abscissae="gauss"), SVI(s))]
     assert distance(*maps) < ROUND_OFF
 
 
-def test_otherwise_it_is_not(sample, compiled):
+def test_variable_mass_scvi_on_gauss_points_is_not_svi(sample, compiled):
     """It collocates the equations of second order, Gauss's method those of first order."""
     maps = [
         compiled_map(sample, compiled, "double-pendulum", method) for method in (SCVI(2, abscissae="gauss"), SVI(2))

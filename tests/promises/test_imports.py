@@ -124,12 +124,12 @@ def circle(used: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def test_every_room_stands_on_one_floor():
+def test_every_package_belongs_to_one_layer():
     assert len(FLOOR_OF) == len(FLOORS.split())
     assert {room_of(module) for module in MODULES} == set(FLOOR_OF)
 
 
-def test_the_root_holds_the_tour_and_what_everything_needs():
+def test_root_contains_only_the_tour_and_shared_modules():
     assert len([*PACKAGE.glob("*.py")]) <= 12
 
 
@@ -139,7 +139,7 @@ def test_imports_point_down_only(room):
     assert [pair for pair in used if FLOOR_OF[room_of(pair[1])] >= FLOOR_OF[room]] == []
 
 
-def test_no_module_imports_itself_by_way_of_others():
+def test_no_module_imports_itself_indirectly():
     assert circle(USED) == []
 
 
@@ -148,7 +148,7 @@ def test_a_circle_would_be_found():
 
 
 @pytest.mark.parametrize("library", OWNERS)
-def test_a_third_party_library_has_its_rooms(library):
+def test_third_party_libraries_are_imported_by_assigned_packages_only(library):
     users = {room_of(m) for m, names in NAMES.items() if library in {name.split(".")[0] for name in names}}
     assert users <= set(OWNERS[library].split())
 
@@ -226,7 +226,7 @@ TYPED_PAGES = (*USE, "derivatives", "chaos", "fits", "ensembles", "long_runs")
 
 
 @pytest.mark.full
-def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
+def test_mypy_checks_public_names_and_code_of_the_pages(tmp_path):
     (tmp_path / "typed.py").write_text(TYPED)
     files = ["typed.py"]
     for page in ("README.md", *(f"docs/{name}.md" for name in TYPED_PAGES)):
@@ -246,7 +246,7 @@ def test_a_type_checker_knows_them_and_the_code_of_the_pages(tmp_path):
 
 
 @pytest.mark.full
-def test_another_type_checker_does_too(tmp_path):
+def test_pyright_checks_public_names(tmp_path):
     needs("pyright")
     text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
     (tmp_path / "readme.py").write_text(
@@ -260,7 +260,7 @@ def test_another_type_checker_does_too(tmp_path):
     assert "1 error, " in said
 
 
-def test_public_names_are_all_there_and_come_from_where_they_are_said_to():
+def test_public_names_exist_and_come_from_the_documented_modules():
     for home, names in scvi_codegen._HOMES.items():
         assert FLOOR_OF[room_of(home)] < FLOOR_OF["__init__"]
         for name in names:

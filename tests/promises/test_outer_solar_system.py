@@ -30,7 +30,7 @@ def run(tmp_path_factory):
     return np.load(output)
 
 
-def test_the_model_file_runs_the_whole_span(run):
+def test_model_file_runs_the_complete_span(run):
     assert run["t"][0] == 0.0
     assert run["t"][-1] == SPAN
 

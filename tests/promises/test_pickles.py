@@ -43,7 +43,7 @@ def copied(given: Any) -> Any:
     return pickle.loads(pickle.dumps(given))
 
 
-def test_every_option_of_a_stepper_stands_in_the_table() -> None:
+def test_every_option_of_a_stepper_is_in_the_table() -> None:
     signature = inspect.signature(compile_stepper)
     options = {name for name, each in signature.parameters.items() if each.kind is each.KEYWORD_ONLY}
     assert options == set(STEPPERS) - {""}
@@ -69,7 +69,7 @@ def test_a_stepper_is_what_it_was(option: str) -> None:
             assert_same(*(each.integrate_ensemble([Q], [P], h=H, steps=STEPS) for each in (own, copy)))
 
 
-def test_second_derivatives_that_were_not_asked_for_are_missed_by_name() -> None:
+def test_missing_second_derivatives_are_named() -> None:
     with pytest.raises(sc.MethodError, match="a pickled stepper has second derivatives only if"):
         _ = copied(compile_stepper(KEPLER, "svi:2", flags=QUICK_FLAGS))._second_derivatives
 
@@ -93,20 +93,20 @@ RUNS: dict[str, dict[str, Any]] = {
 """By the argument of ``start`` that it is about."""
 
 
-def test_every_argument_of_a_run_stands_in_the_table() -> None:
+def test_every_argument_of_a_run_is_in_the_table() -> None:
     assert set(inspect.signature(Stepper.start).parameters) - {"self", "q", "p"} == set(RUNS)
 
 
 @pytest.mark.parametrize("argument", RUNS)
 @pytest.mark.parametrize("steps", [0, 3])
-def test_a_run_goes_on_as_it_would_have(argument: str, steps: int) -> None:
+def test_pickled_run_continues_identically(argument: str, steps: int) -> None:
     given = RUNS[argument]
     run = stepper("").start(Q, None if "velocity" in given else P, **given)
     run.record(steps)
     check_same_run(run, copied(run), lambda each: each.record(None if each.plan else STEPS))
 
 
-def test_a_run_of_a_monitor_goes_on_as_it_would_have() -> None:
+def test_pickled_run_with_time_transformation_continues_identically() -> None:
     run = stepper("monitor").start(Q, P, h=0.2, t_end=0.9)
     run.record(2)
     check_same_run(run, copied(run), Run.record)
@@ -120,7 +120,7 @@ def check_same_run(run: Run, copy: Run, record: Callable[[Run], Any]) -> None:
     assert_same(record(run), record(copy))
 
 
-def test_a_run_may_be_given_another_goal_and_keeps_it() -> None:
+def test_target_time_of_a_run_may_be_changed_and_is_pickled() -> None:
     run = stepper("").start(Q, P, t_end=5.0)
     run.update(plan=StepPlan(t_end=0.7, tolerance=1e-6))
     assert copied(run).plan == StepPlan(t_end=0.7, tolerance=1e-6)

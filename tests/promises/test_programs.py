@@ -50,7 +50,7 @@ def test_a_program_that_is_missing_skips_the_test_by_its_name() -> None:
         needs("no-such-program")
 
 
-def test_programs_are_looked_up_in_one_place() -> None:
+def test_programs_are_looked_up_in_one_module() -> None:
     """A test that asks ``shutil.which`` by itself would be skipped without the name of the program."""
     exempt = {"tools/programs.py", "tools/browsing.py", "faults/mutate.py", "promises/test_programs.py"}
     files = [path for path in TESTS.rglob("*.py") if path.relative_to(TESTS).as_posix() not in exempt]

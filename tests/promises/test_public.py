@@ -5,7 +5,7 @@ from difflib import unified_diff
 from public import KEPT, public
 
 
-def test_what_is_public_is_what_was_said_to_be():
+def test_public_names_are_those_documented():
     kept, found = (text.splitlines() for text in (KEPT.read_text(encoding="utf-8"), public()))
     changes = [line for line in unified_diff(kept, found, "kept", "found", lineterm="", n=0) if line[0] in "+-"]
     assert changes == [], "if it is meant: python tests/tools/public.py, and a line in CHANGELOG.md"

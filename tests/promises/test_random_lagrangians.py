@@ -159,5 +159,5 @@ def test_random_steps_are_the_oracles(quickly_compiled, case):
 @pytest.mark.full
 @given(case=cases())
 @settings(max_examples=300, **COMMON)
-def test_many_random_steps_are_the_oracles(quickly_compiled, case):
+def test_many_random_steps_agree_with_the_oracle(quickly_compiled, case):
     check(case, quickly_compiled)

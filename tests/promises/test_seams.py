@@ -224,7 +224,7 @@ def pendulum(angle: float, rate: float, time: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_multipliers_of_a_constraint_are_blocks_of_their_own_size(degree: int) -> None:
+def test_constraint_multipliers_are_separate_blocks(degree: int) -> None:
     system, surface = rod()
     step = DerivedStep(system, Constrained(degree, (surface,)).stage_system(system))
     assert step.unknowns == degree * (2 + 1)
@@ -239,7 +239,7 @@ def test_multipliers_of_a_constraint_are_blocks_of_their_own_size(degree: int) -
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.4)
 
 
-def test_without_a_constraint_nothing_is_left_but_the_svi() -> None:
+def test_without_constraints_the_method_is_the_svi() -> None:
     system, _ = rod()
     free = DerivedStep(system, Constrained(2, ()).stage_system(system))
     own = DerivedStep(system, SVI(2, "gauss-lobatto:3").paper_form(system))
@@ -352,7 +352,7 @@ def spherical(constraints: int) -> tuple[LagrangianSystem, tuple[sympy.Expr, ...
 
 @pytest.mark.parametrize("constraints", [1, 2])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_one_and_two_constraints_of_three_coordinates(degree: int, constraints: int) -> None:
+def test_one_and_two_constraints_on_three_coordinates(degree: int, constraints: int) -> None:
     system, surfaces = spherical(constraints)
     method = ConstrainedIncrements(degree, surfaces)
     stepper = compile_stepper(system, method, solver="newton", flags=QUICK_FLAGS)

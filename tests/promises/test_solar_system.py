@@ -221,7 +221,7 @@ def test_the_moon_librates_as_a_pendulum(example):
 
 
 @needs_ephemeris
-def test_the_moon_turns_by_cassinis_laws(example):
+def test_moon_rotates_by_cassinis_laws(example):
     """Within a tenth of a degree of the librations of DE421: physical ones, and principal axes off the mean ones."""
     ephemeris = example("ephemeris")
     t = np.arange(ephemeris.FIRST, ephemeris.LAST, 4.7)
@@ -263,7 +263,7 @@ def output_of(script, folder, *arguments):
 @pytest.mark.usefixtures("as_users_compile")
 @needs_ephemeris
 class TestRuns:
-    def test_each_term_brings_the_solar_system_nearer_to_de421(self, tmp_path):
+    def test_each_term_reduces_the_distance_to_de421(self, tmp_path):
         output = output_of("solar_system.py", tmp_path)
         title, *rows = output.split("\n\n")[1].splitlines()
         bodies = rows[0].split()
@@ -281,7 +281,7 @@ class TestRuns:
         assert max(halves) < 100
         assert (tmp_path / "solar_system.png").stat().st_size > 50_000
 
-    def test_rebound_goes_the_same_way(self, tmp_path):
+    def test_rebound_gives_the_same_trajectory(self, tmp_path):
         pytest.importorskip("rebound", reason="needs the extra 'bench'")
         output = output_of("beside_rebound.py", tmp_path, "1")
         apart = [float(metres) for line in output.splitlines() if "apart" in line for metres in line.split()[4:-1]]

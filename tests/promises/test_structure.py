@@ -112,7 +112,7 @@ KEPLER = np.array([0.3, 0.8]), np.array([-1.1, 0.4])
 
 
 @pytest.mark.parametrize(("size", "expected"), PRINTED.items())
-def test_the_printed_shooting_equations_break_what_the_variational_ones_keep(compiled, size, expected):
+def test_printed_shooting_equations_are_not_symplectic_but_variational_ones_are(compiled, size, expected):
     points, count = size
     printed = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}", variational=False))
     variational = compiled("kepler", SCVI(points - 1, f"gauss-legendre:{count}"))
@@ -181,14 +181,14 @@ STEPS = 10_000
 
 
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
-def test_kepler_keeps_its_angular_momentum_to_round_off(compiled, method):
+def test_kepler_conserves_angular_momentum_to_round_off(compiled, method):
     entry = problem("kepler")
     run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
     assert np.abs(L - L[0]).max() < 2e-14
 
 
-def test_newtons_solver_keeps_it_too(compiled):
+def test_newton_solver_conserves_angular_momentum_to_round_off(compiled):
     entry = problem("kepler")
     run = compiled("kepler", SVI(4), solver="newton").integrate(entry.q, entry.velocity, h=0.05, steps=STEPS)
     L = angular_momentum(run.q, run.p)
@@ -196,14 +196,14 @@ def test_newtons_solver_keeps_it_too(compiled):
 
 
 @pytest.mark.parametrize("method", VARIATIONAL, ids=lambda method: method.name)
-def test_the_spherical_pendulum_keeps_its_azimuthal_momentum_exactly(sample, compiled, method):
+def test_spherical_pendulum_conserves_azimuthal_momentum_exactly(sample, compiled, method):
     q, p = sample("spherical-pendulum").state
     run = compiled("spherical-pendulum", method).integrate(q, p, h=0.05, steps=STEPS)
     assert np.abs(run.p[:, 1] - p[1]).max() == 0.0
 
 
 @pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
-def test_free_bodies_keep_linear_and_angular_momentum_to_round_off(sample, compiled, method):
+def test_free_bodies_conserve_linear_and_angular_momentum_to_round_off(sample, compiled, method):
     q, p = sample("three-bodies").state
     run = compiled("three-bodies", method).integrate(q, p, h=0.1, steps=STEPS)
     q, p = (x.reshape(len(run), 3, 2) for x in (run.q, run.p))
@@ -225,13 +225,13 @@ def check_solar_system(compiled, method, steps):
     assert np.abs(angular - angular[0]).max() < 1e-13 * scale
 
 
-def test_the_outer_solar_system_keeps_its_momenta_to_round_off(compiled):
+def test_outer_solar_system_conserves_momenta_to_round_off(compiled):
     check_solar_system(compiled, SVI(3), 1000)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", [SVI(3), SVI(6), SCVI(4)], ids=lambda method: method.name)
-def test_the_outer_solar_system_keeps_its_momenta_for_long(compiled, method):
+def test_outer_solar_system_conserves_momenta_over_long_times(compiled, method):
     check_solar_system(compiled, method, STEPS)
 
 
@@ -265,6 +265,6 @@ def test_symplectic_methods_show_no_energy_drift(sample, compiled, name, method)
 
 
 @pytest.mark.parametrize("method", DRIFTING, ids=lambda method: method.name)
-def test_other_methods_drift(sample, compiled, method):
+def test_nonsymplectic_methods_drift(sample, compiled, method):
     first, last = energy_errors(compiled, "planar-pendulum", method, *sample("planar-pendulum").state, 0.3)
     assert last > 2.0 * first

@@ -14,7 +14,7 @@ from tiers import DEFAULT, cover, first_of_each, long_ones_first
 
 @pytest.mark.parametrize("times", [1, 2, 3])
 @pytest.mark.parametrize("sizes", [(1, 1), (15, 4), (3, 3, 3), (2, 7, 5)])
-def test_every_value_is_in_as_many_combinations_as_asked_for(sizes: tuple[int, ...], times: int) -> None:
+def test_every_value_is_in_the_requested_number_of_combinations(sizes: tuple[int, ...], times: int) -> None:
     combinations = [tuple((f"x{k}", i) for k, i in enumerate(one)) for one in product(*map(range, sizes))]
     chosen = cover(combinations, times)
     uses = Counter(value for one in chosen for value in one)
@@ -29,7 +29,7 @@ def test_the_first_of_each_kind_is_in_the_default_tier() -> None:
     assert [one.values[0] for one in found] == ["a1", "a2", "b1", "a3", "b2"]
 
 
-def test_files_marked_long_are_begun_first_and_others_keep_their_order():
+def test_long_files_start_first_and_others_retain_their_order():
     items = [SimpleNamespace(name=name, get_closest_marker={"long": name.isupper() or None}.get) for name in "abCdE"]
     long_ones_first(items)
     assert "".join(item.name for item in items) == "CEabd"

@@ -27,13 +27,13 @@ RUN = (
 """What SymPy, NumPy, SciPy and cffi have a part in."""
 
 
-def test_every_need_has_a_floor():
+def test_every_dependency_has_a_lower_bound():
     assert [need for need in NEEDED if not FLOOR.fullmatch(need)] == []
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("age", ["oldest", "newest"])
-def test_the_rooms_stand_on_them(age, tmp_path):
+def test_tests_pass_with_the_lower_bounds(age, tmp_path):
     venv.create(tmp_path / "home", with_pip=True)
     [python] = (tmp_path / "home").glob("*/python")
     wanted = [need.replace(">=", "==") for need in NEEDED] if age == "oldest" else ["--upgrade", *NEEDED]

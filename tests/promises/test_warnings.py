@@ -47,7 +47,7 @@ def test_a_warning_names_the_line_that_called(act):
         ),
     ],
 )
-def test_a_start_off_its_constraints_is_told_of_by_what_is_off(q, velocity, told):
+def test_start_off_its_constraints_warns_with_the_violation(q, velocity, told):
     with pytest.warns(sc.AccuracyWarning, match=told):
         sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
 

@@ -35,14 +35,14 @@ def chain():
     return sc.compile_indexed(system, "svi:2")
 
 
-def test_inputs_go_to_integrate(stepper, chain):
+def test_inputs_are_arguments_of_integrate(stepper, chain):
     for start in (partial(stepper.start, [0.2], [0.0]), partial(chain.start, np.zeros(3))):
         with pytest.raises(ArgumentError, match=r"start\(\) takes no 'inputs': pass them to \.integrate\("):
             start(h=0.1, inputs=DATA)
     assert stepper.integrate([0.2], [0.0], h=0.1, steps=3, inputs=DATA).t[-1] == pytest.approx(0.3)
 
 
-def test_states_of_runs_with_inputs_are_kept_at_steps(stepper):
+def test_states_of_runs_with_inputs_are_saved_at_steps(stepper):
     for integrate, state in ((stepper.integrate, [0.2]), (stepper.integrate_ensemble, [[0.2]])):
         with pytest.raises(StateError, match="t_eval is not supported with inputs: omit t_eval"):
             integrate(state, state, t_end=0.3, inputs=DATA, t_eval=[0.1])
@@ -61,7 +61,7 @@ def test_states_of_runs_with_inputs_are_kept_at_steps(stepper):
     ],
     ids=str,
 )
-def test_words_of_other_programs(wrong, meant, stepper):
+def test_keywords_of_other_programs_are_recognised(wrong, meant, stepper):
     with pytest.raises(TypeError) as caught:
         stepper.integrate([0.2], **wrong)
     assert str(caught.value).startswith(f"Stepper.integrate() takes no {meant}")
@@ -77,13 +77,13 @@ def test_words_of_other_programs(wrong, meant, stepper):
     ],
     ids=lambda each: getattr(each, "__name__", None) or str(each),
 )
-def test_functions_say_what_was_meant(function, wrong, meant):
+def test_functions_suggest_the_intended_keyword(function, wrong, meant):
     with pytest.raises(ArgumentError) as caught:
         function(**wrong)
     assert meant in str(caught.value)
 
 
-def test_no_word_hides_a_keyword():
+def test_no_synonym_hides_a_keyword():
     """What a function has is never said to be another, and every place that is named is one."""
     assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
     assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
@@ -93,7 +93,7 @@ def test_no_word_hides_a_keyword():
         assert any(f".{name}" in place for place in EXPLANATIONS.values())
 
 
-def test_an_input_that_is_none_is_said_how_to_declare(stepper, chain):
+def test_undeclared_input_is_explained(stepper, chain):
     free = sc.compile_stepper(
         sc.LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2"),
         "svi:2",

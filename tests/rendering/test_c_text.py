@@ -184,7 +184,7 @@ def check_symbols(prefix: str, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_asks_for_no_memory_writes_nothing_and_keeps_nothing(method):
+def test_code_allocates_nothing_writes_nothing_and_has_no_static_state(method):
     for source, _ in generated(method).values():
         text = re.sub(r"/\*.*?\*/", "", source.header + source.amalgamated().code, flags=re.DOTALL)
         assert re.findall(r"\b(?:[mc]alloc|realloc|alloca|free|f?printf|puts|fopen|exit|abort|assert)\b", text) == []
@@ -192,7 +192,7 @@ def test_asks_for_no_memory_writes_nothing_and_keeps_nothing(method):
         assert re.findall(r"\b(?:errno|setjmp|volatile|register|goto)\b", text) == []
 
 
-def test_headers_serve_c_plus_plus(tmp_path):
+def test_headers_compile_as_c_plus_plus(tmp_path):
     pairs = [generated(method)["kepler"] for method in METHODS]
     files = write([source for source, _ in pairs], tmp_path)
     uses = "".join(
@@ -332,7 +332,7 @@ TITLES = [
 
 
 @pytest.mark.parametrize("title", TITLES)
-def test_a_title_cannot_leave_its_comment(title, tmp_path):
+def test_title_cannot_end_its_comment(title, tmp_path):
     system = named_system(["a", "b", "c"], name=title)
     source, interface = generate_source(system, SVI(1))
     assert interface.title.isprintable()
@@ -454,7 +454,7 @@ def test_method_families_pass_the_sanitizers(command, method, tmp_path):
     ("masses", "method"),
     [(5, SVI(8)), (12, SVI(3, "gauss-lobatto:4")), (12, SCVI(2)), (12, Gauss(3)), (9, SpectralCollocation(3))],
 )
-def test_bands_and_kept_factors_pass_the_sanitizers(command, masses, method, tmp_path):
+def test_band_solver_and_reused_factors_pass_the_sanitizers(command, masses, method, tmp_path):
     sanitizer(command, tmp_path)
     source, interface = generate_source(fput_chain(masses), method, solver="newton")
     assert interface.unknowns >= LEAST_REUSED_UNKNOWNS
@@ -463,7 +463,7 @@ def test_bands_and_kept_factors_pass_the_sanitizers(command, masses, method, tmp
 
 
 @SANITIZERS
-def test_sweeps_over_positions_and_momenta_pass_the_sanitizers(command, tmp_path):
+def test_phase_space_iterations_pass_the_sanitizers(command, tmp_path):
     sanitizer(command, tmp_path)
     source, interface = generate_source(driven_hamiltonian(), Gauss(3), solver="fixed-point")
     check_sanitized([(source, interface)], command, tmp_path)
@@ -477,7 +477,7 @@ def test_every_method_passes_the_sanitizers_for_every_system(command, method, tm
     check_sanitized(list(generated(method).values()), command, tmp_path)
 
 
-def test_every_method_has_a_name_of_its_own():
+def test_every_method_has_a_unique_name():
     assert all(isinstance(method, Method) for method in METHODS.values())
     prefixes = [interface.prefix for method in METHODS for _, interface in generated(method).values()]
     assert len(set(prefixes)) == len(prefixes)

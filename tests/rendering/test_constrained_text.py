@@ -71,7 +71,7 @@ def test_derivation_shows_multipliers():
     assert sum(line.startswith("  (hidden)") for line in text.splitlines()) == 3
 
 
-def test_model_files_choose_points_that_fit():
+def test_model_files_select_compatible_points():
     stepper = compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)
     model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)
@@ -102,7 +102,7 @@ def made_and_run(folder, q, *, precision=None, system=LINKAGE, said=0):
 
 
 @pytest.mark.parametrize("precision", [None, "double", "single"])
-def test_generated_folders_meet_constraints_and_compute_what_python_does(precision, tmp_path):
+def test_generated_folders_project_constraints_and_equal_python(precision, tmp_path):
     """A state a little off is moved, which is said, and integrated; also by steps that choose their length."""
     near = [0.001, 1.0, 1.94, 1.5]
     states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
@@ -121,7 +121,7 @@ def test_generated_folders_meet_constraints_and_compute_what_python_does(precisi
         assert np.abs(np.array(away.rpartition(" end ")[2].split(), dtype=float)).max() < 1e-5
 
 
-def test_what_cannot_be_put_on_the_constraints_is_refused_in_c(tmp_path):
+def test_states_that_cannot_be_projected_are_rejected_in_c(tmp_path):
     """A state that is far off; and one stretched out, whose rods are one line: what they say depends on each other."""
     states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], said=1)
     assert "violates the constraints" in found.stderr

@@ -183,7 +183,7 @@ int main(void)
 
 
 @pytest.mark.parametrize("bound", [1, 3, 8])
-def test_iterations_are_bounded_when_it_is_compiled_whatever_the_options_say(bound, tmp_path):
+def test_iteration_limit_is_fixed_at_compile_time(bound, tmp_path):
     needs("gcc")
     write_case("kepler", "double", tmp_path)
     (tmp_path / "count.c").write_text(COUNTING)
@@ -198,13 +198,13 @@ def test_iterations_are_bounded_when_it_is_compiled_whatever_the_options_say(bou
 @pytest.mark.parametrize(
     "value", [*np.float32([0.1, 1 / 3, np.pi, 2.0**-126, 3.4028234e38, 1 + 2.0**-23]).tolist(), 0.0]
 )
-def test_literals_read_back_as_the_nearest_number(value):
+def test_literals_read_back_as_the_nearest_double(value):
     text = SINGLE.number(value)
     assert text.endswith("f")
     assert np.float32(text[:-1]) == np.float32(value)
 
 
-def test_what_is_left_of_a_zero_in_a_table_becomes_zero_and_a_number_of_a_model_is_refused():
+def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
     assert SINGLE.number(1.7e-63) == "0.0f"
     for value in (1e-39, 1e39, -1e300):
         with pytest.raises(MethodError, match="outside the range of single precision"):
@@ -274,7 +274,7 @@ def test_lanes_are_refused_by_name():
     assert "lanes" not in generate_source(system, SVI(2), embedded="double")[0].code
 
 
-def test_other_methods_compile_in_either_precision(tmp_path):
+def test_all_methods_compile_in_either_precision(tmp_path):
     needs("gcc")
     methods = {"collocation": SpectralCollocation(2, form="position"), "printed": SCVI(2, variational=False)}
     for prefix, method in methods.items():

@@ -64,7 +64,7 @@ def test_every_file_compiles_with_every_warning_an_error(compiler, tmp_path):
     assert "warning" not in result.stderr
 
 
-def test_no_text_holds_a_date_a_path_or_a_version():
+def test_text_contains_no_date_path_or_version():
     for name, text in stored().items():
         assert scvi_codegen.__version__ not in text, name
         assert re.findall(r"\b(?:19|20)\d\d-\d\d|/home/|/usr/|/tmp/|C:\\", text) == [], name

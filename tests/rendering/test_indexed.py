@@ -66,7 +66,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     ("name", "method"),
     [(name, method) for name in FORMULAS for method in ("svi:4", "stoermer-verlet") if (name, method) != EXPLICIT],
 )
-def test_it_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
+def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> None:
     """No warnings, in the style of all C here, and nothing that is not declared in the header."""
     check_strict(rendered(name, method), tmp_path)
 
@@ -89,7 +89,7 @@ def check_strict(source: Source, tmp_path: Path) -> None:
     assert built.returncode == 0, built.stderr
 
 
-def test_what_belongs_to_the_first_of_a_pair_is_read_and_added_once() -> None:
+def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
     """Before and behind the loop over the second."""
     code = rendered("bodies", "svi:4").code
     outer = code.index(

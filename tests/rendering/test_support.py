@@ -104,7 +104,7 @@ int main(void)
 """
 
 
-def test_a_step_is_split_where_a_zero_is_in_doubt_and_nowhere_else(tmp_path):
+def test_intervals_are_split_only_where_a_root_is_uncertain(tmp_path):
     """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; hollows
     0.01 and 0.001 above zero, of one extremum and of two; the highest power alone."""
     stepper = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=["q"])
@@ -117,7 +117,7 @@ def test_a_step_is_split_where_a_zero_is_in_doubt_and_nowhere_else(tmp_path):
     assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5, 2.0, 0.2, 2.0, 0.0], abs=1e-6)
 
 
-def test_an_unknown_momentum_counts_in_how_far_newtons_iteration_has_come():
+def test_unknown_momentum_is_part_of_newtons_convergence_criterion():
     """A body that falls from q0 = q1: its velocity is guessed at once, its momentum off by g h / 2."""
     falling = LagrangianSystem.from_text(name="falling", coordinates=["x"], lagrangian="x_dot**2/2 - 10*x")
     stepper = compile_stepper(falling, SVI(1), solver="newton")
@@ -151,7 +151,7 @@ int main(void)
 @pytest.mark.parametrize(
     "system", [problem("harmonic-oscillator").system, problem("kepler").system], ids=lambda system: system.name
 )
-def test_derivatives_read_and_write_nothing_but_their_own(system, solver, tmp_path):
+def test_derivatives_stay_within_their_workspace(system, solver, tmp_path):
     """Forward and back, in a workspace of exactly the length that they ask for."""
     stepper = compile_stepper(system, SVI(2), solver=solver)
     assert stepper.derivatives is not None

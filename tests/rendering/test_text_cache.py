@@ -41,13 +41,13 @@ def spring(stiffness: float = 1.0) -> sc.LagrangianSystem:
     )
 
 
-def test_what_was_derived_is_not_derived_again(made):
+def test_cached_derivations_are_not_repeated(made):
     first, second = (sc.compile_stepper(spring(), sc.SVI(2)) for _ in range(2))
     assert len(made) == 1
     assert (first.source, first.interface, first.ensemble) == (second.source, second.interface, second.ensemble)
 
 
-def test_the_text_of_an_ensemble_is_made_when_it_is_asked_for_and_then_kept(made, tmp_path, monkeypatch):
+def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monkeypatch):
     written: list[str] = []
     render = compiler.render_ensemble
     monkeypatch.setattr(compiler, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
@@ -70,7 +70,7 @@ def test_the_text_of_an_ensemble_is_made_when_it_is_asked_for_and_then_kept(made
     ],
     ids=["parameter", "method", "solver", "prefix"],
 )
-def test_anything_else_is(made, other):
+def test_different_arguments_are_derived_again(made, other):
     sc.compile_stepper(spring(), sc.SVI(2))
     other()
     assert len(made) == 2
@@ -149,7 +149,7 @@ def test_every_file_of_the_generator_has_a_part_in_the_name(tmp_path, monkeypatc
     assert len(set(found)) == len(found)
 
 
-def test_another_generator_makes_it_anew(made, monkeypatch):
+def test_different_generator_regenerates_the_source(made, monkeypatch):
     sc.compile_stepper(spring(), sc.SVI(2))
     monkeypatch.setattr(source_cache, "_generator", lambda: "the next version")
     sc.compile_stepper(spring(), sc.SVI(2))
@@ -157,7 +157,7 @@ def test_another_generator_makes_it_anew(made, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", [b"", b"{", b'{"source": {}}', b"\xff\xfe"])
-def test_a_damaged_entry_is_made_anew(made, tmp_path, damage):
+def test_damaged_entry_is_regenerated(made, tmp_path, damage):
     sc.compile_stepper(spring(), sc.SVI(2))
     (entry,) = (tmp_path / "texts").glob("*.json")
     entry.write_bytes(damage)
@@ -166,7 +166,7 @@ def test_a_damaged_entry_is_made_anew(made, tmp_path, damage):
     assert len(entry.read_bytes()) > 1000
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(made, tmp_path):
+def test_unwritable_cache_is_not_an_error(made, tmp_path):
     (tmp_path / "texts").write_text("a file where the folder should be")
     sc.compile_stepper(spring(), sc.SVI(2))
     sc.compile_stepper(spring(), sc.SVI(2))
@@ -250,7 +250,7 @@ def test_every_field_of_what_describes_a_text_changes_its_key(number):
         assert given.key() == (key,)
 
 
-def test_keys_hold_what_equality_or_texts_would_confuse():
+def test_keys_distinguish_values_that_are_equal_or_print_equally():
     a, b = sympy.symbols("x x", real=True), sympy.Symbol("x")
     same = [(1, 2), ("1, 2",), (1, (2,)), (1.0, 2), (True, 2), ("None",), (None,), (sympy.Integer(1), 2), (a[0],), (b,)]
     assert len({key_of(each) for each in same}) == len(same)

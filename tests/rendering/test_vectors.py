@@ -69,7 +69,7 @@ SHORT, LONG = ("-O1", "-march=x86-64"), ("-O1", "-march=native")
         ("point-vortices", sc.SVI(6)),  # a Hamiltonian
     ],
 )
-def test_points_are_in_as_many_vectors_as_registers_want(name, method):
+def test_points_use_the_vectors_that_registers_allow(name, method):
     given = sc.problem(name)
     ends = []
     for flags in (SHORT, LONG):

@@ -45,7 +45,7 @@ def both(case, monkeypatch, flags):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_written_out_and_with_tables_are_the_same(case, monkeypatch):
+def test_unrolled_and_tabulated_methods_are_equal(case, monkeypatch):
     m = CASES[case][0].dimension
     q, p = [0.9, 0.4][:m], [0.3, 0.8][:m]
     ours, theirs = (
@@ -56,7 +56,7 @@ def test_written_out_and_with_tables_are_the_same(case, monkeypatch):
 
 
 @pytest.mark.parametrize("case", first_of_each(CASES, lambda case: type(CASES[case][0])))
-def test_they_are_to_round_off_where_it_does_fuse(case, monkeypatch):
+def test_unrolled_and_tabulated_methods_agree_to_round_off_with_fma(case, monkeypatch):
     m = CASES[case][0].dimension
     q, p = [0.9, 0.4][:m], [0.3, 0.8][:m]
     ours, theirs = (each.integrate(q, p, h=0.05, steps=100) for each in both(case, monkeypatch, {}))
@@ -75,7 +75,7 @@ def test_the_papers_example_is_solved():
     assert (q1 - q0) / h - h / 2 * (far * first + near * second) == pytest.approx(p1, abs=1e-14)
 
 
-def test_the_equations_stand_in_the_smallest_file():
+def test_smallest_file_contains_the_equations():
     text = " ".join(GENERATED.read_text().split())
     near, far = r"0\.78867513459481\d+", r"0\.21132486540518\d+"
     assert re.search(

@@ -32,7 +32,7 @@ def test_the_claims_ask_for_experiments_that_exist() -> None:
 
 
 @pytest.mark.full
-def test_all_of_the_paper_runs_and_every_claim_is_judged() -> None:
+def test_whole_paper_runs_and_every_claim_is_evaluated() -> None:
     """About two minutes. What holds, and what does not, is found in the same places as when this was written."""
     results = {result.name: result for result in run_experiments(list(EXPERIMENTS)) if not isinstance(result, Failure)}
     assert set(results) == PAPER

@@ -40,7 +40,7 @@ def test_the_exact_flow_is_what_a_fine_run_gives():
     assert np.abs([run.q - q, run.p - p]).max() < 1e-12
 
 
-def test_exact_orbits_keep_to_their_ellipse_and_period():
+def test_exact_orbits_stay_on_their_ellipse_and_period():
     t = np.linspace(0.0, 40.0, 4001)
     q, p = exact_flow(*perihelion(0.5), t)
     assert np.abs(off_ellipse(q, 0.5)).max() < 1e-13
@@ -93,7 +93,7 @@ CIRCLE_SLOPES = {
     [(*key, 0.5, value) for key, value in SLOPES.items()]
     + [(*key, 0.0, value) for key, value in CIRCLE_SLOPES.items()],
 )
-def test_slopes_of_the_error_of_a_step(scheme, degree, e, expected):
+def test_convergence_orders_of_the_local_error(scheme, degree, e, expected):
     found = orders(scheme, degree, e)
     assert [derivative is None for derivative in found] == [power is None for power in expected]
     pairs = [(derivative, power) for derivative, power in zip(found, expected, strict=True) if power]
@@ -208,7 +208,7 @@ def test_names_are_those_of_the_figures():
 
 
 @pytest.mark.parametrize("name", ["figure-15", "figure-24", "figure-29", "correction"])
-def test_results_travel_and_can_be_drawn_and_read(name):
+def test_results_can_be_pickled_drawn_and_read(name):
     result = pickle.loads(pickle.dumps(BY_NAME[name].run({})))
     assert result.name == name
     assert draw(result.picture, "svg").startswith(b"<?xml")
@@ -216,7 +216,7 @@ def test_results_travel_and_can_be_drawn_and_read(name):
     assert all(len(row) == len(table.columns) for table in result.tables for row in table.rows)
 
 
-def test_verdicts_tell_the_printed_form_from_the_full_one():
+def test_verdicts_distinguish_the_printed_form_from_the_full_one():
     verdicts = [check.verdict for check in BY_NAME["figure-29"].run({}).checks]
     assert verdicts == [Verdict.FAILS, Verdict.HOLDS, Verdict.HOLDS]
 

@@ -46,7 +46,7 @@ def column(name: str, heading: str) -> dict[str, float]:
     return {row[0]: row[table.columns.index(heading)] for row in table.rows}
 
 
-def test_there_is_every_figure():
+def test_every_figure_exists():
     assert list(EXPERIMENTS) == [f"figure-{n}" for n in (*range(1, 9), 9, 10, 21, 22, 11, 12)]
 
 
@@ -54,7 +54,7 @@ def test_there_is_every_figure():
     ("name", "whole"),
     [(name, False) for name in EXPERIMENTS] + [pytest.param(name, True, marks=pytest.mark.full) for name in COARSE],
 )
-def test_results_are_whole(name, whole):
+def test_results_are_complete(name, whole):
     found = result(name, whole=whole)
     assert (found.name, found.title) == (name, EXPERIMENTS[name].title)
     assert found.setting
@@ -107,7 +107,7 @@ def test_figure_6_errors_are_those_of_an_independent_step():
     assert row[3] == pytest.approx(float(abs(exact.imag - mp.sin(20))), rel=1e-6)
 
 
-def test_the_lines_of_a_legend_tell_what_n_counts():
+def test_legends_state_what_n_counts():
     """Errors along 1e14 (0.09)^N are as far from the line as N is from what was meant."""
     n = np.arange(11.0, 17.0)
     errors = 1e11 * 0.09**n
@@ -145,7 +145,7 @@ def test_figure_7_constants_of_two_points_are_those_found_by_hand():
     assert two == pytest.approx([5 / 6, 7 / 360], rel=0.01)
 
 
-def test_as_many_gauss_points_as_the_degree_conserve_the_energy_of_the_oscillator():
+def test_equal_numbers_of_gauss_points_and_degree_conserve_the_energy_of_the_oscillator():
     methods = [oscillator_orders.DEGREES.method("SVI", n) for n in (2, 4, 6)]
     assert all(oscillator_orders.fitted_power("energy", method) is None for method in methods)
 
@@ -199,7 +199,7 @@ def test_a_derived_step_of_a_coupled_system_is_the_compiled_one():
     assert np.abs(np.array([*end.q, *end.p], dtype=float) - [*q, *p]).max() < 1e-14
 
 
-def test_drift_is_told_from_oscillation():
+def test_drift_is_distinguished_from_oscillation():
     t = np.linspace(0.0, 100.0, 1000)
     assert one_degree.drifts(1e-6 * t)
     assert not one_degree.drifts(1e-6 * np.sin(t))

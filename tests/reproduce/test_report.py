@@ -48,7 +48,7 @@ def page(results: dict[str, Result]) -> str:
 
 
 class TestRunner:
-    def test_needs_come_first_and_once(self):
+    def test_dependencies_run_first_and_once(self):
         assert with_needs(["table-8", "figure-4", "last"], EXPERIMENTS) == [
             "figure-4",
             "table-8",
@@ -57,11 +57,11 @@ class TestRunner:
             "last",
         ]
 
-    def test_an_unknown_name_is_answered_with_the_nearest(self):
+    def test_unknown_name_suggests_the_nearest(self):
         with pytest.raises(StateError, match=r"no experiment called 'figur-4'; did you mean 'figure-4'\?"):
             run_experiments(["figur-4"], module=TOYS)
 
-    def test_failures_stop_nothing_but_what_needs_them(self):
+    def test_failures_stop_only_dependent_experiments(self):
         outcomes = list(run_experiments(["last", "misnamed", "table-8"], 1, module=TOYS))
         assert [outcome.name for outcome in outcomes if isinstance(outcome, Result)] == ["figure-4", "table-8"]
         failures = {outcome.name: outcome for outcome in outcomes if isinstance(outcome, Failure)}
@@ -104,7 +104,7 @@ def an_svg(draw_on: Callable[[Axes], object]) -> str:
 
 
 class TestSvg:
-    def test_it_is_small_and_in_the_colours_of_the_page(self, results):
+    def test_svg_is_small_and_uses_the_colours_of_the_page(self, results):
         drawn = draw(results["figure-4"].picture, "svg")
         text = inline_svg(drawn, prefix="one", label='a "b" & <c>')
         assert len(text) < 0.6 * len(drawn)
@@ -134,7 +134,7 @@ class TestSvg:
         dark = color_variables([text], dark=True)
         assert contrast(dark["--line-ffffcc"], DARK_PAPER) == pytest.approx(contrast("#ffffcc", "#ffffff"), abs=0.05)
 
-    def test_images_and_colour_scales_keep_their_colours(self):
+    def test_images_and_colour_scales_retain_their_colours(self):
         image = an_svg(lambda axes: axes.imshow([[0.0, 1.0], [2.0, 3.0]]))
         scale = an_svg(lambda axes: axes.pcolormesh(np.arange(36.0).reshape(6, 6)))
         for text in (image, scale):
@@ -177,7 +177,7 @@ def test_cells_are_formatted():
 
 
 class TestPage:
-    def test_it_is_complete_and_well_formed(self, page):
+    def test_page_is_complete_and_well_formed(self, page):
         parsed = Page(page)
         assert parsed.all("html") == [{"lang": "en"}]
         assert len(parsed.all("h1")) == 1
@@ -196,7 +196,7 @@ class TestPage:
         assert referred <= set(identifiers)
         assert set(GOOD) <= referred
 
-    def test_it_needs_nothing_else(self, page):
+    def test_page_is_self_contained(self, page):
         parsed = Page(page)
         assert parsed.all("script") == []
         for _, attributes in parsed.elements:
@@ -216,7 +216,7 @@ class TestPage:
     def test_names_of_results_are_links(self, page):
         assert f'See <a href="#figure-4">Figure{N}4</a>, not figure-40.' in page
 
-    def test_tables_show_what_is_to_be_shown(self, page):
+    def test_tables_show_the_selected_columns(self, page):
         assert '<td class="word">SVI</td>' in page
         assert '<td class="number">500</td>' in page
         assert '<td class="number">\N{EN DASH}</td>' in page
@@ -234,7 +234,7 @@ class TestPage:
     def test_equal_results_give_equal_pages(self, page, results):
         assert report_html(list(results.values())) == page
 
-    def test_a_result_alone_is_a_page_of_its_own(self, results):
+    def test_single_result_is_a_separate_page(self, results):
         parsed = Page(text := report_html([results["section-3.1"]]))
         assert len(parsed.all("h1")) == 1
         assert parsed.all("h2") == []
@@ -254,7 +254,7 @@ def invoke(*words: str) -> Any:
 
 @pytest.mark.usefixtures("toys")
 class TestCommand:
-    def test_files_and_the_page_are_written(self):
+    def test_command_writes_files_and_the_page(self):
         done = invoke("section-3.1", "table-8", "-o", "made/here", "--html", "all.html")
         assert done.exit_code == 0, done.output
         assert sorted(path.name for path in Path("made/here").iterdir()) == [
@@ -273,7 +273,7 @@ class TestCommand:
         text = Path("all.html").read_text(encoding="utf-8")
         assert text.index('<section id="section-3.1"') < text.index('<section id="figure-4"')
 
-    def test_a_claim_that_does_not_hold_is_no_failure(self):
+    def test_violated_claim_is_not_a_failure(self):
         assert invoke("figure-4").exit_code == 0
         assert Path("reproduced/figure-4.txt").is_file()
 
@@ -293,20 +293,20 @@ class TestCommand:
             (["table-9", "--jobs", "0"], "Invalid value for '--jobs'"),
         ],
     )
-    def test_what_is_wrong_is_said_before_anything_runs(self, words, message):
+    def test_invalid_arguments_are_reported_before_the_run(self, words, message):
         Path("file").write_text("")
         done = invoke(*words)
         assert done.exit_code == 2
         assert message in done.stderr
         assert not Path("reproduced").exists()
 
-    def test_a_file_that_cannot_be_written_ends_with_1(self):
+    def test_unwritable_file_exits_with_1(self):
         Path("made/table-9.txt").mkdir(parents=True)
         done = invoke("table-9", "-o", "made")
         assert done.exit_code == 1
         assert "made" in done.stderr
 
-    def test_without_matplotlib_it_says_what_to_install(self, monkeypatch):
+    def test_missing_matplotlib_names_what_to_install(self, monkeypatch):
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
         done = invoke("table-9")
         assert done.exit_code == 2
@@ -349,7 +349,7 @@ JUST_STARTING = 2
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals for process groups")
-def test_ctrl_c_ends_everything_at_once_and_keeps_what_was_written(tmp_path):
+def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
     path = f"import sys; sys.path[:0] = {sys.path!r}\n"
     child = subprocess.Popen(
         [sys.executable, "-c", path + INTERRUPTED],

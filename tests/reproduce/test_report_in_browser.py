@@ -39,15 +39,15 @@ def view(
 
 
 class TestInABrowser:
-    def test_it_asks_for_nothing_and_complains_of_nothing(self, view):
+    def test_page_loads_nothing_and_logs_no_error(self, view):
         assert_it_asks_for_nothing(view)
 
-    def test_nothing_sticks_out(self, view):
+    def test_no_element_overflows_the_page(self, view):
         assert_nothing_sticks_out(view)
         boxes = "[...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth, e.clientWidth])"
         assert view.width > 390 or sum(inside > outside for inside, outside in view.evaluate(boxes)) > 3
 
-    def test_a_picture_of_one_panel_fits_a_phone_and_a_wider_one_says_that_it_scrolls(self, view):
+    def test_single_panel_fits_a_phone_and_wider_pictures_scroll(self, view):
         figures = """[...document.querySelectorAll('figure .scroll')].map(e => {
             const width = e.querySelector('svg').style.getPropertyValue('--width');
             return [parseFloat(width) * 4 / 3, e.scrollWidth, e.clientWidth, getComputedStyle(e).backgroundImage];
@@ -69,7 +69,7 @@ class TestInABrowser:
     def test_all_text_is_readable(self, view):
         assert view.evaluate(UNREADABLE) == []
 
-    def test_on_paper_it_is_light_and_figures_stay_whole(self, view):
+    def test_print_style_is_light_and_does_not_split_figures(self, view):
         view.emulate_media(media="print")
         style = "e => getComputedStyle(document.querySelector(e))"
         assert view.evaluate(f"({style})('body').backgroundColor") == "rgb(255, 255, 255)"

@@ -26,7 +26,7 @@ QUICK = [experiment for module in MODULES for experiment in module.EXPERIMENTS]
 
 
 @pytest.mark.parametrize("experiment", QUICK, ids=lambda experiment: experiment.name)
-def test_experiments_travel_between_processes_and_can_be_written(experiment):
+def test_experiments_can_be_pickled_and_written(experiment):
     result = experiment.run({})
     again = pickle.loads(pickle.dumps(result))
     assert again.name == experiment.name
@@ -58,7 +58,7 @@ def test_the_corrected_table_3_is_what_is_typeset():
     assert A[2, 3] == sympy.Symbol("w_1") + sympy.Symbol("w__'_3") - sympy.Symbol("w_4")
 
 
-def test_table_4_marks_are_decided_by_the_coefficients():
+def test_table_4_marks_are_computed_from_the_coefficients():
     rows = {(family, stages): row for family, stages, *row in properties.table_4({}).tables[0].rows}
     assert rows["Gauss", 5] == [10, "yes", "yes", "yes", "yes"]
     assert rows["Chebyshev-Gauss", 1] == [2, "yes", "yes", "yes", "yes"]
@@ -147,7 +147,7 @@ def test_picard_iteration_ends_in_the_compiled_step(degree):
         assert np.abs(np.array(ends[:2]) - step).max() < 1e-13
 
 
-def test_picard_iteration_that_does_not_converge_says_so():
+def test_diverging_picard_iteration_is_reported():
     q, v = map(np.array, motion.perihelion(0.2))
     with pytest.raises(picard.NotSolvedError):
         picard.picard_step(

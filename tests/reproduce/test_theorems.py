@@ -62,7 +62,7 @@ def test_collocation_polynomials_end_where_the_tableau_does(family):
 
 
 @pytest.mark.parametrize("form", kronecker.FORMS)
-def test_kronecker_forms_hold_of_their_own_method_alone(form):
+def test_kronecker_forms_hold_only_for_their_own_method(form):
     """Masses that are not constant make two methods of (18) and (21)."""
     assert kronecker.residual("double-pendulum", form, 2) < 1e-45
     system = sc.problem("double-pendulum").system
@@ -142,7 +142,7 @@ def test_the_action_is_bounded_by_collocation_and_quadrature(label):
         assert errors("planar-pendulum", method, 2.0).action < sum(parts)
 
 
-def test_slopes_and_rates_leave_round_off_out():
+def test_orders_and_rates_exclude_round_off():
     steps = [2.0**-k for k in range(12)]
     assert fitted_order(steps, [h**5 + 1e-16 for h in steps]) == pytest.approx(5, abs=1e-3)
     assert rate([2, 4, 6, 8], [1e-4, 1e-8, 1e-12, 1e-16])[1] == pytest.approx(0.01)
@@ -168,7 +168,7 @@ def test_verdicts_on_the_order_and_on_the_rates(name, held, failed, tmp_path):
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".png", ".svg", ".txt"}
 
 
-def test_results_travel_and_are_written(results, tmp_path):
+def test_results_can_be_pickled_and_written(results, tmp_path):
     for result in pickle.loads(pickle.dumps(results)).values():
         assert len(writing.write_result(result, tmp_path)) >= 2
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".txt"}

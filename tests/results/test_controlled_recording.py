@@ -49,7 +49,7 @@ def controlled(stepper: Stepper, folder: str, t_end: float = END, **settings: ob
 
 
 @pytest.mark.parametrize("save_every", [1, 7, 5000])
-def test_it_is_the_run_in_memory_in_full_files(kepler, save_every):
+def test_recording_equals_the_run_in_memory(kepler, save_every):
     found, run = (
         controlled(kepler, "a.run", save_every=save_every),
         kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE),
@@ -72,7 +72,7 @@ def test_interrupted_it_has_the_bytes_of_one_that_was_not(kepler, save_every):
     assert digests("a.run") == digests("whole.run")
 
 
-def test_a_part_is_a_trajectory_that_knows_states_between(kepler):
+def test_slice_is_a_trajectory_with_dense_output(kepler):
     run = kepler.integrate(**STATE, t_end=END, tolerance=TOLERANCE)
     found = controlled(kepler, "a.run")
     piece, times = found[100:200], np.linspace(run.t[120], run.t[180], 9)
@@ -84,7 +84,7 @@ def test_a_part_is_a_trajectory_that_knows_states_between(kepler):
 
 
 @pytest.mark.parametrize("t_end", [END, -END])
-def test_it_may_be_made_longer_and_shorter_but_not_turned(kepler, t_end):
+def test_run_may_be_extended_or_shortened_but_not_reversed(kepler, t_end):
     controlled(kepler, "a.run", t_end, save_every=3)
     longer = resume_run("a.run", t_end=1.5 * t_end)
     assert longer.finished

@@ -33,7 +33,7 @@ def test_files_are_read_by_xarray(ensemble, tmp_path, name):
         assert dataset.attrs["method"] == ensemble.stepper.interface.method
 
 
-def test_the_dataset_holds_what_follows_from_the_states(ensemble):
+def test_dataset_contains_derived_quantities(ensemble):
     dataset = ensemble.to_xarray()
     assert dataset.q.dims == ("t", "trajectory", "coordinate")
     np.testing.assert_array_equal(dataset.energy, ensemble.energy())

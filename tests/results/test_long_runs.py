@@ -97,14 +97,14 @@ def killed_at_random(stepper: Stepper, times: int, generator: random.Random) -> 
 
 
 @pytest.mark.parametrize("times", [5, pytest.param(100, marks=pytest.mark.full)])
-def test_a_run_killed_at_random_moments_goes_on(kepler, times):
+def test_run_killed_at_random_times_continues(kepler, times):
     steps = killed_at_random(kepler, times, random.Random(times))
     assert steps == sorted(steps)
     assert len(set(steps)) > times / 3
     assert_whole(kepler)
 
 
-def test_a_file_that_may_not_grow_is_told_with_where_the_run_stands(kepler):
+def test_file_size_limit_is_reported_with_the_state_of_the_run(kepler):
     limit = "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))"
     with child(kepler, before=limit, rows=10_000) as process:
         _, stderr = process.communicate(timeout=600)
@@ -131,7 +131,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
         subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_loses_nothing_and_the_run_goes_on_when_there_is_room(kepler, small_disk):
+def test_full_disk_loses_nothing_and_the_run_continues_later(kepler, small_disk):
     folder = small_disk / "a.run"
     with pytest.raises(RecordingError, match=r"No space left on device\. It contains the run up to step") as error:
         recorded(kepler, 10**9, folder=str(folder), rows=2000)
@@ -144,7 +144,7 @@ def test_a_full_disk_loses_nothing_and_the_run_goes_on_when_there_is_room(kepler
 
 
 @pytest.mark.parametrize("suffix", ["npz", "csv", "h5", "zarr"])
-def test_a_file_for_which_there_is_no_room_leaves_the_old_one_and_nothing_else(kepler, small_disk, suffix):
+def test_failed_write_preserves_the_old_file(kepler, small_disk, suffix):
     pytest.importorskip({"h5": "h5netcdf", "zarr": "zarr"}.get(suffix, "numpy"))
     path = small_disk / f"a.{suffix}"
     kepler.integrate(**STATE, h=H, steps=30).save(path)
@@ -166,7 +166,7 @@ if os.geteuid() == 0:  # give up CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH, with 
 """
 
 
-def test_a_folder_that_cannot_be_written_is_told_at_once(kepler, tmp_path):
+def test_unwritable_folder_is_reported_before_the_run(kepler, tmp_path):
     recorded(kepler, 100, save_every=20, rows=5000)
     before = digests("a.run")
     try:
@@ -179,7 +179,7 @@ def test_a_folder_that_cannot_be_written_is_told_at_once(kepler, tmp_path):
     assert digests("a.run") == before
 
 
-def test_an_exception_on_the_way_loses_nothing(kepler):
+def test_exception_in_a_callback_loses_nothing(kepler):
     def interrupt(done: int) -> None:
         if done > 300:
             raise KeyboardInterrupt
@@ -190,7 +190,7 @@ def test_an_exception_on_the_way_loses_nothing(kepler):
     assert_same(resume_run("a.run", steps=3000), kepler.integrate(**STATE, h=H, steps=3000))
 
 
-def test_ctrl_c_at_any_time_loses_nothing(kepler):
+def test_interrupt_at_any_time_loses_nothing(kepler):
     with child(kepler, seconds=1000.0, rows=10**6) as process:
         assert process.stdout is not None
         for _ in range(20):
@@ -202,7 +202,7 @@ def test_ctrl_c_at_any_time_loses_nothing(kepler):
     assert_whole(kepler)
 
 
-def test_a_step_that_fails_leaves_the_states_before_it(compiled):
+def test_failed_step_saves_the_preceding_states(compiled):
     stepper = compiled("runaway", SVI(4))
     run = stepper.start([1.0], [1.0], h=0.05)
     with pytest.raises(StepFailedError) as error:
@@ -252,11 +252,11 @@ class TestCommandLine:
             ("export none.run -o a.xls", "not as 'a.xls'", 2),
         ],
     )
-    def test_what_does_not_work_is_told(self, words, message, status):
+    def test_command_line_reports_invalid_requests(self, words, message, status):
         words = words.replace("kepler -o", "kepler --method stoermer-verlet --steps 10 -o")
         assert message in self.invoke(words, status)
 
-    def test_ctrl_c_says_how_to_go_on(self):
+    def test_interrupt_prints_how_to_continue(self):
         words = "run kepler --method stoermer-verlet --step 0.01 --steps 1000000000000 --save-every 100000 -o a.run"
         command = [sys.executable, "-m", "scvi_codegen", *words.split(), "--checkpoint", "0.1"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

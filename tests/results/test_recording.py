@@ -67,7 +67,7 @@ class TestRecording:
         assert digests("a.run") == digests("whole.run")
 
     @pytest.mark.parametrize("save_every", [1, 7])
-    def test_steps_that_nobody_kept_are_made_again(self, kepler, save_every, monkeypatch):
+    def test_steps_after_the_last_saved_state_are_recomputed(self, kepler, save_every, monkeypatch):
         """Ctrl-C within a portion: the run stands beyond the last state that was kept, and so does its memory."""
         recorded(kepler, 600, save_every=save_every, folder="whole.run")
         left = iter([*[False] * 5, True])
@@ -87,7 +87,7 @@ class TestRecording:
         assert resume_run("a.run").finished
         assert digests("a.run") == digests("whole.run")
 
-    def test_options_and_parameters_are_kept(self, kepler):
+    def test_options_and_parameters_are_saved(self, kepler):
         settings = {"parameters": {"mu": 1.1}, "options": SolverOptions(tolerance=1e-9), "t": 3.0}
         whole = kepler.integrate(**STATE, h=H, steps=300, **settings)
         record_run(start(kepler, **settings), "a.run", steps=300, rows=64, stop=StopsAfter(2))
@@ -107,13 +107,13 @@ class TestRecording:
         assert resume_run("a.run").finished
         assert digests("a.run") == before
 
-    def test_checkpoints_come_by_steps(self, kepler):
+    def test_checkpoints_are_written_every_n_steps(self, kepler):
         seen = []
         recorded(kepler, 100, checkpoint_steps=25, progress=lambda done: seen.append((done, load_run("a.run").steps)))
         assert {25, 50, 75, 100} <= {done for done, _ in seen}
         assert all(written >= done - done % 25 for done, written in seen)
 
-    def test_the_manifest_says_what_runs(self, kepler):
+    def test_manifest_describes_the_run(self, kepler):
         text = dump_model(Model.from_problem(problem("kepler")))
         found = recorded(kepler, 10, model=text, certificate={"symplectic": True})
         about = json.loads(Path("a.run/manifest.json").read_text())
@@ -141,7 +141,7 @@ class TestRecording:
             with pytest.raises(StateError, match="the certificate"):
                 recorded(kepler, 1, certificate=wrong, folder="c.run")
 
-    def test_memory_does_not_grow_with_the_length(self, kepler):
+    def test_memory_does_not_grow_with_run_length(self, kepler):
         recorded(kepler, 10, folder="first.run")  # what is imported on the way is not counted
         tracemalloc.start()
         found = recorded(kepler, 100_000, rows=2000)
@@ -151,7 +151,7 @@ class TestRecording:
         tracemalloc.stop()
         assert peak < 1.5e6 < 100_000 * (8 * 5 + 4)
 
-    def test_another_compiler_or_processor_is_told_and_kept(self, kepler, monkeypatch):
+    def test_different_compiler_or_processor_is_reported_and_saved(self, kepler, monkeypatch):
         recorded(kepler, 500, stop=StopsAfter(3))
         step = load_run("a.run").steps
         monkeypatch.setattr(manifest, "fingerprint", lambda source, flags: "another")
@@ -173,12 +173,12 @@ class TestRecording:
         ],
         ids=str,
     )
-    def test_wrong_numbers_are_named_before_anything_is_written(self, kepler, settings, message):
+    def test_invalid_numbers_are_named_before_writing(self, kepler, settings, message):
         with pytest.raises(StateError, match=message):
             record_run(start(kepler), "a.run", **{"steps": 3} | settings)
         assert not Path("a.run").exists()
 
-    def test_a_run_under_way_is_refused(self, kepler):
+    def test_active_run_is_rejected(self, kepler):
         run = start(kepler)
         run.record(3)
         with pytest.raises(StateError, match="at its start, but this run has 3 steps"):
@@ -193,14 +193,14 @@ class TestFolders:
             recorded(kepler, 10)
         assert digests("a.run") == before
 
-    def test_a_folder_of_something_else_is_left_alone(self, kepler):
+    def test_foreign_folder_is_not_changed(self, kepler):
         Path("a.run").mkdir()
         Path("a.run/thesis.tex").touch()
         with pytest.raises(RecordingError, match="is not empty"):
             recorded(kepler, 10)
         assert [path.name for path in Path("a.run").iterdir()] == ["thesis.tex"]
 
-    def test_what_a_process_left_that_was_killed_at_once_is_no_obstacle(self, kepler):
+    def test_remains_of_a_killed_process_are_ignored(self, kepler):
         Path("a.run").mkdir()
         for name in ("states-000000.npz", ".states-000000.npz.x1y2", ".manifest.json.x1y2"):
             Path("a.run", name).write_text("torn")
@@ -256,7 +256,7 @@ class TestFolders:
             (("flags",), ["-include", "outside"]),
         ],
     )
-    def test_a_manifest_is_data_that_leads_nowhere_else(self, kepler, place, value, tmp_path):
+    def test_manifest_cannot_reference_other_folders(self, kepler, place, value, tmp_path):
         recorded(kepler, 10)
         path = Path("a.run/manifest.json")
         document = json.loads(path.read_text())
@@ -337,7 +337,7 @@ class TestReading:
         with pytest.raises(TypeError, match="must be a whole number or a slice"):
             lazy["t"]
 
-    def test_a_run_under_way_can_be_read(self, kepler):
+    def test_active_run_can_be_read(self, kepler):
         lengths = []
 
         def look(done: int) -> None:
@@ -419,7 +419,7 @@ class TestFiles:
         np.testing.assert_array_equal(dataset.momentum_map, run.momentum_maps())
         assert list(dataset.symmetry.values) == list(kepler.momentum_map_names)
 
-    def test_what_cannot_be_computed_is_not_a_number(self, kepler):
+    def test_undefined_quantities_are_nan(self, kepler):
         pytest.importorskip("xarray")
         run = kepler.integrate(**STATE, h=H, steps=9)
         q = run.q.copy()
@@ -429,7 +429,7 @@ class TestFiles:
         np.testing.assert_array_equal(np.delete(dataset.energy.values, 4), np.delete(run.energy(), 4))
 
     @pytest.mark.parametrize(("path", "units"), [("a.csv", {"t": "s"}), ("a.h5", {"h": "s"}), ("a.h5", {"t": 1})])
-    def test_units_that_cannot_be_kept_are_refused(self, kepler, path, units):
+    def test_unsupported_units_are_rejected(self, kepler, path, units):
         with pytest.raises(StateError, match="units"):
             kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
 
@@ -454,13 +454,13 @@ class TestFiles:
             run.to_xarray()
         assert list(Path().iterdir()) == []
 
-    def test_a_folder_of_something_else_is_not_replaced(self, kepler):
+    def test_foreign_folder_is_not_replaced(self, kepler):
         pytest.importorskip("zarr")
         Path("a.zarr").mkdir()
         with pytest.raises(StateError, match="a folder with other contents"):
             kepler.integrate(**STATE, h=H, steps=3).save("a.zarr")
 
-    def test_a_file_that_cannot_be_finished_leaves_the_old_one(self, kepler, monkeypatch):
+    def test_unfinished_file_preserves_the_old_one(self, kepler, monkeypatch):
         run = kepler.integrate(**STATE, h=H, steps=3)
         run.save("a.npz")
         before = Path("a.npz").read_bytes()
@@ -476,7 +476,7 @@ class TestFiles:
         assert Path("a.npz").read_bytes() == before
 
 
-def test_inputs_that_nobody_gave_leave_no_folder_behind():
+def test_missing_inputs_leave_no_folder():
     stepper = compile_stepper(pushed_pendulum(), SVI(2))
     run = stepper.start([0.3], [0.0], h=0.1)
     with pytest.raises(StateError, match=r"the input 'u' is not set.*only constant inputs"):

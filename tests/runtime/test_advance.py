@@ -48,7 +48,7 @@ def test_steps_without_states_are_those_with_them(pushed, monkeypatch, portion):
 
 
 @pytest.mark.parametrize("portion", [3, 10**5])
-def test_at_its_goal_a_run_goes_no_farther(pushed, monkeypatch, portion):
+def test_run_stops_at_its_target_time(pushed, monkeypatch, portion):
     plan = {"t_end": 3.0, "tolerance": 1e-9}
     kept = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
     monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
@@ -61,7 +61,7 @@ def test_at_its_goal_a_run_goes_no_farther(pushed, monkeypatch, portion):
         assert standing(run) == (3.0, kept.q[-1].tolist(), kept.p[-1].tolist())
 
 
-def test_so_does_one_whose_steps_a_monitor_chooses():
+def test_run_with_time_transformation_stops_at_its_target_time():
     kepler = LagrangianSystem.from_text(
         name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
     )
@@ -84,7 +84,7 @@ def test_an_input_that_is_no_number_changes_none(pushed):
     assert np.array_equal(run.parameters, before)
 
 
-def test_goals_and_parameters_are_changed_on_the_way(pushed):
+def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
     """By what is heard of in the next call, whatever was given to the last."""
     run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
     run.advance(10**6)
@@ -97,7 +97,7 @@ def test_goals_and_parameters_are_changed_on_the_way(pushed):
     assert run.q == pytest.approx(second.q[-1], abs=1e-8)
 
 
-def test_runs_of_one_stepper_share_nothing(pushed):
+def test_runs_of_one_stepper_are_independent(pushed):
     given = np.array(pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2}).parameters)
 
     def held(force):

@@ -67,7 +67,7 @@ def test_time_is_that_of_kepler_s_equation(form: str, solver: str) -> None:
 @pytest.mark.covering
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("form", ["L", "K"])
-def test_every_way_to_solve_a_step_gives_the_same_time(form: str, method: str) -> None:
+def test_every_solver_gives_the_same_time(form: str, method: str) -> None:
     runs = [stepper(form, solver, method).integrate(*START, h=0.05, steps=100) for solver in ("auto", "newton")]
     assert np.abs(runs[0].t - runs[1].t).max() < 1e-13
     assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
@@ -104,7 +104,7 @@ def _exact_time(form: str, h: float) -> float:
     return float(motion.flow([*q, 0], [*p, 0], mp.mpf(h))[0][-1])
 
 
-def test_a_run_of_many_orbits_keeps_its_time_and_energy() -> None:
+def test_run_of_many_orbits_conserves_time_and_energy() -> None:
     """Time is summed in two pieces: over a thousand orbits nothing but the method's phase error is left."""
     run = stepper().integrate(*START, h=0.25, steps=30_000, save_every=1_000)
     energies = run.energy()
@@ -244,7 +244,7 @@ def test_levi_civita_follows_an_ellipse_that_is_almost_a_line() -> None:
     assert run.parameters[-1] == pytest.approx(-0.5, rel=1e-13)
 
 
-def test_what_is_not_possible_is_refused() -> None:
+def test_unsupported_transformations_are_rejected() -> None:
     made = stepper()
     with pytest.raises(StateError, match="give either steps=3 or t_end=1"):
         made.integrate(*START, h=0.1, steps=3, t_end=1.0)
@@ -272,7 +272,7 @@ def test_a_rate_that_is_not_positive_is_refused() -> None:
         made.step([-1.0], [0.0], 0.1, parameters={"E": 0.5})
 
 
-def test_what_is_not_made_for_transformed_time_is_refused():
+def test_unsupported_functions_in_transformed_time_are_rejected():
     system = sc.reparametrise(sc.problem("kepler").system, "frequency")
     with pytest.raises(sc.MethodError, match="is in transformed time: no step size is recommended"):
         sc.advise(system, sc.SVI(4), [1.9, 0.0], [0.0, 0.2], span=10.0, tolerance=1e-9)

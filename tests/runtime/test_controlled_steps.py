@@ -65,7 +65,7 @@ def exact_position(q, p, t):
 
 
 @pytest.mark.parametrize(("e", "error"), [(0.0, 1e-12), (0.2, 1e-12), (0.5, 1e-12), (0.9, 5e-12), (0.99, 5e-11)])
-def test_an_ellipse_is_followed_to_round_off_without_a_word_about_steps(kepler, e, error):
+def test_ellipse_is_followed_to_round_off_without_step_arguments(kepler, e, error):
     q, p = orbit(e)
     run = kepler.integrate(q, p, t_end=SPAN)
     assert run.t[-1] == SPAN
@@ -90,7 +90,7 @@ def test_steps_follow_the_motion(kepler):
 @pytest.mark.covering
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-7, 1e-10])
 @pytest.mark.parametrize("degree", [4, 8])
-def test_the_end_of_a_step_is_as_accurate_as_wanted(tolerance, degree):
+def test_end_of_a_step_has_the_requested_accuracy(tolerance, degree):
     problem, method = sc.problem("henon-heiles"), sc.SVI(degree)
     stepper, reference = sc.compile_stepper(problem.system, method), sc.compile_stepper(problem.system, sc.SVI(12))
     run = stepper.integrate([0.3, 0.2], [0.2, 0.3], t_end=30.0, tolerance=tolerance)
@@ -114,7 +114,7 @@ def test_steps_are_shorter_in_time_where_errors_grow(degree, e, tolerance):
     assert run.iterations.sum() < 6 * run.steps
 
 
-def test_back_in_time(kepler):
+def test_adaptive_steps_backward_in_time(kepler):
     q, p = orbit(0.7)
     there = kepler.integrate(q, p, t_end=-SPAN, t=1.0)
     assert there.t[-1] == -SPAN
@@ -126,7 +126,7 @@ def test_back_in_time(kepler):
 
 
 @pytest.mark.parametrize("method", [sc.Gauss(6), sc.SCVI(4), sc.SpectralCollocation(6)])
-def test_every_method_with_sweeps_has_them(method, pendulums):
+def test_every_iterative_method_has_adaptive_steps(method, pendulums):
     stepper = sc.compile_stepper(sc.problem("double-pendulum").system, method)
     start = [1.2, 0.4], stepper.momentum([1.2, 0.4], [0.0, 0.5])
     run, same = stepper.integrate(*start, t_end=5.0), pendulums.integrate(*start, t_end=5.0)
@@ -153,7 +153,7 @@ def test_the_swinging_atwood_machine(atwood):
 
 
 @pytest.mark.parametrize(("h", "wrong"), [(1.0, True), (0.25, True), (0.01, False)])
-def test_a_step_that_converged_and_is_nonsense_is_said(atwood, h, wrong):
+def test_converged_spurious_step_is_reported(atwood, h, wrong):
     q, v = [1.1, 0.8], [0.0, 0.2]
     said = pytest.raises((AccuracyWarning, StepFailedError), match=r"too long|spurious") if wrong else nullcontext()
     with said:
@@ -207,7 +207,7 @@ def test_events_are_found_and_end_a_run(kepler):
     assert abs(ended.q[-1, 0]) < 1e-13
 
 
-def test_a_run_goes_on_bit_for_bit(kepler):
+def test_restored_adaptive_run_continues_bitwise(kepler):
     q, p = orbit(0.8)
     whole = kepler.integrate(q, p, t_end=20.0)
     run = kepler.start(q, p, t_end=20.0)
@@ -229,7 +229,7 @@ def test_a_collision_is_refused_where_it_is(kepler):
     assert len(failure.value.trajectory) > 10
 
 
-def test_what_rests_or_moves_freely_needs_few_steps():
+def test_equilibria_and_free_particles_need_few_steps():
     free = sc.compile_stepper(
         sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2"), sc.SVI(8)
     )
@@ -264,7 +264,7 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
 
 
 @pytest.mark.parametrize("method", [sc.StoermerVerlet(), sc.SVI(4, space="trigonometric:0.5")])
-def test_methods_without_a_polynomial_curve_say_so(method):
+def test_methods_without_a_polynomial_curve_are_reported(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method)
     with pytest.raises(MethodError, match="the error estimate requires"):
         stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=1.0)
@@ -296,7 +296,7 @@ MASSES = {
     ("name", "solver"),
     [(name, solver) for name in MASSES for solver in ("auto", "newton")[: 2 - (name == "of arrays")]],
 )
-def test_velocities_that_forces_leave_alike_at_both_points_tell_no_error(name, solver, method):
+def test_equal_velocities_at_both_points_give_no_error_estimate(name, solver, method):
     """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are."""
     text, kind = MASSES[name]
     system = kind.from_text(name="quartic", **text)
@@ -311,7 +311,7 @@ def test_velocities_that_forces_leave_alike_at_both_points_tell_no_error(name, s
 
 
 @pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_of_three_points_at_both_ends_the_error_is_that_of_the_slope_of_momenta(solver):
+def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver):
     """The highest coefficient of the velocities is 0 in every step."""
     system = sc.LagrangianSystem.from_text(name="quartic", **MASSES["relativistic"][0])
     stepper = sc.compile_stepper(system, sc.SVI(3, "gauss-lobatto:3"), solver=solver)
@@ -338,7 +338,7 @@ def test_newtons_iteration_has_them(method):
     assert np.array_equal(np.concatenate([first.q, rest.q[1:]]), run.q)
 
 
-def test_stiff_systems_take_steps_as_long_as_their_motion_by_newtons_iteration():
+def test_newton_solves_stiff_systems_with_steps_of_the_slow_time_scale():
     system = sc.LagrangianSystem.from_text(
         name="penalty pendulum",
         coordinates=["x", "y"],
@@ -355,7 +355,7 @@ def test_stiff_systems_take_steps_as_long_as_their_motion_by_newtons_iteration()
     assert np.ptp(run.energy()) < 1e-6
 
 
-def test_solve_motion_takes_the_tolerance_of_steps(kepler):
+def test_solve_ivp_accepts_the_tolerance_of_steps(kepler):
     q, p = orbit(0.9)
     motion = sc.solve_ivp(kepler, (0.0, 20.0), [*q, *p], rtol=1e-12, t_eval=[5.0, 20.0])
     assert motion.success
@@ -383,7 +383,7 @@ def test_a_first_step_is_found_where_a_velocity_is_zero(method):
 
 
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
-def test_of_degree_two_what_bends_a_curve_tells_its_error(tolerance):
+def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
     """From rest the force does not change at first: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
     pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     run = sc.compile_stepper(pendulum, "svi:2").integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance)
@@ -394,7 +394,7 @@ def test_of_degree_two_what_bends_a_curve_tells_its_error(tolerance):
     assert errors.max() < (len(run) - 1) * tolerance
 
 
-def test_forces_that_set_out_beyond_the_degree_are_said():
+def test_forces_beyond_the_degree_at_the_start_are_reported():
     """Every step from rest at the origin is as wrong, beside where it leads, however short."""
     ramp = sc.LagrangianSystem.from_text(name="ramp", coordinates=["x"], lagrangian="x_dot**2/2 + x*(1 - cos(t))")
     with pytest.raises(StepFailedError, match="from rest at the origin they grow as a power of t beyond the method's"):
@@ -416,7 +416,7 @@ def test_a_singular_time_inside_a_run_is_resolved_or_its_error_reported():
         assert error < 10.0 * run.step_error <= 1e3 * wanted, tolerance
 
 
-def test_what_newtons_iteration_finds_far_from_the_motion_is_refused():
+def test_spurious_newton_solutions_are_rejected():
     stepper = sc.compile_stepper(sc.problem("cart-pole").system, sc.SCVI(2))
     start = [1.1906153181856531, 1.6868254287493736], [-1.1281634410206784, -1.1565320090084121]
     with pytest.warns(AccuracyWarning):
@@ -467,7 +467,7 @@ WAYS = ["adaptive", "monitored", "clocked", "driven", "driven, adaptive", "index
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("span", [2.0, -2.0])
-def test_runs_end_at_t_end_counted_with_the_low_word_of_time(far_away, way, span):
+def test_runs_end_at_t_end_including_the_low_word_of_time(far_away, way, span):
     """At t = 1e15 an ulp is 1/8, longer than a step: time alone is t_end some steps too early."""
     near = far_away[way](0.0, span)
     for t in FAR:
@@ -496,7 +496,7 @@ class TestStepsOfHLeadToAnEnd:
     def positions(run):
         return (run.q if isinstance(run.q, np.ndarray) else run.q["q"])[:, 0]
 
-    def test_a_whole_number_of_them_is_that_many_steps(self, oscillators, name, sign):
+    def test_integer_number_of_steps_is_exact(self, oscillators, name, sign):
         run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, t_end=sign * 2.0)
         same = oscillators[name].integrate([1.0], [0.0], h=sign * 0.1, steps=20)
         assert np.array_equal(run.t, same.t)
@@ -513,7 +513,7 @@ class TestStepsOfHLeadToAnEnd:
         q, _ = run.at(between)
         assert np.abs((q if name == "q" else q["q"])[:, 0] - np.cos(between)).max() < 1e-9
 
-    def test_events_on_the_way_and_in_the_last_step_are_found(self, oscillators, name, sign):
+    def test_events_in_steps_and_in_the_shortened_last_step_are_found(self, oscillators, name, sign):
         wanted = [f"{name} - 0.5", f"{name} - cos(1.95)", sc.Event(f"{name} - cos(1.99)", terminal=True)]
         run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, events=wanted)
         found = sign * np.concatenate([each.t for each in run.events])
@@ -521,7 +521,7 @@ class TestStepsOfHLeadToAnEnd:
         assert run.t[-1] == sign * found[-1]
 
 
-def test_states_at_times_are_kept_up_to_an_end_that_h_does_not_divide(oscillators):
+def test_states_at_times_are_saved_if_h_does_not_divide_the_span(oscillators):
     times = np.linspace(0.0, 2.0, 9)
     run = oscillators["q"].integrate([1.0], [0.0], h=0.3, t_end=2.0, t_eval=times)
     assert np.array_equal(run.t, times)
@@ -538,12 +538,12 @@ def test_states_at_times_are_kept_up_to_an_end_that_h_does_not_divide(oscillator
     ],
 )
 @pytest.mark.parametrize("name", ["q", "q[0]"])
-def test_ends_that_steps_of_h_do_not_lead_to_are_refused(oscillators, name, given, message):
+def test_incompatible_ends_of_fixed_steps_are_rejected(oscillators, name, given, message):
     with pytest.raises(StateError, match=message):
         oscillators[name].integrate([1.0], [0.0], **given)
 
 
-def test_a_looser_tolerance_takes_no_more_steps_where_the_iteration_limits_them():
+def test_looser_tolerance_needs_no_more_steps_under_the_iteration_limit():
     """At 1e-3 the error of a charge in a field that depends on z allows sizes at which the iteration diverges."""
     system = sc.LagrangianSystem.from_text(
         name="charge",

@@ -82,7 +82,7 @@ def test_cubics_through_positions_and_velocities_are_worse(kepler):
 
 @each_method
 @pytest.mark.parametrize("h", [0.1, -0.1])
-def test_states_are_those_kept_at_both_ends_and_nothing_jumps(compiled, sample, method, h):
+def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h):
     q, p = sample("driven-duffing").state
     run = compiled("driven-duffing", method).integrate(q, p, h=h, steps=20, t=0.4)
     assert np.array_equal(run.at(run.t)[0], run.q)
@@ -94,7 +94,7 @@ def test_states_are_those_kept_at_both_ends_and_nothing_jumps(compiled, sample, 
             assert np.abs(value - state).max() < 1e-14
 
 
-def test_any_order_any_shape_and_any_distance_of_kept_states(kepler):
+def test_dense_output_for_any_order_shape_and_save_interval(kepler):
     every_one = kepler.integrate(**START, h=0.1, steps=100)
     t = np.random.default_rng(3).uniform(0.0, 10.0, 400)
     q, p = every_one.at(t)
@@ -108,7 +108,7 @@ def test_any_order_any_shape_and_any_distance_of_kept_states(kepler):
         assert np.abs(few.at(t[inside])[0] - q[inside]).max() < 1e-13
 
 
-def test_options_of_the_run_hold_between_steps(kepler):
+def test_options_of_the_run_apply_to_dense_output(kepler):
     rough = kepler.integrate(**START, h=0.3, steps=10, options=SolverOptions(tolerance=1e-3))
     fine = kepler.integrate(**START, h=0.3, steps=10)
     t = 0.3 * np.arange(10) + 0.29
@@ -157,7 +157,7 @@ def test_given_times_are_checked(kepler, arguments, words):
             kepler.integrate(**START, **way, **arguments)
 
 
-def test_what_was_kept_before_a_failure_is_there():
+def test_states_before_a_failure_are_available():
     runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     stepper = compile_stepper(runaway, SVI(3), flags=FLAGS)
     with pytest.raises(StepFailedError) as failure:
@@ -240,7 +240,7 @@ def test_a_motion_runs_backward_and_its_last_step_ends_the_span(kepler):
     assert np.abs(back.sol(-0.5)[:2] - ellipse(np.array([-1.5]))[0]).max() < 1e-6
 
 
-def test_a_motion_says_that_a_step_failed():
+def test_solve_ivp_reports_a_failed_step():
     runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     failed = solve_ivp(compile_stepper(runaway, SVI(3), flags=FLAGS), (0, 10), [1.0, 1.0], h=0.1)
     assert (failed.status, failed.success) == (-1, False)
@@ -248,7 +248,7 @@ def test_a_motion_says_that_a_step_failed():
     assert failed.y.shape == (2, len(failed.t))
 
 
-def test_a_motion_chooses_its_step_for_a_tolerance():
+def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
     y0 = [*START["q"], *START["p"]]
     motion = solve_ivp(problem("kepler").system, (0, 20), y0, tolerance=1e-7, method=SVI(4))
     error = np.abs(motion.y[:2, -1] - ellipse(motion.t[-1:])[0]).max()

@@ -65,7 +65,7 @@ def test_steps_are_those_of_the_controller(method, solver):
     assert 0.0 < run.t[-1] - run.t[-2] <= run.step_sizes[-3] * 1.5
 
 
-def test_the_monitor_may_depend_on_time_where_the_system_does():
+def test_step_density_may_depend_on_time_for_nonautonomous_systems():
     stepper = compile_stepper(DRIVEN, SVI(3), monitor="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
     run = stepper.integrate([1.0], [0.7], h=0.2, t_end=8.0)
 
@@ -84,7 +84,7 @@ def test_the_monitor_may_depend_on_time_where_the_system_does():
     assert np.abs(np.column_stack([run.t, run.q, run.p])[1:-1] - expected).max() < 1e-12
 
 
-def test_a_hamiltonian_has_monitors_of_its_momenta():
+def test_hamiltonian_has_step_densities_of_its_momenta():
     system = hamiltonian_of(KEPLER)
     stepper = compile_stepper(system, SVI(4), monitor="1/(p_q1**2 + p_q2**2 + 1/(q1**2 + q2**2))", flags=QUICK_FLAGS)
     run = stepper.integrate(*START, h=0.3, t_end=20 * PERIOD)
@@ -94,7 +94,7 @@ def test_a_hamiltonian_has_monitors_of_its_momenta():
     assert 4.0 * lengths[near].mean() < lengths[~near].mean()
 
 
-def test_forces_change_a_monitor_of_momenta():
+def test_forces_enter_the_step_density_of_momenta():
     system = hamiltonian_of(DRIVEN, momenta=["p"])
     run = compile_stepper(system, SVI(3), monitor="1/(1 + p**2)", flags=QUICK_FLAGS).integrate(
         [1.0], [0.7], h=0.2, t_end=8.0
@@ -112,7 +112,7 @@ def test_forces_change_a_monitor_of_momenta():
 
 
 @pytest.mark.parametrize("system", [KEPLER, hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])
-def test_a_run_that_turns_goes_back_on_its_own_steps(system):
+def test_reversed_run_returns_on_its_own_steps(system):
     stepper = compile_stepper(system, SVI(4), monitor="frequency", flags=QUICK_FLAGS)
     run = stepper.start(*START, h=0.1, t_end=100.0)
     there = run.record(300)
@@ -128,7 +128,7 @@ def off_the_monitor(run):
     return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
 
 
-def test_steps_that_end_at_a_time_take_the_density_on_by_their_part():
+def test_steps_that_end_at_a_time_advance_the_density_partially():
     """At breakpoints of inputs and where a run goes to and fro; by whole ones it would go on ahead of the motion."""
     pushed = LagrangianSystem.from_text(
         name="pushed",
@@ -150,7 +150,7 @@ def test_steps_that_end_at_a_time_take_the_density_on_by_their_part():
     assert off_the_monitor(piece) < 2e-3
 
 
-def test_ways_of_driven_runs():
+def test_time_transformations_of_runs_with_inputs():
     """Both of them by positive steps of tau, which have no number."""
     system = LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
     stepper = compile_stepper(system, SVI(2), monitor="1 + x**2", flags=QUICK_FLAGS)
@@ -163,7 +163,7 @@ def test_ways_of_driven_runs():
         stepper.integrate([0.0], [0.0], **given, steps=10)
 
 
-def test_invariants_are_kept_for_long():
+def test_invariants_are_conserved_over_long_times():
     run = kepler(SVI(2)).integrate(*START, h=0.1, t_end=500 * PERIOD)
     error = run.energy() / run.energy()[0] - 1.0
     turns = error[np.hypot(*run.q.T) > 1.79]
@@ -181,7 +181,7 @@ def test_the_order_is_that_of_the_method(degree):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.35)
 
 
-def test_states_between_events_and_portions_of_a_run():
+def test_dense_output_events_and_continuation_with_step_density():
     stepper = kepler(SVI(8), events="q1*q1_dot + q2*q2_dot")
     run = stepper.integrate(*START, h=0.2, t_end=3 * PERIOD)
     assert run.events[0].t == pytest.approx(PERIOD / 2 * np.arange(1, 6), abs=1e-11)
@@ -206,7 +206,7 @@ def test_backward_and_recorded(tmp_path):
     assert np.array_equal(resume_run(tmp_path / "run", t_end=5.0)[:].q[:-1], whole.q[: len(back.q) - 1])
 
 
-def test_a_fallback_is_borrowed_here_too():
+def test_fallback_library_is_used_with_step_density():
     pendulum = problem("double-pendulum")
     start = np.array(pendulum.q), 0.3 * np.array(pendulum.q)
     runs = [
@@ -231,17 +231,17 @@ def test_a_fallback_is_borrowed_here_too():
         (lambda s: s.from_checkpoint(b"", t_end=1.0), "and t_end"),
     ],
 )
-def test_what_is_missing_is_said(call, words):
+def test_missing_arguments_are_reported(call, words):
     with pytest.raises(StateError, match=words):
         call(kepler(SVI(2)))
 
 
-def test_what_is_no_monitor_is_said():
+def test_invalid_time_transformation_is_reported():
     with pytest.raises(SystemDefinitionError, match="unknown name 'z'"):
         kepler(SVI(2), "z**2").integrate(*START, h=0.1, t_end=1.0)
 
 
-def test_steps_too_long_for_the_monitor_are_refused():
+def test_too_long_steps_for_the_time_transformation_are_rejected():
     with pytest.warns(AccuracyWarning):
         kepler(SVI(2)).integrate(*START, h=0.7, t_end=PERIOD / 2)
     with pytest.raises(StepFailedError, match=r"infinite or NaN|did not converge|spurious solution"):

@@ -113,7 +113,7 @@ def values_of(form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_of_a_step_by_all_it_starts_from(form):
+def test_derivatives_of_a_step_by_all_arguments(form):
     """At the energy of its state; and at one that is given, where it is symplectic."""
     made, exact = stepper(form), Digits(form).partials(values_of(form), 1)
     found = columns_of(made.sensitivity(Q, P, H, T0))
@@ -131,7 +131,7 @@ def test_of_a_step_by_all_it_starts_from(form):
 @pytest.mark.parametrize(
     "form", [form if form == "L" else pytest.param(form, marks=pytest.mark.full) for form in FORMS]
 )
-def test_of_runs_of_steps_and_to_a_time(form):
+def test_derivatives_of_runs_by_steps_and_to_an_end_time(form):
     made, values = stepper(form), values_of(form)
     run = made.integrate(Q, P, h=H, steps=3, t=T0)
     exact = Digits(form).partials(values, 3)
@@ -203,7 +203,7 @@ def test_a_run_that_ends_where_a_step_does_ends_at_that_time():
     assert_allclose(still.tangent(), np.stack([np.eye(4)] * 2))
 
 
-def test_what_ends_at_a_time_is_what_steps_of_time_lead_to():
+def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
     """The flow of the motion itself, to the error of both: a period later all but the phase returns."""
     period, made = 2 * np.pi, compile_stepper(reparametrise(KEPLER, "distance"), SVI(8), flags=QUICK_FLAGS)
     q, p = [0.2, 0.0], [0.0, 3.0]
@@ -233,7 +233,7 @@ def test_a_rod_in_transformed_time():
     assert forward[1, -1, -2] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-7)
 
 
-def test_what_is_not_told_in_transformed_time():
+def test_unsupported_derivatives_in_transformed_time():
     made = stepper("L")
     run = made.integrate(Q, P, h=H, steps=3)
     with pytest.raises(MethodError, match=r"second derivatives of the steps are unavailable .* in transformed time"):
@@ -246,7 +246,7 @@ def test_what_is_not_told_in_transformed_time():
         made.integrate(Q, P, h=H, t_end=2.7, save_every=4).tangent()
 
 
-def test_a_hamiltonian_that_is_linear_in_momenta_has_a_level():
+def test_hamiltonian_linear_in_momenta_has_an_energy_surface():
     vortex = HamiltonianSystem.from_text(
         name="turn", coordinates=["q"], momenta=["p"], hamiltonian="w*(q**2 + p**2)/2", parameters={"w": 1.5}
     )

@@ -78,7 +78,7 @@ def test_a_saddle_has_the_exponents_of_its_linear_motion():
     assert derivative(run.t[2000:], run.fli()[2000:]) == pytest.approx(0.3, rel=1e-3)
 
 
-def test_a_free_particle_spreads_as_it_can_be_written_down():
+def test_tangent_vectors_of_a_free_particle_grow_as_in_closed_form():
     """A change (u, v) becomes (u + v t, v), for every method; integrals by the steps, to their second order."""
     free = LagrangianSystem.from_text(name="free", coordinates=["q"], lagrangian="q_dot**2/2")
     run = compile_stepper(free, SVI(2)).integrate([0.0], [1.0], h=0.01, steps=2000)
@@ -120,7 +120,7 @@ def test_indicators_are_those_of_the_variational_equations(galaxy):
     assert found.megno()[-1] == pytest.approx(ends[17] / 50.0, rel=1e-3)
 
 
-def test_regular_and_chaotic_motions_are_told_apart(galaxy):
+def test_regular_and_chaotic_trajectories_are_distinguished(galaxy):
     """MEGNO to 2 or along lambda t / 2; GALI_2 constant, GALI_3 and GALI_4 as t^-2 and t^-4, or exponential."""
     regular, chaotic = (galaxy.integrate(*start, h=0.2, steps=10_000) for start in (REGULAR, CHAOTIC))
     assert regular.megno()[-1] == pytest.approx(2.0, abs=0.1)
@@ -139,7 +139,7 @@ def test_regular_and_chaotic_motions_are_told_apart(galaxy):
     assert 0.0 < chaotic.sali()[1000] < 1e-2 < regular.sali()[-1]
 
 
-def test_states_left_out_change_nothing(galaxy):
+def test_stride_does_not_change_the_indicators(galaxy):
     whole = galaxy.integrate(*CHAOTIC, h=0.2, steps=600)
     some = galaxy.integrate(*CHAOTIC, h=0.2, steps=600, save_every=50)
     for name in SERIES:
@@ -150,7 +150,7 @@ def test_states_left_out_change_nothing(galaxy):
     assert np.abs(back.lyapunov_exponents() + back.lyapunov_exponents()[::-1]).max() < 1e-13
 
 
-def test_a_length_is_greatest_wherever_it_was(galaxy):
+def test_maximal_growth_between_saved_states_is_found(galaxy):
     """Between states that are kept, too: of a regular motion, whose changes come and go."""
     run, start = galaxy.integrate(*REGULAR, h=0.2, steps=60), ([REGULAR[0]], [REGULAR[1]])
     greatest = run.chaos_indicators(1).lengths.max()
@@ -175,7 +175,7 @@ def test_friction_moves_the_middle_of_the_spectrum():
     assert run.lyapunov_exponents().sum() == pytest.approx(-0.25, abs=1e-6)
 
 
-def test_constraints_leave_fewer_changes():
+def test_constraints_reduce_the_number_of_tangent_vectors():
     """A pendulum of rods: two changes, those of the angle."""
     rod = LagrangianSystem.from_text(
         name="rod",
@@ -267,7 +267,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
-def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
+def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
     """x'' = 100 x: apart by e^20 in ten steps, e^600 in all; the closed form, and what the derivatives tell."""
     saddle = LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
     stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
@@ -278,7 +278,7 @@ def test_changes_in_lanes_that_part_quickly_are_taken_in_shorter_pieces():
     same(found, alone.chaos_indicators_ensemble(*start, h=0.1, steps=300, save_every=100), 1e-10)
 
 
-def test_a_motion_that_leaves_its_lane_is_followed_alone():
+def test_diverging_trajectory_is_continued_as_scalar():
     """x'' = 4 x^3 goes to infinity, sooner or later: statuses, and what is known until then, are those told alone."""
     away = LagrangianSystem.from_text(name="away", coordinates=["x"], lagrangian="x_dot**2/2 + x**4")
     stepper, done = compile_stepper(away, SVI(3)), []
@@ -305,7 +305,7 @@ def test_steps_that_are_no_motion_are_refused_as_by_runs():
     assert np.isnan(found.megno()[-1]).all()
 
 
-def test_more_motions_than_go_along_together_are_told_apart(galaxy):
+def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
     """Those of a row of a map, and each of them alone, whatever the number of threads."""
     y = np.linspace(-0.2, 0.3, TRAJECTORIES_TOGETHER + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
@@ -328,7 +328,7 @@ def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):
 
 
 @pytest.mark.full
-def test_planets_are_regular_and_chaotic_where_rebound_says_so():
+def test_regular_and_chaotic_planets_agree_with_rebound():
     """Two of a thousandth of their star; its MEGNO by the variational equations of IAS15, of another change."""
     rebound = pytest.importorskip("rebound")
     pairs = ("01", "02", "12")
@@ -361,7 +361,7 @@ def test_planets_are_regular_and_chaotic_where_rebound_says_so():
             assert min(found, known.megno()) > 6.0
 
 
-def test_what_is_refused(galaxy):
+def test_invalid_arguments_are_rejected(galaxy):
     run = galaxy.integrate(*REGULAR, h=0.2, steps=4)
     with pytest.raises(StateError, match="a run of at least one step"):
         galaxy.integrate(*REGULAR, h=0.2, steps=0).lyapunov_exponents()
@@ -381,7 +381,7 @@ def test_what_is_refused(galaxy):
         galaxy.chaos_indicators_ensemble([REGULAR[0]], [REGULAR[1]], h=0.2, steps=10, save_every=3)
 
 
-def test_steps_too_long_are_said_of_an_ensemble():
+def test_too_long_steps_in_an_ensemble_are_reported():
     kepler = compile_stepper(problem("kepler").system, SVI(4))
     starts = [[1.0, 0.0], [0.1, 0.0]], [[0.0, 1.0], [0.0, 19.0**0.5]]
     with warnings.catch_warnings():

@@ -54,7 +54,7 @@ def cluster(distributed: Any) -> Iterator[Any]:
         yield cluster
 
 
-def test_parts_are_full_registers_and_cover_everything():
+def test_parts_are_multiples_of_the_register_width():
     for count, blocks in ((70, 4), (70, 100), (1, 3), (64, 8), (1000, 3)):
         parts = list(_slices(count, blocks))
         assert len(parts) <= blocks
@@ -63,7 +63,7 @@ def test_parts_are_full_registers_and_cover_everything():
 
 
 class TestCluster:
-    def test_in_this_process_by_default(self, distributed: Any, kepler: Stepper):
+    def test_default_is_the_current_process(self, distributed: Any, kepler: Stepper):
         q, p = states()
         mu = np.linspace(0.9, 1.1, COUNT)
         arguments = {"h": 0.05, "steps": 100, "save_every": 30, "t": 1.0, "parameters": {"mu": mu}}
@@ -76,7 +76,7 @@ class TestCluster:
         assert done == sorted(done)
 
     @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 2.0}, {"t_end": np.linspace(1.0, 2.0, COUNT)}])
-    def test_inputs_go_along(self, distributed: Any, way: dict[str, Any]):
+    def test_ensembles_with_inputs_are_distributed(self, distributed: Any, way: dict[str, Any]):
         stepper = compile_stepper(pushed_pendulum(), SVI(3))
         knots, values = np.array([0.0, 0.7, 2.0]), np.linspace(-1.0, 1.0, 3 * COUNT).reshape(COUNT, 3)
         given = {"inputs": {"u": (knots, values), "w": (knots, [0.0, 0.1, 0.0])}, **way}
@@ -94,7 +94,7 @@ class TestCluster:
             with pytest.raises(StateError):
                 integrate_ensemble(kepler, q, p, **({"h": 0.1, "steps": 1} | faults))  # type: ignore[arg-type]
 
-    def test_failures_of_trajectories_come_back(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_failures_of_trajectories_are_returned(self, distributed: Any, cluster: Any, kepler: Stepper):
         q, p = states()
         mu = np.where(np.arange(COUNT) == 5, 1e9, 1.0)  # the sixth falls into the centre
         result = integrate_ensemble(
@@ -103,7 +103,7 @@ class TestCluster:
         assert np.flatnonzero(~result.ok).tolist() == [5]
         assert result.steps[5] < 50
 
-    def test_a_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_killed_worker_loses_nothing(self, distributed: Any, cluster: Any, kepler: Stepper):
         q, p = states()
         arguments = {"h": 0.05, "steps": 15_000, "save_every": 5_000}
         here = kepler.integrate_ensemble(q, p, **arguments)
@@ -123,7 +123,7 @@ class TestCluster:
         assert np.array_equal(result.q, here.q)
         assert np.array_equal(result.p, here.p)
 
-    def test_a_worker_compiles_the_source_into_its_own_cache(self, distributed: Any, kepler: Stepper, tmp_path: Path):
+    def test_worker_compiles_the_source_into_its_cache(self, distributed: Any, kepler: Stepper, tmp_path: Path):
         q, p = states()
         with distributed.LocalCluster(
             n_workers=1,
@@ -136,7 +136,7 @@ class TestCluster:
         assert np.array_equal(result.q, kepler.integrate_ensemble(q, p, h=0.05, steps=20).q)
         assert any(tmp_path.iterdir())
 
-    def test_nothing_is_left_running(self, distributed: Any, kepler: Stepper):
+    def test_no_process_remains(self, distributed: Any, kepler: Stepper):
         q, p = states()
         counts = []
         for _ in range(6):
@@ -146,7 +146,7 @@ class TestCluster:
         left = np.subtract(counts[-1], counts[1])  # one may be about to close
         assert max(left) < 3
 
-    def test_an_interruption_calls_the_rest_off(self, distributed: Any, cluster: Any, kepler: Stepper):
+    def test_interrupt_cancels_remaining_parts(self, distributed: Any, cluster: Any, kepler: Stepper):
         def interrupt(done: int) -> None:
             raise KeyboardInterrupt
 
@@ -162,13 +162,13 @@ class TestCluster:
             assert not any(client.processing().values())
 
 
-def test_workers_compile_the_source_once_and_keep_it(kepler: Stepper):
+def test_workers_compile_the_source_once(kepler: Stepper):
     pickled = pickle.dumps(kepler)
     assert kepler.source.code.encode() in pickled
     assert _stepper(pickled) is _stepper(pickled)
 
 
-def test_without_the_extra_the_message_says_how_to_get_it(kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+def test_missing_extra_names_what_to_install(kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ImportError, match=r"pip install 'scvi-codegen\[distributed\]'"):
         integrate_ensemble(kepler, *states(), h=0.1, steps=1)

@@ -44,7 +44,7 @@ def test_ensembles_do_not_drift():
 
 
 @pytest.mark.parametrize("angle", [0.7, 4.0])
-def test_steps_that_choose_their_length_do_not_drift(angle):
+def test_adaptive_steps_do_not_drift(angle):
     """h^2 within an ulp of a power of 2 rounds a product by its leading digits alone: 1.5e-12 and 2.1e-12 here."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8))
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

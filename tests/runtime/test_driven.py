@@ -64,7 +64,7 @@ def sloped(t, inner):
     ("kind", "exact"), [("constant", held), ("linear", sloped), ("cubic", lambda t, _: CubicSpline(KNOTS, VALUES)(t))]
 )
 @pytest.mark.parametrize("method", [SVI(2), StoermerVerlet(), Gauss(3)], ids=lambda method: method.name)
-def test_the_order_is_kept_across_breakpoints(pendulum, kind, exact, method):
+def test_order_is_preserved_across_breakpoints(pendulum, kind, exact, method):
     stepper, expected = compile_stepper(pendulum, method), reference(exact, lambda t, _: 0.1 * t, 2.3)
     inputs, errors = {"u": (KNOTS, VALUES, kind), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     for h in (0.1, 0.02):
@@ -76,7 +76,7 @@ def test_the_order_is_kept_across_breakpoints(pendulum, kind, exact, method):
     assert errors[1] < 1e-12 or np.log(errors[0] / errors[1]) / np.log(5.0) > method.order - 0.4
 
 
-def test_steps_that_choose_their_length_and_states_between(pendulum):
+def test_adaptive_steps_and_dense_output_with_inputs(pendulum):
     stepper, expected = compile_stepper(pendulum, SVI(6)), reference(sloped, lambda t, _: 0.1 * t, 2.3)
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     run = stepper.integrate([0.3], velocity=[0.1], inputs=inputs, t_end=2.3)
@@ -97,7 +97,7 @@ def test_work_of_inputs_is_in_the_balance(pendulum):
     assert np.abs(run.energy() - run.energy()[0] - run.work()).max() < 1e-11
 
 
-def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
+def test_sampled_controller_continues_bitwise(pendulum):
     """Between samples an input is held; the same from a saved run, and by the parameters themselves."""
     stepper = compile_stepper(pendulum, SVI(3))
     run = stepper.start([0.3], [0.0], h=0.01)
@@ -124,7 +124,7 @@ def test_a_sampled_controller_goes_on_bit_for_bit(pendulum):
             run.set_inputs(u=0.1)
 
 
-def test_from_sympy_and_what_scipy_gives():
+def test_inputs_from_sympy_and_scipy():
     q, v, u = sympy.symbols("q q_dot u")
     system = LagrangianSystem.from_sympy(
         name="pushed", lagrangian=v**2 / 2, coordinates=[q], forces={"q": u}, inputs=[u]
@@ -137,7 +137,7 @@ def test_from_sympy_and_what_scipy_gives():
 
 
 @pytest.mark.parametrize("t_end", [2.3, 2.05])
-def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
+def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
     """Nothing but what is kept depends on it: states between, work and iterations are those of all states."""
     stepper = compile_stepper(pendulum, SVI(3))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
@@ -161,7 +161,7 @@ def test_states_at_breakpoints_are_kept_whatever_every_says(pendulum, t_end):
         full.at(3.0)
 
 
-def test_files_hold_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
+def test_files_contain_energies_with_the_inputs_of_their_times(pendulum, tmp_path):
     stepper = compile_stepper(pendulum, SVI(4))
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0])}
     run = stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3, parameters={"c": 0.3}, events="q_dot")
@@ -217,12 +217,12 @@ def test_momentum_maps_with_inputs():
         ({"u": PPoly([[1.0, 2.0]], [3.0, 1.0, 0.0]), "w": (KNOTS, VALUES)}, "must be ascending: 1 follows 3"),
     ],
 )
-def test_what_is_no_input(pendulum, inputs, said):
+def test_invalid_inputs_are_rejected(pendulum, inputs, said):
     with pytest.raises(StateError, match=said):
         compile_stepper(pendulum, SVI(2)).integrate([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
 
 
-def test_velocities_at_a_breakpoint_are_those_of_the_pieces_that_follow():
+def test_velocities_at_a_breakpoint_use_the_following_segment():
     """Also on the way back, in the first state of runs of all kinds."""
     system = LagrangianSystem.from_text(
         name="drawn", coordinates=["q"], lagrangian="q_dot**2/2 + u*q_dot - q**2/2", inputs=["u"]
@@ -236,7 +236,7 @@ def test_velocities_at_a_breakpoint_are_those_of_the_pieces_that_follow():
         assert many.p[0, 0, 0] == 0.5 + u
 
 
-def test_what_inputs_are_made_of_is_no_parameter_beside_them(pendulum):
+def test_spline_coefficients_are_not_parameters(pendulum):
     stepper = compile_stepper(pendulum, SVI(2))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3, "parameters": {"u_0": 3}}
     with pytest.raises(StateError, match="u_0 belongs to the input 'u'"):
@@ -281,7 +281,7 @@ def test_names_and_runs_without_an_end(pendulum):
         LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
 
 
-def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
+def test_empty_and_contradictory_runs_with_inputs(pendulum):
     stepper, inputs = compile_stepper(pendulum, SVI(2)), {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}
     with pytest.raises(StateError, match="either t_end or steps"):
         stepper.integrate([0.3], [0.0], inputs=inputs, h=0.1, steps=3, t_end=2.0)
@@ -299,7 +299,7 @@ def test_ways_that_lead_nowhere_and_a_run_of_no_time(pendulum):
         assert (still.t.tolist(), still.q.tolist(), still.p.tolist()) == ([1.0], [[0.3]], [[0.2]])
 
 
-def test_an_input_that_nobody_gave_is_not_zero(pendulum):
+def test_missing_input_is_not_zero(pendulum):
     """Wherever a step would be taken; what is given by a name, in order, or held, is taken."""
     stepper, state = compile_stepper(pendulum, SVI(2)), ([0.3], [0.0])
     for step in (
@@ -327,7 +327,7 @@ def test_an_input_that_nobody_gave_is_not_zero(pendulum):
     assert_allclose(lanes.q[:, 0], given.q, rtol=1e-15)
 
 
-def test_events_and_monitors_know_inputs_by_name(pendulum):
+def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     """A crossing of the torque with a number, and of the angle with a line that is data."""
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     stepper = compile_stepper(pendulum, SVI(4))
@@ -387,7 +387,7 @@ def test_inputs_of_a_hamiltonian(pendulum):
     assert_allclose(found.q, expected.q, atol=1e-13)
 
 
-def test_the_step_of_a_driven_run_is_that_of_its_first_piece(pendulum):
+def test_step_of_a_run_with_inputs_uses_the_first_segment(pendulum):
     stepper = compile_stepper(pendulum, "svi:2")
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     for h in (0.1, 0.4):
@@ -396,7 +396,7 @@ def test_the_step_of_a_driven_run_is_that_of_its_first_piece(pendulum):
     assert stepper.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=0.3).h == 0.1
 
 
-def test_some_of_the_states(pendulum):
+def test_slices_of_runs_with_inputs(pendulum):
     """Every slice of a run with inputs is the same states, energies and work, across breakpoints and at them."""
     run = compile_stepper(pendulum, "svi:2").integrate(
         [0.3], velocity=[0.1], inputs=dict.fromkeys(pendulum.inputs, (KNOTS, VALUES)), h=0.2, t_end=2.6

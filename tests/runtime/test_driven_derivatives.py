@@ -71,7 +71,7 @@ def test_gradients_by_the_start_by_parameters_and_by_the_data(stepper, options):
     assert_allclose(two.q[:, 1], 2 * found.q, rtol=1e-12)
 
 
-def test_tangents_go_from_piece_to_piece(stepper):
+def test_tangent_vectors_are_propagated_across_segments(stepper):
     run = run_from(stepper, START)
     expected = derivative(lambda x: states_of(run_from(stepper, x)), START)
     assert_allclose(run.tangent(), expected[:2].transpose(1, 2, 0), atol=1e-9)

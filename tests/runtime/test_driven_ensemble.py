@@ -69,7 +69,7 @@ def starts(m):
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
 @pytest.mark.parametrize("kind", ["constant", "linear", "cubic"])
 @pytest.mark.parametrize("method", [SVI(3), StoermerVerlet(), Gauss(2)], ids=lambda method: method.name)
-def test_each_trajectory_is_that_of_drive(pendulum, method, kind):
+def test_each_trajectory_equals_integrate(pendulum, method, kind):
     stepper = compile_stepper(pendulum, method)
     assert stepper.ensemble is not None
     inputs = {"u": (KNOTS, own_values()[0], kind), "w": ([0.0, 3.0], [0.0, 0.3])}
@@ -78,7 +78,7 @@ def test_each_trajectory_is_that_of_drive(pendulum, method, kind):
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
-def test_other_sweeps_begin_anew_after_a_shorter_step(coupled):
+def test_other_iterations_restart_after_a_shorter_step(coupled):
     stepper = compile_stepper(coupled, SVI(3))
     assert stepper.ensemble is not None
     assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
@@ -94,7 +94,7 @@ def test_methods_without_lanes_are_equal_to_the_bit(pendulum):
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
-def test_by_steps_of_their_own_each_is_that_of_drive_to_the_bit(pendulum, tolerance):
+def test_adaptive_trajectories_equal_integrate_bitwise(pendulum, tolerance):
     """Times, ends, energies; two inputs of their own and a common one; also back."""
     stepper, (values, c) = compile_stepper(pendulum, SVI(4)), own_values()
     inputs = {"u": (KNOTS, values), "w": ([0.0, 1.0, 3.0], [0.0, 0.5, 0.0], "cubic")}
@@ -115,7 +115,7 @@ def test_by_steps_of_their_own_each_is_that_of_drive_to_the_bit(pendulum, tolera
     assert len(pickle.loads(pickle.dumps(back))) == COUNT
 
 
-def test_a_trajectory_that_vanishes_keeps_what_came_before():
+def test_diverging_trajectory_retains_its_previous_states():
     singular = LagrangianSystem.from_text(
         name="falling", coordinates=["x"], lagrangian="x_dot**2/2 + 1/x", forces={"x": "u"}, inputs=["u"]
     )
@@ -147,7 +147,7 @@ def test_splines_of_scipy(pendulum):
     assert (by_values.q == by_spline.q).all()
 
 
-def test_a_trajectory_that_fails_leaves_the_others_alone():
+def test_failed_trajectory_does_not_affect_others():
     """The third pendulum's push has no square root in the fourth piece."""
     system = LagrangianSystem.from_text(
         name="root",
@@ -169,7 +169,7 @@ def test_a_trajectory_that_fails_leaves_the_others_alone():
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
-def test_a_lane_whose_sweeps_fail_goes_on_alone_across_breakpoints():
+def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
     """Stiff from the second piece on, where Newton's iteration alone leads on."""
     system = LagrangianSystem.from_text(
         name="stiffening", coordinates=["q"], lagrangian="q_dot**2/2 - (1 + u)*q**2/2 - q**4/4", inputs=["u"]
@@ -184,7 +184,7 @@ def test_a_lane_whose_sweeps_fail_goes_on_alone_across_breakpoints():
     assert_allclose(runs.energy()[:, 4], run.energy(), rtol=1e-10)
 
 
-def test_threads_portions_and_every_change_nothing(pendulum):
+def test_threads_chunks_and_save_every_do_not_change_results(pendulum):
     stepper = compile_stepper(pendulum, SVI(3))
     inputs, told = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     given = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
@@ -197,7 +197,7 @@ def test_threads_portions_and_every_change_nothing(pendulum):
     assert_allclose(full.energy()[rows], fewer.energy(), rtol=0, atol=0)
 
 
-def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
+def test_files_contain_the_energies_of_each_segment(pendulum, tmp_path):
     stepper = compile_stepper(pendulum, SVI(3))
     w = np.outer(np.arange(COUNT), [0.0, 0.1])
     runs = stepper.integrate_ensemble(
@@ -225,7 +225,7 @@ def test_files_tell_the_energies_of_each_piece(pendulum, tmp_path):
         ({"h": 0.0}, "h"),
     ],
 )
-def test_what_is_refused(pendulum, change, said):
+def test_invalid_arguments_are_rejected(pendulum, change, said):
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3} | change
     with pytest.raises(StateError, match=said):
         compile_stepper(pendulum, SVI(3)).integrate_ensemble(*starts(1), **given)

@@ -67,7 +67,7 @@ class TestEqualsSingleTrajectories:
     @pytest.mark.covering
     @pytest.mark.parametrize("kind", KINDS)
     @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-    def test_for_systems_and_methods(self, kind: str, method: Method):
+    def test_ensemble_equals_single_runs_for_systems_and_methods(self, kind: str, method: Method):
         stepper = stepper_for(KINDS[kind], method)
         q, p = states(KINDS[kind], 3)
         result = stepper.integrate_ensemble(q, p, h=0.02, steps=60, save_every=20, t=0.3)
@@ -77,7 +77,7 @@ class TestEqualsSingleTrajectories:
         assert_equals_single_runs(stepper, result, 3e-13, steps=60, save_every=20, t=0.3)
 
     @pytest.mark.parametrize("count", [1, 7, 8, 9, 64])
-    def test_for_any_number_with_their_own_parameters(self, count: int):
+    def test_ensemble_equals_single_runs_for_any_number_and_parameters(self, count: int):
         stepper = stepper_for("kepler", SVI(5))
         q, p = states("kepler", count)
         result = stepper.integrate_ensemble(
@@ -87,7 +87,7 @@ class TestEqualsSingleTrajectories:
         assert len(result.t) == 14
         assert_equals_single_runs(stepper, result, 3e-13, steps=40, save_every=3)
 
-    def test_parameters_come_by_name_as_a_row_or_a_row_each(self):
+    def test_parameters_are_named_rows_or_one_row_per_trajectory(self):
         stepper = stepper_for("planar-pendulum", SVI(5))
         q, p = states("planar-pendulum", 3)
         each = stepper.integrate_ensemble(q, p, h=0.1, steps=5, parameters={"g": [1.0, 2.0, 3.0], "l": 2.0})
@@ -142,7 +142,7 @@ def kepler() -> Stepper:
 
 
 class TestFailures:
-    def test_a_trajectory_that_escapes_to_infinity_spoils_nobody(self):
+    def test_diverging_trajectory_does_not_affect_others(self):
         stepper = stepper_for("runaway", SVI(5))
         generator = np.random.default_rng(3)
         q, p = generator.uniform(-1.2, -0.8, (16, 1)), generator.uniform(-0.6, -0.4, (16, 1))
@@ -165,7 +165,7 @@ class TestFailures:
         assert np.isnan(result.energy()[reached:, 3]).all()
 
     @pytest.mark.parametrize("place", [3, 6])
-    def test_a_lane_that_never_starts_leaves_its_neighbours_alone(self, place: int):
+    def test_lane_that_fails_at_the_start_does_not_affect_others(self, place: int):
         """Between others, and as the last, whose place is filled up with copies: to roundings, as lanes that step
         together take as many sweeps as the slowest of them needs."""
         stepper = stepper_for("relativistic-particle", SVI(5))
@@ -179,7 +179,7 @@ class TestFailures:
         np.testing.assert_allclose(result.q[:, others], without.q, rtol=0, atol=1e-14)
         np.testing.assert_allclose(result.p[:, others], without.p, rtol=0, atol=1e-14)
 
-    def test_newton_goes_on_where_the_fixed_point_cannot(self):
+    def test_newton_continues_where_the_fixed_point_fails(self):
         stepper = stepper_for("harmonic-oscillator", SVI(5))
         q, p = states("harmonic-oscillator", 9)
         stiffness = {"k": np.where(np.arange(9) % 4 == 1, 1e6, 1.0)}
@@ -190,7 +190,7 @@ class TestFailures:
         calm = stepper.integrate_ensemble(q, p, h=0.5, steps=50, save_every=7)
         assert np.abs(result.q[:, others] - calm.q[:, others]).max() < 1e-13
 
-    def test_a_block_without_trajectories_left_stops(self):
+    def test_block_without_active_trajectories_stops(self):
         stepper = stepper_for("relativistic-particle", SVI(5))
         q, p = states("relativistic-particle", 8)
         nothing = dict.fromkeys(stepper.parameters, 0.0)
@@ -233,7 +233,7 @@ class TestThreadsAndInterruption:
         assert calls == sorted(calls)
         assert calls[-1] == 4000
 
-    def test_an_interruption_leaves_no_thread_and_keeps_what_was_done(self, kepler: Stepper):
+    def test_interrupt_ends_all_threads_and_returns_completed_states(self, kepler: Stepper):
         q, p = states("kepler", 64)
         work = Ensemble(kepler, q, p, h=0.05, steps=10**9, save_every=10**7)
 
@@ -322,7 +322,7 @@ class TestFiles:
             assert file["coordinates"].tolist() == ["q1", "q2"]
             assert file["parameter_names"].tolist() == ["mu"]
 
-    def test_csv_is_long_and_leaves_out_what_failed(self, result: EnsembleTrajectory, tmp_path):
+    def test_csv_has_long_format_and_omits_failures(self, result: EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.csv")
         assert (tmp_path / "runs.csv").read_text().startswith("trajectory,mu,t,q1,q2,p_q1,p_q2\n0,1,0,")
         table = np.loadtxt(tmp_path / "runs.csv", delimiter=",", skiprows=1)
@@ -332,7 +332,7 @@ class TestFiles:
             assert np.array_equal(rows[:, 3:5], result.q[: len(rows), j])
             assert set(rows[:, 1]) == {result.parameters[j, 0]}
 
-    def test_other_suffixes(self, result: EnsembleTrajectory, tmp_path):
+    def test_unknown_suffixes_are_rejected(self, result: EnsembleTrajectory, tmp_path):
         with pytest.raises(StateError, match=r"use \.npz, \.csv, \.h5"):
             result.save(tmp_path / "runs.txt")
 
@@ -351,7 +351,7 @@ def model(**changes: object) -> Model:
 
 
 class TestEnsembleFiles:
-    def test_a_grid_is_a_product_and_the_model_gives_the_rest(self, tmp_path):
+    def test_grid_is_a_product_and_the_model_supplies_the_rest(self, tmp_path):
         (tmp_path / "grid.toml").write_text(GRID)
         states = load_ensemble(tmp_path / "grid.toml", model())
         assert len(states) == 6
@@ -377,7 +377,7 @@ class TestEnsembleFiles:
         (tmp_path / "table.csv").write_text("q1\n0.5\n", encoding="utf-8-sig")
         assert load_ensemble(tmp_path / "table.csv", model()).q[:, 0].tolist() == [0.5]
 
-    def test_velocities_are_transformed_with_the_parameters_of_their_own(self, tmp_path):
+    def test_velocities_are_transformed_with_individual_parameters(self, tmp_path):
         (tmp_path / "table.csv").write_text("q,q_dot,m\n0.1,0.5,1.0\n0.1,0.5,3.0\n")
         pendulum = Model.from_problem(problem("planar-pendulum"))
         states = load_ensemble(tmp_path / "table.csv", pendulum)
@@ -452,7 +452,7 @@ class TestCommandLine:
         return CliRunner().invoke(main, ["run", *words.split()])
 
     @pytest.mark.parametrize("suffix", ["npz", "csv"])
-    def test_sums_up_and_writes(self, suffix: str):
+    def test_ensemble_command_prints_a_summary_and_writes_files(self, suffix: str):
         result = self.invoke(
             f"kepler --degree 4 --step 0.1 --steps 50 --save-every 10 --ensemble grid.toml -o runs.{suffix}"
         )
@@ -467,7 +467,7 @@ class TestCommandLine:
         else:
             assert len(Path("runs.csv").read_text().splitlines()) == 37
 
-    def test_failures_are_counted_and_the_rest_is_kept(self):
+    def test_failures_are_counted_and_others_saved(self):
         Path("table.csv").write_text("mu\n1\n1e9\n1.1\n")
         result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv -o runs.npz")
         assert result.exit_code == 0, result.output
@@ -477,7 +477,7 @@ class TestCommandLine:
         )
         assert Path("runs.npz").exists()
 
-    def test_nothing_but_failures_is_a_failure(self):
+    def test_failure_of_all_trajectories_is_a_failure(self):
         Path("table.csv").write_text("mu\n1e9\n")
         result = self.invoke("kepler --degree 4 --step 0.05 --steps 50 --ensemble table.csv")
         assert result.exit_code == 1
@@ -502,7 +502,7 @@ class TestCommandLine:
         assert result.exit_code == 2, result.output
         assert message in result.stderr
 
-    def test_an_interruption_keeps_what_was_done(self, monkeypatch: pytest.MonkeyPatch):
+    def test_interrupted_command_saves_completed_states(self, monkeypatch: pytest.MonkeyPatch):
         @contextmanager
         def once_some_have_begun(steps: int) -> Iterator[Callable[[int], None]]:
             yield lambda count: signal.raise_signal(signal.SIGINT) if count else None

@@ -31,7 +31,7 @@ def alone(kepler, j, **settings):
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("save_every", [1, 7])
-def test_each_is_the_trajectory_alone(kepler, threads, save_every):
+def test_each_trajectory_equals_the_single_run(kepler, threads, save_every):
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, save_every=save_every, threads=threads)
     assert runs.ok.all()
     for j, (t, q, p, status, steps) in enumerate(runs.each()):
@@ -59,13 +59,13 @@ def test_states_at_common_times_end_where_a_trajectory_does(kepler):
         assert np.array_equal(runs.q[times <= end, j], alone(kepler, j, t_eval=times[times <= end]).q)
 
 
-def test_back_in_time_with_parameters_of_each(kepler):
+def test_backward_in_time_with_individual_parameters(kepler):
     runs = kepler.integrate_ensemble(Q[:2], P[:2], t_end=-3.0, tolerance=TOLERANCE, parameters={"mu": [1.0, 1.2]})
     run = kepler.integrate(Q[1], P[1], t_end=-3.0, tolerance=TOLERANCE, parameters={"mu": 1.2})
     assert np.array_equal(runs.ends[1][1], run.q[-1])
 
 
-def test_one_that_fails_does_not_disturb_the_others(kepler):
+def test_failed_trajectory_does_not_affect_the_others(kepler):
     p = P.copy()
     p[1] = 0.0  # falls into the centre
     runs = kepler.integrate_ensemble(Q, p, t_end=ENDS, tolerance=TOLERANCE)
@@ -75,7 +75,7 @@ def test_one_that_fails_does_not_disturb_the_others(kepler):
     assert np.array_equal(runs.ends[1][3], alone(kepler, 3).q[-1])
 
 
-def test_an_interruption_keeps_what_was_done(kepler):
+def test_interrupt_returns_completed_states(kepler):
     class Enough(Exception):  # noqa: N818
         pass
 
@@ -123,7 +123,7 @@ def test_over_a_cluster(kepler):
         assert np.array_equal(getattr(here, name), getattr(there, name), equal_nan=True)
 
 
-def test_files_hold_the_times_of_each(kepler, tmp_path):
+def test_files_contain_individual_times(kepler, tmp_path):
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, save_every=5)
     runs.save(tmp_path / "e.csv")
     table = np.genfromtxt(tmp_path / "e.csv", delimiter=",", names=True)
@@ -151,7 +151,7 @@ def test_the_command_line_runs_a_grid(tmp_path, monkeypatch):
         assert (np.nanmax(file["times"], axis=0) == 9.0).all()
 
 
-def test_the_result_names_its_goals(kepler):
+def test_result_names_its_target_times(kepler):
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE)
     assert isinstance(runs, EnsembleTrajectory)
     assert [plan.t_end for plan in runs.plans] == ENDS

@@ -168,7 +168,7 @@ def test_hardly_any_root_of_polynomials_of_degree_eight_is_missed(polynomials):
 
 @settings(max_examples=200, deadline=None)
 @given(st.floats(0.15, 0.85), st.integers(1, 7), st.sampled_from([1.0, -1.0]))
-def test_pairs_of_roots_are_found_however_near(polynomials, middle, exponent, sign):
+def test_pairs_of_close_roots_are_found(polynomials, middle, exponent, sign):
     distance = 10.0**-exponent
     values = {"a": middle, "b": distance, "s": sign}
     found = polynomials.integrate([0.0], [1.0], h=1.0, steps=1, parameters=values).events[5]
@@ -205,7 +205,7 @@ def test_a_graze_is_two_crossings_or_none():
         assert np.abs(below - turn.t[0]).max() == pytest.approx(math.sqrt(2 * depth / math.sin(top)), 1e-3)
 
 
-def test_several_functions_of_one_step_come_in_their_order_and_ends_are_not_doubled():
+def test_several_events_of_one_step_are_ordered_without_duplicates():
     functions = ["t - 0.25", "t - 0.5", "t - 0.75", "(t - 0.5)*(t - 1)"]
     run = compile_stepper(FREE, SVI(2), flags=FLAGS).integrate([0.0], [1.0], h=0.25, steps=8, events=functions)
     assert [found.t.tolist() for found in run.events] == [[0.25], [0.5], [0.75], [0.5, 1.0]]
@@ -217,7 +217,7 @@ def test_a_root_at_the_start_is_none_and_one_at_the_end_is_found():
     assert [found.t.tolist() for found in run.events] == [[], [2.0], []]
 
 
-def test_more_crossings_than_one_call_has_room_for(pendulum):
+def test_more_crossings_than_the_buffer_of_one_call(pendulum):
     run = pendulum.integrate([0.1], [0.0], h=0.5, steps=3000, events=["sin(8*t)", "cos(8*t)"])
     for found, first in zip(run.events, (0.0, 0.5), strict=True):
         expected = math.pi / 8 * np.arange(first, 1500 * 8 / math.pi)
@@ -256,7 +256,7 @@ def test_a_terminal_event_ends_the_run_at_its_crossing(pendulum, save_every):
     assert run.events[0].t[-1] < last.t[-1]
 
 
-def test_the_run_stands_before_the_step_in_which_it_was_ended(pendulum):
+def test_run_ends_before_the_step_of_the_terminal_event(pendulum):
     run = pendulum.with_events(Event("q", terminal=True)).start([0.5], [0.0], h=0.1)
     first = run.record(400)
     assert run.t == first.t[-2]
@@ -273,7 +273,7 @@ def test_a_run_from_a_crossing_does_not_find_it_again(pendulum):
     assert np.abs(found - whole).max() < 1e-11
 
 
-def test_a_terminal_event_before_a_step_that_fails_is_met():
+def test_terminal_event_before_a_failing_step_is_found():
     runaway = LagrangianSystem.from_text(name="runaway", coordinates=["q"], lagrangian="q_dot**2/2 + q**3/3")
     stepper = compiled_plainly(runaway, SVI(3))
     with pytest.raises(StepFailedError) as failure:
@@ -321,7 +321,7 @@ def test_hamiltonians_call_their_momenta_as_they_like():
     assert np.abs(run.events[2].t - expected[1].t).max() < 1e-12
 
 
-def test_point_vortices_have_no_velocity_kernel_of_their_own():
+def test_point_vortices_have_no_velocity_kernel():
     vortices = problem("point-vortices")
     stepper = compiled_plainly(vortices.system, SVI(3))
     name = stepper.coordinates[0]
@@ -355,7 +355,7 @@ def test_sympy_expressions_in_functions_of_time():
         ("log(q)", EventError, "not finite"),
     ],
 )
-def test_errors_say_which_symbol_or_function(pendulum, event, error, words):
+def test_errors_name_the_symbol_or_function(pendulum, event, error, words):
     with pytest.raises(error, match=words):
         pendulum.integrate([0.5], [0.0], h=0.1, steps=100, events=event)
 
@@ -366,7 +366,7 @@ def test_events_are_checked(arguments, error):
         Event("q", **arguments)
 
 
-def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
+def test_stepper_with_events_is_pickled(pendulum):
     watched = pickle.loads(pickle.dumps(pendulum.with_events([Event("q", 1), "p_q"])))
     assert watched.events == (Event("q", 1), Event("p_q"))
     assert [len(found) for found in watched.integrate([0.5], [0.0], h=0.1, steps=200).events] == [3, 6]
@@ -384,7 +384,7 @@ def test_a_stepper_with_events_is_pickled_and_keeps_them(pendulum):
         ("double-pendulum", SCVI(2), ["t*theta1_dot", "sqrt(1 + theta2**2)**-5 - p_theta1"]),
     ],
 )
-def test_the_text_is_the_plain_one_and_more_and_strict_compilers_take_it(compiler, name, method, events, tmp_path):
+def test_source_with_events_extends_the_plain_one_without_warnings(compiler, name, method, events, tmp_path):
     needs(compiler)
     system = problem(name).system
     plain, _ = generate_source(system, method, prefix="watched")
@@ -445,7 +445,7 @@ def thrown(request):
 @pytest.mark.filterwarnings("ignore::scvi_codegen.AccuracyWarning")
 @pytest.mark.parametrize(("floor", "error"), [(0.0, 1e-12), (1000.0, 2e-5)])
 @pytest.mark.parametrize("h", [0.1, -0.02])
-def test_a_ball_that_comes_to_rest_bounces_until_its_crossings_accumulate(thrown, floor, error, h):
+def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h):
     """Times of bounces form a geometric series; hops get shorter than rounding before its end."""
     ball, _, (height, *_) = thrown
     restitution, fall = 0.5, math.sqrt(2.0 / 9.81)
@@ -471,7 +471,7 @@ def test_a_ball_that_comes_to_rest_bounces_until_its_crossings_accumulate(thrown
 
 @pytest.mark.parametrize("t0", [0.0, 7e4])
 @pytest.mark.parametrize(("h", "start", "velocity"), CORNERS)
-def test_walls_met_in_a_corner_are_both_found(thrown, t0, h, start, velocity):
+def test_walls_hit_in_a_corner_are_both_found(thrown, t0, h, start, velocity):
     """A puck in a square that hits corners exactly: its paths are folded straight lines."""
     _, puck, (_, x, y) = thrown
     h = min(h, 0.5) if "[" in x else h  # of arrays, ends of steps alone are looked at
@@ -488,7 +488,7 @@ def test_walls_met_in_a_corner_are_both_found(thrown, t0, h, start, velocity):
     assert corners >= 2
 
 
-def test_crossings_of_a_step_come_by_their_fractions_where_their_times_tie():
+def test_simultaneous_crossings_are_ordered_within_the_step():
     """An ulp of t = 1e12 is 1.2e-4 long: the wall behind the other is met 1e-6 later."""
     stepper = compiled_plainly(FREE, SVI(2))
     events = [Event("q - 1.000001", terminal=True), Event("q - 1", terminal=True)]
@@ -497,7 +497,7 @@ def test_crossings_of_a_step_come_by_their_fractions_where_their_times_tie():
     assert abs(run.q[-1, 0] - 1.0) < 1e-15
 
 
-def test_the_same_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """And those of many calls do not fill the memory."""
     system = LagrangianSystem.from_text(name="falling", coordinates=["q"], lagrangian="q_dot**2/2 - q")
     stepper = compile_stepper(system, "svi:2")

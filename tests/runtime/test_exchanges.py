@@ -47,14 +47,14 @@ def test_impulses_are_exact_and_work_is_of_the_order_of_the_method(thrown, metho
     assert np.log2(coarse[0] / fine[0]) > method.order - 0.4
 
 
-def test_shooting_keeps_the_account_to_the_order_of_its_curve(thrown):
+def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
     stepper = compile_stepper(thrown, SCVI(2))
     coarse, fine = balance(stepper, 0.1), balance(stepper, 0.05)
     assert np.log2(coarse[0] / fine[0]) > 2.8
     assert np.log2(coarse[1] / fine[1]) > 2.8
 
 
-def test_hamiltonians_sweeps_and_parameters(thrown):
+def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
     """The same account from H; sweeps borrow the iteration; parameters and time are those of the run."""
     hamiltonian = HamiltonianSystem.from_text(
         name="thrown",
@@ -80,7 +80,7 @@ def test_hamiltonians_sweeps_and_parameters(thrown):
     assert run.work()[-1] == pytest.approx(float(weights @ power) * 0.02 / 3.0, abs=1e-7)  # Simpson's rule
 
 
-def test_steps_between_and_steps_that_choose_their_length(thrown):
+def test_work_balance_with_dense_output_and_adaptive_steps(thrown):
     stepper = compile_stepper(thrown, SVI(4))
     start = ([1.0, 0.0], [0.0, 1.1])
     save_every, some = (stepper.integrate(*start, h=0.05, steps=40, save_every=n) for n in (1, 8))
@@ -95,7 +95,7 @@ def test_steps_between_and_steps_that_choose_their_length(thrown):
         stepper.integrate(*start, t_end=2.0, t_eval=[0.3, 1.1]).work()
 
 
-def test_who_keeps_no_account(thrown):
+def test_unsupported_systems_have_no_work_balance(thrown):
     free = LagrangianSystem.from_text(name="oscillator", lagrangian="x_dot**2/2 - x**2/2", coordinates=["x"])
     with pytest.raises(MethodError, match="work and impulses are unavailable"):
         compile_stepper(free, SVI(2)).integrate([1.0], [0.0], h=0.1, steps=2).work()
@@ -104,7 +104,7 @@ def test_who_keeps_no_account(thrown):
         stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2).impulses()
 
 
-def test_without_newtons_iteration_there_is_an_error_and_not_a_missing_function(thrown):
+def test_missing_newton_iteration_is_an_error_message(thrown):
     stepper = compile_stepper(thrown, SVI(3), solver="fixed-point")
     run = stepper.integrate([1.0, 0.0], [0.0, 1.1], h=0.1, steps=2)
     with pytest.raises(MethodError, match="requires Newton's method"):

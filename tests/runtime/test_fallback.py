@@ -62,12 +62,12 @@ def outcome(stepper, start, h, **more):
 @each_method
 @pytest.mark.parametrize("h", [0.02, LONG, 0.3])
 @pytest.mark.parametrize("events", [{}, {"events": "sin(theta1)"}], ids=["plain", "events"])
-def test_what_is_borrowed_gives_the_bits_of_ones_own(method, h, events, start):
+def test_fallback_library_gives_equal_bits(method, h, events, start):
     borrowing, owning = both(method)
     assert outcome(borrowing, start, h, **events) == outcome(owning, start, h, **events)
 
 
-def test_the_error_of_a_borrowed_step_is_that_of_ones_own(start):
+def test_error_estimate_of_a_fallback_step_is_equal(start):
     errors = []
     for stepper in both(SVI(4)):
         run = stepper.start(*start, h=LONG)
@@ -93,7 +93,7 @@ def test_newtons_iteration_is_compiled_once_it_is_needed(start, monkeypatch):
     assert built == ["late"] * 2
 
 
-def test_the_discrete_lagrangian_is_that_of_the_lender(start):
+def test_discrete_lagrangian_comes_from_the_fallback_library(start):
     borrowing, owning = both(SVI(4))
     assert "discrete_legendre" not in borrowing.source.declarations
     q, _ = start
@@ -109,12 +109,12 @@ def test_threads_may_all_be_the_first_to_need_it(start):
     assert found[0] == outcome(stepper, start, LONG)
 
 
-def test_a_copy_in_another_process_borrows_too(start):
+def test_copy_in_another_process_uses_the_fallback(start):
     borrowing, owning = both(SVI(4))
     assert outcome(pickle.loads(pickle.dumps(borrowing)), start, LONG) == outcome(owning, start, LONG)
 
 
-def test_a_recorded_run_goes_on_with_what_it_borrowed(start, tmp_path):
+def test_recorded_run_continues_with_its_fallback(start, tmp_path):
     borrowing, owning = both(SVI(4))
     expected = owning.start(*start, h=LONG).record(60)
     record_run(borrowing.start(*start, h=LONG), tmp_path / "run", steps=20)
@@ -123,7 +123,7 @@ def test_a_recorded_run_goes_on_with_what_it_borrowed(start, tmp_path):
     assert np.array_equal(whole.iterations, expected.iterations)
 
 
-def test_low_words_do_not_depend_on_how_a_run_is_cut():
+def test_low_words_do_not_depend_on_the_split_of_a_run():
     """Those of a step by sweeps are not those of the next one by Newton's iteration, in one call as in many."""
     stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)
     whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
@@ -133,7 +133,7 @@ def test_low_words_do_not_depend_on_how_a_run_is_cut():
     assert whole.checkpoint() == cut.checkpoint()
 
 
-def test_a_run_that_fails_stands_before_the_step(start):
+def test_failed_run_ends_before_the_step(start):
     borrowing, _ = both(SVI(4))
     run = borrowing.start(*start, h=40.0)
     before = run.checkpoint()

@@ -65,7 +65,7 @@ def recorded(seed=None):
     return values if seed is None else values + NOISE * np.random.default_rng(seed).normal(size=values.shape)
 
 
-def test_without_noise_the_truth_is_found():
+def test_noise_free_data_give_the_true_values():
     found = fit(oscillator(), TIMES, recorded()[0], unknown=SOME, **GUESS)
     assert found.names == (*SOME, "x", "p_x")
     assert_allclose(found.values, [TRUE[name] for name in SOME] + [0.8, 0.1], rtol=1e-9)
@@ -90,7 +90,7 @@ def test_values_and_errors_are_those_of_curve_fit():
     assert "alpha = " in str(found)
 
 
-def test_errors_are_as_large_as_the_covariance_says():
+def test_standard_errors_agree_with_the_covariance():
     """The sum of squares of 5 errors, in their own deviations, over 20 series of noise: chi squared, 100 +- 14."""
     true, total = np.array([*(TRUE[name] for name in SOME), 0.8, 0.1]), 0.0
     for seed in range(20):
@@ -100,7 +100,7 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert 58.0 < total < 142.0
 
 
-def test_several_quantities_with_gaps_and_noise_of_their_own():
+def test_several_quantities_with_gaps_and_individual_noise():
     both = recorded(2).T.copy()
     both[:, 1] += 9 * NOISE * np.random.default_rng(3).normal(size=len(TIMES))
     both[::7, 0] = np.nan
@@ -115,7 +115,7 @@ def test_several_quantities_with_gaps_and_noise_of_their_own():
     assert held.values[2] == pytest.approx(0.25, abs=1e-6)
 
 
-def test_a_known_start_and_inputs_that_are_data():
+def test_fit_with_known_start_and_tabulated_inputs():
     """The cart is pushed as measured; what is known is not found."""
     system = LagrangianSystem.from_text(
         name="pushed",
@@ -159,12 +159,12 @@ def test_a_known_start_and_inputs_that_are_data():
         ),
     ],
 )
-def test_what_the_measurements_do_not_tell_is_named(options, message):
+def test_unidentifiable_parameters_are_named(options, message):
     with pytest.raises(FitError, match=message):
         fit(oscillator(), TIMES, recorded(5)[0], **(GUESS | options))
 
 
-def test_two_measurements_do_not_tell_five_unknowns():
+def test_two_measurements_do_not_determine_five_unknowns():
     with pytest.raises(FitError, match="2 measurements do not determine 5 unknowns"):
         fit(oscillator(), TIMES[:2], recorded()[0][:2], unknown=SOME, **GUESS)
 
@@ -195,12 +195,12 @@ def test_two_measurements_do_not_tell_five_unknowns():
         ({"h": 0.0}, "the step size h is 0"),
     ],
 )
-def test_what_is_wrong_is_named(options, message):
+def test_invalid_arguments_are_named(options, message):
     with pytest.raises(StateError, match=message):
         fit(oscillator(), TIMES, recorded()[0], **(GUESS | {"unknown": SOME} | options))
 
 
-def test_steps_that_tell_an_unknown_are_too_long():
+def test_biased_parameters_warn_of_too_long_steps():
     """Of second order, by long steps: what is found is off by twelve of the errors claimed, and said to be."""
     soft = LagrangianSystem.from_text(
         name="hard",
@@ -231,14 +231,14 @@ def test_a_guess_beyond_which_motions_fail_is_a_guess():
         fit(stepper, run.t, run.q[:, 0], q=[2.0], p=[0.0], h=0.1)
 
 
-def test_what_is_measured_is_finite_or_missing():
+def test_measurements_are_finite_or_missing():
     values = recorded()[0].copy()
     values[3] = np.inf
     with pytest.raises(StateError, match="a value in measured is infinite"):
         fit(oscillator(), TIMES, values, unknown=SOME, **GUESS)
 
 
-def test_a_measurement_at_the_start_tells_the_state_alone():
+def test_measurement_at_the_start_determines_the_state():
     """No step is taken: the state is what was measured, and parameters are not told."""
     known = {"q": [0.7], "p": [0.2], "h": 0.1}
     with pytest.raises(FitError, match="do not determine delta: they do not depend on it"):
@@ -247,7 +247,7 @@ def test_a_measurement_at_the_start_tells_the_state_alone():
     assert_allclose(found.values, [0.5, 0.4], rtol=1e-12)
 
 
-def test_what_a_bound_holds_has_no_error_and_the_others_that_of_a_known_one():
+def test_parameter_at_a_bound_has_no_standard_error():
     """As if it were no unknown: nothing else is known of their errors to first order."""
     bound = {"alpha": (-0.95, 0.0)}
     found = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
@@ -269,7 +269,7 @@ def test_times_ascend_and_constraints_are_not_fitted():
         fit(bars, [0.0, 0.1], np.zeros((2, 4)), q=[0, 1, 1.94, 1.5], p=np.zeros(4), h=0.1)
 
 
-def test_a_search_that_ends_nowhere_says_so(monkeypatch):
+def test_search_without_convergence_is_reported(monkeypatch):
     search = partial(scipy.optimize.least_squares, max_nfev=1)
     monkeypatch.setattr(scipy.optimize, "least_squares", search)
     with pytest.raises(FitError, match=r"least squares did not converge: .* Give a better initial guess"):
@@ -330,7 +330,7 @@ def test_segments_find_what_one_finds():
     assert_allclose(momenta.values[:3], [TRUE[name] for name in SOME], atol=0.05)
 
 
-def test_segments_with_a_known_start_and_inputs():
+def test_segments_with_known_start_and_inputs():
     system = LagrangianSystem.from_text(
         name="pushed",
         coordinates=["x"],
@@ -404,7 +404,7 @@ def kepler():
 @pytest.mark.parametrize(
     ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]
 )
-def test_what_is_told_does_not_depend_on_units(length, time, segments):
+def test_diagnosis_does_not_depend_on_units(length, time, segments):
     """Not even where slopes by mu, q and p are 10^30 apart; nor are data without noise a fault of the steps."""
     units = [length**3 / time**2, 1 / time**2, *[length] * 3, *[length / time] * 3]
     true = np.array([1.0, 1.0, 1.0, 0.0, 0.2, 0.0, 0.8, 0.1])
@@ -420,7 +420,7 @@ def test_what_is_told_does_not_depend_on_units(length, time, segments):
         fit(kepler(), t, q[:, :2], observed=["x", "y"], parameters=[1.01 * mu, k], **guess)
 
 
-def test_what_segments_do_not_have():
+def test_unsupported_arguments_of_segments():
     with pytest.raises(StateError, match="segments"):
         fit(oscillator(), TIMES, recorded()[0], segments=0, unknown=SOME, **GUESS)
     with pytest.raises(FitError, match=r"do not join, .* as known"):

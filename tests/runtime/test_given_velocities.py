@@ -20,7 +20,7 @@ def pendulum_on_cart():
     return compile_stepper(problem("cart-pole").system, "svi:2", flags=QUICK_FLAGS)
 
 
-def test_velocities_stand_for_momenta_with_the_parameters_and_the_time_of_the_run():
+def test_velocities_are_converted_with_the_parameters_and_time_of_the_run():
     stepper = pendulum_on_cart()
     name = stepper.parameters[0]
     given = {"parameters": {name: 2.5}, "t": 0.7, "h": 0.01}
@@ -81,7 +81,7 @@ def test_velocities_of_momenta_that_are_not_linear_are_found_to_round_off():
         assert np.abs(stepper.momentum(p, c * p / energy) - p).max() < 16 * 2.0**-52 * condition * np.abs(p).max()
 
 
-def test_ensembles_take_velocities_each_with_its_parameters():
+def test_ensembles_accept_velocities_with_individual_parameters():
     stepper = pendulum_on_cart()
     q, v, name = np.array([Q, [0.2, 0.1]]), np.array([V, [0.5, 0.6]]), stepper.parameters[0]
     settings = {"h": 0.01, "steps": 20, "t": 0.7}
@@ -94,7 +94,7 @@ def test_ensembles_take_velocities_each_with_its_parameters():
         stepper.integrate_ensemble(q, velocity=V, **settings)
 
 
-def test_motions_take_velocities_and_the_arguments_of_solve_ivp():
+def test_solve_ivp_accepts_velocities_and_scipy_arguments():
     stepper = pendulum_on_cart()
     values = [2.0 * value for value in stepper.defaults]
     given = {"t_span": (0.0, 1.0), "h": 0.1}
@@ -121,7 +121,7 @@ def test_velocities_and_momenta_of_many_states():
     assert stepper.velocity(q, p, t) == pytest.approx(v, rel=1e-14, abs=1e-15)
 
 
-def test_one_of_both_is_wanted():
+def test_exactly_one_of_momenta_and_velocities_is_required():
     stepper = pendulum_on_cart()
     with pytest.raises(StateError, match="give either p or velocity"):
         stepper.integrate(Q, h=0.1, steps=1)
@@ -148,7 +148,7 @@ def test_names_are_methods(name, method):
 
 
 @pytest.mark.parametrize("name", ["svy", "svi:", "svi:x", "svi:0", "svi:-3", "stoermer-verlet:3", "", "svi:2:3", 3])
-def test_what_is_no_name_is_refused(name):
+def test_invalid_names_are_rejected(name):
     with pytest.raises(MethodError):
         as_method(name)
     with pytest.raises(MethodError):

@@ -270,13 +270,13 @@ def check_bounds(name, error):
 class TestEstimatesBoundTheTrueError:
     @pytest.mark.parametrize("error", [1e-5, 1e-9])
     @pytest.mark.parametrize("name", QUICK)
-    def test_of_some_systems(self, name, error):
+    def test_estimates_bound_errors_of_selected_systems(self, name, error):
         check_bounds(name, error)
 
     @pytest.mark.full
     @pytest.mark.parametrize("error", [1e-3, 1e-6, 1e-8, 1e-10, 1e-12])
     @pytest.mark.parametrize("name", CASES)
-    def test_of_all_systems(self, name, error):
+    def test_estimates_bound_errors_of_all_systems(self, name, error):
         check_bounds(name, error)
 
 
@@ -316,7 +316,7 @@ class TestChaos:
             burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, **more)
 
     @pytest.mark.filterwarnings("error")
-    def test_it_does_not_where_it_is_told_not_to_or_goes_on_for_less(self, burrau_stepper):
+    def test_short_or_unchecked_runs_do_not_warn(self, burrau_stepper):
         burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
         burrau_stepper.integrate(*PYTHAGOREAN, t_end=3.0)
 
@@ -331,7 +331,7 @@ class TestChaos:
         other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
         assert np.array_equal(one.q, other.q)
 
-    def test_long_runs_are_checked_up_to_a_limit_or_as_a_whole(self):
+    def test_long_runs_are_checked_up_to_a_limit_or_completely(self):
         """Duffing's oscillator with two wells, chaotic after t = 1000 alone."""
         late = "(1 + tanh(t - 1000))/2"
         wells = f"{late}*(x**2 - x**4/4 + x*cos(t)/2)"
@@ -367,7 +367,7 @@ class TestWhatIsRefused:
             ({"h": 0.1, "steps": 10, "error": None, "check_growth": True}, "requires adaptive steps"),
         ],
     )
-    def test_what_does_not_go_together(self, kepler_stepper, given, message):
+    def test_contradictory_arguments_are_rejected(self, kepler_stepper, given, message):
         with pytest.raises(sc.StateError, match=message):
             kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
 
@@ -378,14 +378,14 @@ class TestWhatIsRefused:
 
 
 class TestOtherRuns:
-    def test_without_error_nothing_is_confirmed(self, kepler_stepper):
+    def test_without_error_argument_nothing_is_confirmed(self, kepler_stepper):
         run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
         assert run.confirmation is None
         assert run.confirmed_digits is None
         assert math.isnan(run.global_error)
         assert math.isnan(run.confirmed_until)
 
-    def test_kept_states_and_events(self, kepler_stepper):
+    def test_saved_states_and_events_are_confirmed(self, kepler_stepper):
         start = {"q": [1.6, 0.0], "p": [0.0, 0.5]}
         at = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, t_eval=[10.0, 30.0])
         assert at.t.tolist() == [10.0, 30.0] == at.confirmation.t.tolist()
@@ -480,14 +480,14 @@ class TestSolveMotion:
         assert np.abs(motion.y[:2].T - exact[:, :2]).max() <= 1.6 * motion.trajectory.global_error
         assert motion.trajectory.global_error <= 1e-8
 
-    def test_what_is_not_confirmed_is_no_success(self, burrau_stepper):
+    def test_unconfirmed_result_is_not_a_success(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning, match="confirmed until"):
             motion = sc.solve_ivp(burrau_stepper, (0.0, 30.0), np.concatenate(PYTHAGOREAN), error=1e-9)
         assert not motion.success
         assert motion.status == -2
         assert "is confirmed only until t = " in motion.message
 
-    def test_beside_another_choice_of_steps(self, kepler_stepper):
+    def test_error_argument_excludes_other_step_arguments(self, kepler_stepper):
         with pytest.raises(sc.StateError, match="error=1e-08 and rtol=1e-06 both determine the step size"):
             sc.solve_ivp(kepler_stepper, (0.0, 1.0), [1.6, 0.0, 0.0, 0.5], error=1e-8, rtol=1e-6)
 
@@ -498,7 +498,7 @@ def loaded(path):
 
 
 class TestCommandLine:
-    def test_words_and_json_agree_with_the_states(self, tmp_path):
+    def test_text_and_json_agree_with_the_states(self, tmp_path):
         words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", str(tmp_path / "orbit.npz")]
         told = CliRunner().invoke(main, words)
         document = json.loads(CliRunner().invoke(main, [*words, "--json"]).stdout)
@@ -511,7 +511,7 @@ class TestCommandLine:
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
         assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, kept["t"][-1])
 
-    def test_what_is_not_confirmed_ends_with_1(self):
+    def test_unconfirmed_result_exits_with_1(self):
         result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
         assert result.exit_code == 1
         assert re.search(r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+", result.output)
@@ -579,7 +579,7 @@ class TestCommandLine:
         assert result.exit_code == 2
         assert message in result.output
 
-    def test_generated_folders_keep_it(self, tmp_path):
+    def test_generated_folders_contain_the_error_argument(self, tmp_path):
         model = sc.load_model(self._kepler(tmp_path))
         folder = sc.generate_package(model, tmp_path / "orbit")
         assert sc.load_model(folder / "model.toml").error == 1e-9
@@ -591,14 +591,14 @@ class TestCommandLine:
         return path
 
     @pytest.mark.parametrize("other", ["--tolerance", "--advise"])
-    def test_one_choice_of_steps_alone(self, other):
+    def test_step_size_arguments_are_exclusive(self, other):
         result = CliRunner().invoke(main, ["run", "kepler", "--error", "1e-9", other, "1e-9"])
         assert result.exit_code == 2
         assert "exclude each other" in result.output
 
 
 @pytest.mark.parametrize("power", [-660, 660])
-def test_global_errors_of_linear_systems_know_no_size(power):
+def test_global_errors_of_linear_systems_are_scale_invariant(power):
     """Squares of such states overflow, or are 0."""
     stepper = sc.compile_stepper(made("oscillator", ["q"], "q_dot**2/2 - q**2/2"), "svi:4")
     one, other = (stepper.integrate([size], [0.0], t_end=3.0, error=1e-8) for size in (1.0, 2.0**power))

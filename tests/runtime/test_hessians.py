@@ -75,7 +75,7 @@ def test_the_hessian_of_a_function_of_all_states(stepper, save_every):
 @pytest.mark.parametrize(
     "options", [{"h": None, "steps": None, "t_end": 4.0}, {"h": -0.07}], ids=["own lengths", "back"]
 )
-def test_it_is_the_derivative_of_the_gradient_of_any_run_of_steps(stepper, options):
+def test_hessian_is_the_derivative_of_the_gradient(stepper, options):
     """As a symmetric form: v . H w = w . H v, and as the change of all states along two directions."""
     run = run_from(stepper, START, **options)
     weights, bends = square(len(run), 1)
@@ -86,7 +86,7 @@ def test_it_is_the_derivative_of_the_gradient_of_any_run_of_steps(stepper, optio
     assert v[:-1] @ found[:, 1] == pytest.approx(w[:-1] @ found[:, 0], rel=1e-11)
 
 
-def test_many_directions_are_as_good_as_each_alone(stepper):
+def test_many_directions_equal_single_directions(stepper):
     """More of them than are taken through a step at once."""
     run = run_from(stepper, START)
     weights, bends = square(len(run), 3)
@@ -99,7 +99,7 @@ def test_many_directions_are_as_good_as_each_alone(stepper):
             assert_allclose(np.asarray(getattr(many, name))[..., k], getattr(alone, name), rtol=1e-12, atol=1e-12)
 
 
-def test_a_long_run_has_the_hessian_of_its_pieces(stepper):
+def test_hessian_of_a_long_run_equals_that_of_its_segments(stepper):
     """More steps than are linearised at a time, with all states and with few."""
     weights, bends = square(2501, 3)
     weights[np.arange(2501) % 500 > 0] = 0.0
@@ -110,7 +110,7 @@ def test_a_long_run_has_the_hessian_of_its_pieces(stepper):
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
-def test_the_energy_of_a_motion_at_its_end_bends_as_at_its_start():
+def test_hessian_of_the_energy_at_the_end_equals_that_at_the_start():
     """By a high order its Hessian at the end, pulled back, is that at the start: a closed form."""
     stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
@@ -123,14 +123,14 @@ def test_the_energy_of_a_motion_at_its_end_bends_as_at_its_start():
     assert_allclose(found.p, [[0.0, 1 / (m * length**2)]], atol=1e-7)
 
 
-def test_directions_of_all_that_is_given_go_forward_alone_too(stepper):
+def test_directions_of_all_arguments_are_propagated_forward(stepper):
     run = run_from(stepper, START)
     found, whole = run.tangent(np.eye(stepper._input_size)), run.sensitivity()
     assert_allclose(found[:, :, 2:-2], whole.parameters, rtol=1e-13, atol=1e-13)
     assert_allclose(found[:, :, -1], whole.h, rtol=1e-13, atol=1e-13)
 
 
-def test_a_stepper_that_was_sent_keeps_what_was_derived(stepper):
+def test_pickled_stepper_retains_second_derivatives(stepper):
     run = run_from(stepper, START)
     expected = stacked(run.hessian_product(np.ones((61, 2)), [1.0, 0.0]))
     again = run_from(pickle.loads(pickle.dumps(stepper)), START)
@@ -144,7 +144,7 @@ def test_a_run_without_steps_has_the_hessian_of_the_function(stepper):
     assert_allclose(np.concatenate([found.q, found.p]), bends[0])
 
 
-def test_what_has_no_hessian(stepper):
+def test_systems_without_a_hessian_are_rejected(stepper):
     run = run_from(stepper, START)
     with pytest.raises(StateError, match=r"cotangents of one function must have shape \(61, 2\)"):
         run.hessian_product(np.zeros((61, 2, 3)), [1.0, 0.0])
@@ -158,7 +158,7 @@ def test_what_has_no_hessian(stepper):
         clocked.integrate(kepler.q, [0.0, 1.0], h=0.1, steps=3).hessian_product(np.ones((4, 4)), np.ones(4))
 
 
-def test_of_damped_systems_there_are_first_derivatives_alone():
+def test_damped_systems_have_first_derivatives_only():
     system = damped_pendulum()
     state = [1.0] * system.dimension, [0.0] * system.dimension
     run = compile_stepper(system, "svi:2").integrate(*state, h=0.1, steps=3)

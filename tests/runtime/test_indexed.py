@@ -97,7 +97,7 @@ CASES = {
 @pytest.mark.covering
 @pytest.mark.parametrize("method", ["svi:4", "gauss:2", "sc:5", "svi:9", "stoermer-verlet", "composition:8"])
 @pytest.mark.parametrize("name", CASES)
-def test_as_written_out(name: str, method: str) -> None:
+def test_array_system_equals_the_unrolled_system(name: str, method: str) -> None:
     """States, energies, momentum maps and errors of steps are those of the system written out, to round-off."""
     each = CASES[name]
     own = sc.compile_indexed(each.system, method).integrate(
@@ -123,7 +123,7 @@ def test_as_written_out(name: str, method: str) -> None:
 
 
 @pytest.mark.parametrize("method", ["svi:4", "gauss:3", "svi:9"])
-def test_a_hamiltonian_as_written_out(method: str) -> None:
+def test_hamiltonian_array_system_equals_the_unrolled_system(method: str) -> None:
     """The discrete nonlinear Schroedinger equation on a net; its norm, an angular momentum of all phases, is kept."""
     field = sc.IndexedSystem.from_text(
         name="field",
@@ -154,7 +154,7 @@ def test_a_hamiltonian_as_written_out(method: str) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
-def test_one_library_serves_every_size(count: int) -> None:
+def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
     stepper = sc.compile_indexed(
         sc.IndexedSystem.from_text(
@@ -208,7 +208,7 @@ def test_energy_has_the_terms_without_coordinates(method: str) -> None:
     assert np.ptp(other.energy()) > 0.05
 
 
-def test_runs_go_on() -> None:
+def test_consecutive_runs_equal_one_run() -> None:
     """So many steps at once or one after the other give the same bits; a stepper survives a pickle."""
     each = CASES["bodies"]
     stepper = pickle.loads(pickle.dumps(sc.compile_indexed(each.system, "svi:4")))
@@ -223,7 +223,7 @@ def test_runs_go_on() -> None:
 
 
 @pytest.mark.parametrize("method", ["svi:4", "composition:8"])
-def test_a_saved_run_goes_on(method: str) -> None:
+def test_restored_run_continues_bitwise(method: str) -> None:
     """To the bit, with its tables and parameters; other bytes are refused."""
     each = CASES["net"]
     stepper = sc.compile_indexed(each.system, method)
@@ -242,7 +242,7 @@ def test_a_saved_run_goes_on(method: str) -> None:
         sc.compile_indexed(each.system, "svi:2").from_checkpoint(run.checkpoint())
 
 
-def test_observed_runs_keep_what_is_asked_for() -> None:
+def test_observed_runs_save_the_requested_quantities() -> None:
     """And the first and the last state."""
     each = CASES["ring"]
     stepper = sc.compile_indexed(each.system, "svi:2")
@@ -262,7 +262,7 @@ def test_observed_runs_keep_what_is_asked_for() -> None:
         (lambda run: np.zeros(run.steps), r"keep its shape: \(1,\) at t = 0.1, \(0,\) before"),
     ],
 )
-def test_observations_that_cannot_be_kept_are_refused(observe: Any, message: str) -> None:
+def test_unsupported_observations_are_rejected(observe: Any, message: str) -> None:
     """By name, not by NumPy, and not as NaN."""
     each = CASES["ring"]
     with pytest.raises(sc.StateError, match=message):
@@ -342,7 +342,7 @@ def test_energies_are_drawn() -> None:
         ({"x": np.zeros((3, 3))}, {"tables": {"bonds": [[0, 1]]}}, "there is no 'x' in positions"),
     ],
 )
-def test_what_does_not_fit_is_refused(q: Any, given: dict[str, Any], message: str) -> None:
+def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message: str) -> None:
     """Before anything is done."""
     net = sc.IndexedSystem.from_text(
         name="net",
@@ -372,7 +372,7 @@ def test_failures() -> None:
         sc.compile_indexed(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)
 
 
-def test_an_index_leaves_no_table() -> None:
+def test_index_out_of_range_of_a_table_is_rejected() -> None:
     """A loop over another size than the table's rows, found before a row is read."""
     system = sc.IndexedSystem.from_text(
         name="x",
@@ -389,7 +389,7 @@ def test_an_index_leaves_no_table() -> None:
 
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_sweeps_contract_up_to_the_steps_that_are_told(form: str, method: str, most: float) -> None:
+def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method: str, most: float) -> None:
     """Of an oscillator, also where positions or momenta pass through 0; its energy is kept."""
     formulas = {
         "lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
@@ -418,7 +418,7 @@ FORCED = sc.IndexedSystem.from_text(
 @pytest.mark.parametrize(
     "method", ["svi:2", *(pytest.param(name, marks=pytest.mark.full) for name in ("svi:1", "svi:5", "gauss:3", "sc:4"))]
 )
-def test_forces_of_velocities_as_written_out(method: str) -> None:
+def test_velocity_forces_equal_those_of_the_unrolled_system(method: str) -> None:
     """Friction at every place, between the ends of bonds, and a drive at one place."""
     bonds, masses = {"bonds": [[0, 1], [1, 2], [2, 3], [0, 3]]}, {"m": [1, 2, 3, 4]}
     q, velocity = random(2, 4, 2)
@@ -498,7 +498,7 @@ def test_a_table_of_one_axis() -> None:
     assert "q_0**2" not in written
 
 
-def test_the_error_of_a_step_from_rest_at_0() -> None:
+def test_error_estimate_of_a_step_from_rest_at_the_origin() -> None:
     """Where nothing but a drive moves anything, it is a part of where that leads; it is held against the coefficient
     below the highest, which is far too much for so short a step."""
     driven = sc.IndexedSystem.from_text(

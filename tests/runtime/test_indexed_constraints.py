@@ -62,7 +62,7 @@ def stepper():
     return sc.compile_indexed(net(), RATTLE)
 
 
-def test_steps_states_and_multipliers_are_those_of_the_system_written_out(stepper):
+def test_steps_states_and_multipliers_equal_those_of_the_unrolled_system(stepper):
     q, data = chain(3)
     small = sc.unroll_sums(net(), {"N": 4, "B": 3, "P": 1}, **with_fields(data, 3))
     other = sc.compile_stepper(small, RATTLE)
@@ -86,7 +86,7 @@ def with_fields(data, count):
 
 
 @pytest.mark.parametrize("count", [30, 2000])
-def test_every_state_of_a_chain_meets_its_constraints(stepper, count):
+def test_every_state_of_a_chain_satisfies_its_constraints(stepper, count):
     q, data = chain(count)
     run = stepper.start(q, h=0.05 / count, **data)
     for _ in range(20):
@@ -97,7 +97,7 @@ def test_every_state_of_a_chain_meets_its_constraints(stepper, count):
     assert run.iterations < 20 * 20
 
 
-def test_a_chain_takes_one_product_a_correction(stepper):
+def test_chain_needs_one_product_per_correction(stepper):
     q, data = chain(500)
     run = stepper.start(q, h=1e-4, **data)
     report = run.problem.binding.new("report *")
@@ -105,7 +105,7 @@ def test_a_chain_takes_one_product_a_correction(stepper):
     assert report.products <= report.iterations
 
 
-def test_a_cloth_keeps_its_rods_and_its_energy():
+def test_cloth_conserves_rod_lengths_and_energy():
     stepper = sc.compile_indexed(net(3), "stoermer-verlet")
     q, velocity, data = cloth(12)
     run = stepper.start(*stepper.project(q, velocity=velocity, **data), h=0.004, **data)
@@ -120,7 +120,7 @@ def test_a_cloth_keeps_its_rods_and_its_energy():
     assert np.abs(run.q["r"] - q).max() > 0.1  # it moved
 
 
-def test_compositions_have_their_order_and_keep_constraints():
+def test_compositions_have_their_order_and_satisfy_constraints():
     stepper = sc.compile_indexed(net(), "composition:8")
     q, data = chain(3)
     exact = stepper.integrate(q, h=1 / 400, steps=400, save_every=400, **data).q["r"][-1]
@@ -140,7 +140,7 @@ def test_a_step_back_undoes_a_step(stepper):
     assert np.abs(back.q["r"] - q).max() < 1e-11
 
 
-def test_the_start_is_put_on_the_nearest_state(stepper):
+def test_initial_state_is_projected_to_the_nearest_state(stepper):
     q, data = chain(3)
     off = q + 1e-3 * np.random.default_rng(1).normal(size=q.shape)
     near, _ = stepper.project(off, **data)
@@ -156,7 +156,7 @@ def test_the_start_is_put_on_the_nearest_state(stepper):
         stepper.start(1.02 * q, h=0.01, **data)
 
 
-def test_observed_and_restored_runs_go_on_to_the_bit(stepper):
+def test_observed_and_restored_runs_continue_bitwise(stepper):
     q, data = chain(20)
     one, other = (stepper.start(q, h=1e-3, **data) for _ in range(2))
     one.advance(20)
@@ -169,7 +169,7 @@ def test_observed_and_restored_runs_go_on_to_the_bit(stepper):
     assert (one.p["r"] == other.p["r"]).all()
 
 
-def test_momentum_maps_are_those_that_constraints_leave():
+def test_momentum_maps_compatible_with_constraints_are_conserved():
     """Free rods turn in space; pins hold them, by whose constraints nothing is kept."""
     free = sc.IndexedSystem.from_text(
         name="molecule",
@@ -252,7 +252,7 @@ def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
     ],
     ids=["contradiction", "a rod twice", "a rod to itself"],
 )
-def test_constraints_that_cannot_be_met_are_refused(stepper, bonds, lengths, said):
+def test_unsatisfiable_constraints_are_rejected(stepper, bonds, lengths, said):
     q = [[0.0, 0], [1, 0], [1, 1]]
     with pytest.raises(StateError, match=said):
         stepper.start(q, h=0.01, tables={"bonds": bonds, "pins": [0]}, parameters={"l": lengths}).advance(10)
@@ -278,7 +278,7 @@ def test_parameters_of_constraints_do_not_jump(stepper):
         ("r[i, 0] = 1 for i in N x", "the end is expected"),
     ],
 )
-def test_what_is_no_constraint_is_refused(text, said):
+def test_invalid_constraints_are_rejected(text, said):
     with pytest.raises(SystemDefinitionError, match=said):
         sc.IndexedSystem.from_text(
             name="x",
@@ -290,6 +290,6 @@ def test_what_is_no_constraint_is_refused(text, said):
 
 
 @pytest.mark.parametrize("method", ["svi:2", "gauss:2", sc.StoermerVerlet("drift-kick-drift")])
-def test_methods_that_do_not_keep_them_are_refused(method):
+def test_methods_without_constraint_support_are_rejected(method):
     with pytest.raises(MethodError, match="RATTLE"):
         sc.compile_indexed(net(), method)

@@ -57,7 +57,7 @@ def start(stepper: sc.IndexedStepper, **given: Any) -> Any:
 class TestWhatACallerChangesLater:
     @pytest.mark.parametrize("value", [10**6, 10**4, -50])
     @pytest.mark.parametrize("order", ["C", "F"])
-    def test_of_tables_and_fields_nothing_reaches_the_run(self, chain: Any, value: int, order: Any) -> None:
+    def test_later_changes_of_tables_and_fields_do_not_affect_the_run(self, chain: Any, value: int, order: Any) -> None:
         table, k = np.array(BONDS, dtype=np.int32, order=order), K.copy()
         run = start(chain, tables={"bonds": table}, parameters={"k": k, "F_0": 0.5})
         other = start(chain)
@@ -67,7 +67,7 @@ class TestWhatACallerChangesLater:
         assert (run.q["q"] == other.q["q"]).all()
 
     @pytest.mark.parametrize("callback", ["progress", "observe"])
-    def test_in_a_callback_neither(self, chain: Any, callback: str) -> None:
+    def test_later_changes_in_a_callback_do_not_affect_the_run(self, chain: Any, callback: str) -> None:
         table, k = np.array(BONDS, dtype=np.int32), K.copy()
 
         def spoil(*_: Any) -> float:
@@ -81,7 +81,7 @@ class TestWhatACallerChangesLater:
         assert k[0] == 1e300
         assert (found.q["q"][-1] == expected.q["q"][-1]).all()
 
-    def test_what_a_run_holds_is_read_only(self, chain: Any) -> None:
+    def test_arrays_of_a_run_are_read_only(self, chain: Any) -> None:
         arrays = start(chain).problem.arrays
         for array in (arrays.places["bonds"], arrays.fields["k"]):
             with pytest.raises(ValueError, match="read-only"):
@@ -96,7 +96,7 @@ class TestWhatACallerChangesLater:
 class TestPickles:
     @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda run: pickle.loads(pickle.dumps(run))])
     @pytest.mark.parametrize("given", [{}, {"h": None, "t_end": 20.0, "tolerance": 1e-6}], ids=["h", "t_end"])
-    def test_a_run_goes_on_as_it_would_have(self, chain: Any, copied: Any, given: Any) -> None:
+    def test_pickled_run_continues_identically(self, chain: Any, copied: Any, given: Any) -> None:
         run = start(chain, **given, options=sc.SolverOptions(max_iterations=40), threads=2)
         run.advance(3)
         other = copied(run)
@@ -117,13 +117,13 @@ class TestPickles:
             each.advance(5)
         assert all((run.q[name] == other.q[name]).all() for name in "xy")
 
-    def test_an_input_is_still_awaited(self, chain: Any) -> None:
+    def test_input_that_is_not_set_remains_not_set(self, chain: Any) -> None:
         run = start(chain, parameters={"k": K})
         for other in (copy.copy(run), chain.from_checkpoint(run.checkpoint())):
             with pytest.raises(StateError, match="the input 'F' is not set"):
                 other.advance(1)
 
-    def test_a_trajectory_keeps_its_states_between(self, chain: Any) -> None:
+    def test_trajectory_retains_its_dense_output(self, chain: Any) -> None:
         found = chain.integrate(Q, h=0.1, steps=3, tables={"bonds": BONDS}, parameters={"F_0": 0.0})
         other = pickle.loads(pickle.dumps(found))
         assert (found.at([0.05])[0]["q"] == other.at([0.05])[0]["q"]).all()
@@ -214,7 +214,7 @@ class TestDamage:
             chain.from_checkpoint(start(chain).checkpoint(), t_end=2.0)
 
 
-def test_rungs_of_no_run_are_refused_of_scalar_runs_too() -> None:
+def test_invalid_step_size_levels_are_rejected_also_for_scalar_runs() -> None:
     system = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     stepper = sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
     run = stepper.start([1.0], [0.0], t_end=5.0, tolerance=1e-6)

@@ -36,7 +36,7 @@ def molecules():
 
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "svi:8", "gauss:3"])
 @pytest.mark.parametrize(("strength", "h"), [(1.0, 0.1), (400.0, 0.5), (1e4, 0.5)])
-def test_steps_are_those_of_newtons_iteration_of_the_system_written_out(method, strength, h):
+def test_newton_steps_equal_those_of_the_unrolled_system(method, strength, h):
     system, masses = field(strength), np.linspace(1.0, 2.0, 5)
     own = sc.compile_indexed(system, method, solver="newton")
     small = sc.unroll_sums(system, {"N": 5}, parameters={"m": masses})
@@ -53,7 +53,7 @@ def test_steps_are_those_of_newtons_iteration_of_the_system_written_out(method, 
         q, v = run.q["q"], run.velocity["q"]
 
 
-def test_stiff_bonds_at_rest_do_not_shorten_the_steps():
+def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     count, stiff = 40, 1e6
     chain = np.array([(i, i + 1) for i in range(count - 1)])
     k = np.where(np.arange(count - 1) % 2 == 0, stiff, 1.0)
@@ -72,7 +72,7 @@ def test_stiff_bonds_at_rest_do_not_shorten_the_steps():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-9
 
 
-def test_steps_choose_their_length_with_it():
+def test_newton_supports_adaptive_steps():
     system = field(100.0)
     q, v = RANDOM.normal(size=(2, 6))
     own, other = (sc.compile_indexed(system, "svi:6", solver=solver) for solver in ("newton", "fixed-point"))
@@ -80,7 +80,7 @@ def test_steps_choose_their_length_with_it():
     assert np.abs(ends[0] - ends[1]).max() < 1e-7
 
 
-def test_saved_runs_go_on_with_it_alone():
+def test_saved_runs_continue_with_newton_only():
     own, other = (sc.compile_indexed(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
     run = own.start(np.sin(np.arange(8.0)), h=0.1)
     run.advance(3)
@@ -94,7 +94,7 @@ def test_saved_runs_go_on_with_it_alone():
         other.from_checkpoint(saved)
 
 
-def test_a_step_that_comes_to_no_rest_fails():
+def test_step_without_convergence_fails():
     system = sc.IndexedSystem.from_text(
         name="long waves",
         coordinates=["q[N]"],
@@ -107,7 +107,7 @@ def test_a_step_that_comes_to_no_rest_fails():
     assert (run.q["q"] == q).all()
 
 
-def test_what_has_no_newton():
+def test_methods_without_newton_are_rejected():
     damped = sc.IndexedSystem.from_text(
         name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)", forces={"q[i]": "-q_dot[i]"}
     )

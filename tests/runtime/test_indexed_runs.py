@@ -47,7 +47,7 @@ def driven():
     )
 
 
-def test_some_of_the_states(steppers):
+def test_slices_have_the_states_of_the_run(steppers):
     run = steppers[0].integrate(Q, velocity=V, h=0.1, steps=30, events="q[1] - q[2]")
     for rows in (slice(2, None), slice(1, -1, 3), slice(3, 4)):
         part = run[rows]
@@ -88,13 +88,13 @@ class TestControlledSteps:
         assert error < 10.0 * run.steps * tolerance
         assert error > 1e-3 * tolerance  # no more work than was asked for
 
-    def test_back_and_with_a_goal_of_its_own(self, steppers):
+    def test_backward_run_with_a_target_time(self, steppers):
         stepper, _ = steppers
         there = stepper.integrate(Q, velocity=V, t_end=3.0)
         back = stepper.integrate(there.q["q"][-1], there.p["q"][-1], t=3.0, t_end=0.0)
         assert np.abs(back.q["q"][-1] - Q).max() < 1e-13
 
-    def test_of_hamiltonians(self):
+    def test_adaptive_steps_of_hamiltonians(self):
         system = sc.IndexedSystem.from_text(
             name="field",
             coordinates=["q[N]"],
@@ -117,7 +117,7 @@ class TestControlledSteps:
         assert run.steps == again.steps
         assert (run.q["q"] == again.q["q"]).all()
 
-    def test_what_is_refused(self, steppers, ring):
+    def test_unsupported_adaptive_arguments_are_rejected(self, steppers, ring):
         stepper, _ = steppers
         with pytest.raises(MethodError, match="adaptive steps are unavailable"):
             sc.compile_indexed(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
@@ -137,18 +137,18 @@ class TestControlledSteps:
 class TestStatesBetween:
     TIMES = np.array([[0.33, 1.27], [5.0, 0.0]])
 
-    def test_by_steps_of_one_length(self, steppers):
+    def test_dense_output_of_fixed_steps(self, steppers):
         own, other = (each.integrate(Q, velocity=V, h=0.1, steps=50, save_every=5) for each in steppers)
         (q, p), (q_expected, p_expected) = own.at(self.TIMES), other.at(self.TIMES)
         assert q["q"].shape == (2, 2, N)
         assert np.abs(q["q"] - q_expected).max() < 1e-14
         assert np.abs(p["q"] - p_expected).max() < 1e-14
 
-    def test_by_steps_of_their_own(self, steppers):
+    def test_dense_output_of_adaptive_steps(self, steppers):
         own, other = (each.integrate(Q, velocity=V, t_end=5.0, save_every=10) for each in steppers)
         assert np.abs(own.at(self.TIMES)[0]["q"] - other.at(self.TIMES)[0]).max() < 1e-13
 
-    def test_what_was_not_kept_is_not_there(self, steppers):
+    def test_unsaved_states_are_not_available(self, steppers):
         run = steppers[0].integrate(Q, h=0.1, steps=4, observe=lambda run: run.energy)
         with pytest.raises(StateError, match="omit observe"):
             run.at(0.15)
@@ -164,7 +164,7 @@ class TestEvents:
         sc.Event(f"q_{N - 1}_dot + p_q_0", terminal=3),
     )
 
-    def test_they_are_those_of_the_system_written_out(self, steppers):
+    def test_events_equal_those_of_the_unrolled_system(self, steppers):
         stepper, other = steppers
         run = stepper.integrate(Q, velocity=V, h=0.1, steps=500, save_every=5, events=self.OWN)
         expected = other.integrate(Q, velocity=V, h=0.1, steps=500, save_every=5, events=self.WRITTEN)
@@ -181,7 +181,7 @@ class TestEvents:
         signs = np.sign(run.events[0].q["q"][:, 1] - run.events[0].q["q"][:, 2])
         assert (signs[1:] * signs[:-1] <= 0).all()
 
-    def test_a_run_goes_on_behind_a_terminal_one(self, steppers):
+    def test_run_continues_after_a_terminal_event(self, steppers):
         stepper, _ = steppers
         first = stepper.integrate(Q, velocity=V, h=0.1, steps=100, events=sc.Event("q[1] - q[2]", terminal=True))
         again = stepper.integrate(
@@ -189,7 +189,7 @@ class TestEvents:
         )
         assert (again.events[0].t > first.t[-1] + 0.1).all()
 
-    def test_what_is_no_event(self, steppers):
+    def test_invalid_events_are_rejected(self, steppers):
         stepper, _ = steppers
         for function, message in (
             ("x[0]", "not an array"),
@@ -203,7 +203,7 @@ class TestEvents:
 
 class TestInputs:
     @pytest.mark.parametrize("way", [{"h": 0.1, "t_end": 4.9}, {"t_end": 4.9}, {"h": 0.1, "steps": 33}])
-    def test_runs_are_those_of_the_system_written_out(self, driven, way):
+    def test_runs_with_inputs_equal_those_of_the_unrolled_system(self, driven, way):
         own, other = (
             each.integrate(Q, velocity=V, inputs=DATA, save_every=4, **way)
             for each in (sc.compile_indexed(driven, "svi:6"), written(driven))
@@ -211,7 +211,7 @@ class TestInputs:
         assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
         assert np.abs(own.at(3.2)[0]["q"] - other.at(3.2)[0]).max() < 1e-13
 
-    def test_they_are_held_between_samples(self, driven):
+    def test_inputs_are_constant_between_samples(self, driven):
         stepper, other = sc.compile_indexed(driven, "svi:6"), written(driven)
         runs = (stepper.start(Q, velocity=V, h=0.1), other.start(Q, velocity=V, h=0.1))
         for force in (1.0, -2.0):
@@ -224,7 +224,7 @@ class TestInputs:
             runs[0].set_inputs(G=1.0)
 
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
-    def test_what_is_held_leaves_the_guess_of_the_next_step(self, driven, method):
+    def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
         """Samples of the same number cost no sweep more than none; of another, fewer than from nothing."""
         stepper = sc.compile_indexed(driven, method)
         runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
@@ -246,7 +246,7 @@ class TestInputs:
         assert others.iterations < none.iterations
         assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
 
-    def test_they_are_missed(self, driven):
+    def test_missing_inputs_are_reported(self, driven):
         stepper = sc.compile_indexed(driven, "svi:6")
         with pytest.raises(StateError, match="the input 'F' is not set"):
             stepper.integrate(Q, h=0.1, steps=1)
@@ -260,7 +260,7 @@ class TestInputs:
         with pytest.raises(StateError, match="covers t = 0 to 5"):
             stepper.integrate(Q, inputs=DATA, h=0.1, t_end=6.0)
 
-    def test_they_are_shown_by_name(self, driven):
+    def test_inputs_are_displayed_by_name(self, driven):
         assert "F on q[N-1]" in str(driven)
         assert driven.depends_on_time
 

@@ -56,13 +56,13 @@ def test_a_linear_system_is_the_same_at_every_scale(method, solver, h):
 
 
 @pytest.mark.parametrize(("method", "solver", "h"), EACH)
-def test_runs_take_as_many_iterations_as_they_did(method, solver, h):
+def test_iteration_counts_are_those_recorded(method, solver, h):
     assert run_of(method, solver, h, 1.0).iterations == pytest.approx(WAYS[method, solver][h], rel=0.02, abs=2)
 
 
 @pytest.mark.parametrize(("method", "solver"), WAYS)
 @pytest.mark.parametrize("force", [0.0, 2.0**-90])
-def test_forces_from_rest_at_the_origin_know_no_size_either(method, solver, force):
+def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, force):
     """Where there is nothing yet, beside which a change would be small."""
     hamiltonian = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/2 + q[i]**2/2) - e*cos(t)*q[0]"}
     lagrangian = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + e*cos(t)*q[0]"}
@@ -89,7 +89,7 @@ def test_a_momentum_that_is_no_number_is_no_step():
 
 
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
-def test_a_light_stiff_mass_keeps_its_energy_beside_a_slow_one(form):
+def test_light_stiff_mass_conserves_energy_next_to_a_slow_one(form):
     """The 2-norm of both would leave 1e-10 of it after 2,000 steps, of the Hamiltonian 1e-9."""
     light, frequency, amplitude = 1e-8, 20.0, 1e-6
     if form == "hamiltonian":

@@ -138,7 +138,7 @@ def bits(run: Any) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_how_terms_are_shared(name: str) -> None:
+def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
     program = lower_indexed(system, as_method("svi:2", one_coordinate(system)), "shared")
     assert {sharing_of(looped) for looped in program.forces} == {CASES[name].shared}
@@ -168,7 +168,7 @@ def test_no_bit_depends_on_the_number_of_threads(name: str, method: str) -> None
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-def test_sweeps_go_where_leapfrog_goes() -> None:
+def test_iterative_methods_agree_with_leapfrog() -> None:
     """By short steps of both."""
     for name in ("ring", "pairs", "net"):
         case = CASES[name]
@@ -187,7 +187,7 @@ def test_newtons_iteration() -> None:
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-def test_steps_that_choose_their_length() -> None:
+def test_adaptive_steps_with_threads() -> None:
     stepper = stepper_of("pairs", "svi:4")
     found = [
         bits(stepper.integrate(start_of("pairs"), t_end=3.0, tolerance=1e-9, threads=threads)) for threads in THREADS
@@ -214,7 +214,7 @@ def test_hamiltonians_and_forces_of_velocities() -> None:
         assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-def test_a_run_goes_on_by_other_threads() -> None:
+def test_run_continues_with_other_threads() -> None:
     """Saved and restored, apart, and from step to step."""
     stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
     whole = stepper.start(q, h=0.01)
@@ -242,7 +242,7 @@ def test_ctrl_c_ends_a_run_between_steps() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked")
-def test_a_process_that_is_forked_off_has_threads_of_its_own() -> None:
+def test_forked_process_has_separate_threads() -> None:
     stepper, q = stepper_of("pairs", "svi:4"), start_of("pairs")
     expected = bits(stepper.integrate(q, h=0.01, steps=3, threads=3))
     with warnings.catch_warnings():
@@ -263,7 +263,7 @@ def test_a_step_that_fails_fails_for_all() -> None:
     assert len(said) == 1
 
 
-def test_what_is_refused() -> None:
+def test_invalid_thread_counts_are_rejected() -> None:
     stepper, q = stepper_of("ring", "svi:4"), start_of("ring")
     for threads in (0, -1, 65):
         with pytest.raises(StateError, match="threads"):
@@ -335,7 +335,7 @@ def test_neighbouring_blocks_are_never_done_at_a_time(windows: dict[tuple[str, i
     assert several >= 10
 
 
-def test_blocks_of_pairs_meet_once_and_one_another_a_round(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+def test_pair_blocks_form_a_round_robin_schedule(windows: dict[tuple[str, int], list[list[int]]]) -> None:
     most = 0
     for (what, size), each in windows.items():
         if what != "tiles":

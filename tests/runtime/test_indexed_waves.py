@@ -56,19 +56,19 @@ def products_of(stepper, q, h, *, steps=1, **given):
 
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
-def test_waves_of_a_linear_ring_are_independent(size, method):
+def test_fourier_modes_of_a_linear_ring_decouple(size, method):
     """With the right transform of every size, and the right symbol, a product leaves nothing but rounding."""
     q = RANDOM.normal(size=size)
     assert products_of(stepper_of("ring", method), q, 1.0, parameters={"k": 1e3}) <= 3
 
 
 @pytest.mark.parametrize("shape", [(12, 35), (11, 26), (64, 48), (4, 62)])
-def test_so_are_those_of_a_plane(shape):
+def test_fourier_modes_of_a_plane_decouple(shape):
     q = RANDOM.normal(size=shape)
     assert products_of(stepper_of("plane"), q, 1.0, parameters={"k": 1e3}) <= 3
 
 
-def test_arrays_have_waves_of_their_own():
+def test_each_array_has_its_circulant_preconditioner():
     """Components, and arrays of other axes: all are asked at a time, and none answers for another."""
     arrays = sc.IndexedSystem.from_text(
         name="arrays",
@@ -90,7 +90,7 @@ def test_ends_and_amplitudes_cost_few_products(name, shape, most):
 
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("k", [1e2, 1e5])
-def test_steps_are_those_of_the_system_written_out(name, k):
+def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
     """By Newton's iteration with whole matrices; the least lattices are too small to be asked for waves."""
     for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
         sizes = dict(zip(("NX", "NY"), shape, strict=True)) if "plane" in name else {"N": shape}
@@ -107,7 +107,7 @@ def test_steps_are_those_of_the_system_written_out(name, k):
 
 
 @pytest.mark.parametrize("name", ["chain", "beam"])
-def test_no_correction_is_small_for_want_of_a_solution(name):
+def test_corrections_are_accurate_in_badly_scaled_systems(name):
     """The size has a factor beyond those that are transformed, and the diagonal says nothing of long waves."""
     run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
     with pytest.raises(StepFailedError, match="GMRES"):
@@ -123,7 +123,7 @@ def test_no_bit_depends_on_the_number_of_threads():
     assert ends[0] == ends[1] == ends[2]
 
 
-def test_the_diagonal_stays_where_waves_do_not_serve():
+def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     """Places that differ by a factor of a million, with springs between them that are soft to most."""
     places = sc.IndexedSystem.from_text(
         name="places",
@@ -148,7 +148,7 @@ def test_the_diagonal_stays_where_waves_do_not_serve():
         ("sum(i in N periodic, u[i, 0]*u[i+1, 0]) - sum(b in B, u[bonds[b, 0], 0]*u[bonds[b, 1], 0])", 0),
     ],
 )
-def test_which_systems_have_waves(term, reach):
+def test_systems_with_a_circulant_preconditioner(term, reach):
     system = sc.IndexedSystem.from_text(
         name="some",
         coordinates=["u[N, 2]"],

@@ -23,7 +23,7 @@ def stepper() -> sc.Stepper:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-12, 1e-8])
-def test_it_keeps_the_tolerance_and_a_longer_one_does_not(tolerance: float) -> None:
+def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(tolerance: float) -> None:
     h = largest_step(stepper(), *START, 20.0, tolerance)
     errors = [stepper().integrate(*START, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
     assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
@@ -39,7 +39,7 @@ def test_steps_of_it_are_right_to_round_off_after_many_orbits() -> None:
     assert np.ptp(run.energy()) < 1e-13
 
 
-def test_one_call_integrates_in_transformed_time() -> None:
+def test_integrate_runs_in_transformed_time() -> None:
     times = np.array([0.0, np.pi, 2 * np.pi, 8 * np.pi])
     found = sc.solve_ivp(KEPLER, (0.0, 8 * np.pi), [*START[0], *START[1]], monitor="frequency", t_eval=times)
     assert found.success
@@ -52,7 +52,7 @@ def test_one_call_integrates_in_transformed_time() -> None:
         sc.solve_ivp(stepper(), (0.0, 1.0), [*START[0], *START[1]], h=0.1, monitor="frequency")
 
 
-def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
+def test_unsuitable_time_transformation_is_detected_later() -> None:
     """Slow for hundreds of steps far out, with a rate that hardly changes; then the comet is at the sun."""
     far = [2.0 - 1e-4, 0.0, 0.0, (1e-4 / (2.0 - 1e-4)) ** 0.5]
     found = sc.solve_ivp(
@@ -62,7 +62,7 @@ def test_a_monitor_that_fits_the_beginning_alone_is_found_out() -> None:
     assert found.status in (-1, -2)  # a step at the sun has no solution by halves, or too large an error
 
 
-def test_what_is_said_of_a_too_wrong() -> None:
+def test_invalid_tolerances_are_reported() -> None:
     assert accuracy_message(9e-16, 1.0, 0.0) is None
     assert accuracy_message(float("nan"), 1.0, 0.0) is not None
     said = accuracy_message(1e-3, 1.5, 1e-9)
@@ -71,7 +71,7 @@ def test_what_is_said_of_a_too_wrong() -> None:
     assert "1.0e-03, but 1.0e-09 was requested" in said
 
 
-def test_what_has_no_longest_step_is_refused() -> None:
+def test_systems_without_a_largest_step_are_rejected() -> None:
     for span, tolerance in ((0.0, 1e-9), (1.0, 1.0), (1.0, -1.0)):
         with pytest.raises(StateError, match=r"span = \S+ must not be 0, and tolerance"):
             largest_step(stepper(), *START, span, tolerance)

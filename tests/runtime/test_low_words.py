@@ -155,7 +155,7 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["svi", "gauss of a Hamiltonian", "svi, coupled"])
-def test_states_of_ensembles_stay_within_a_rounding_of_exact_sums(name: str) -> None:
+def test_ensemble_states_are_within_a_rounding_of_exact_sums(name: str) -> None:
     """Low words keep what sums leave: high words alone are off by no more than half a rounding each, however long."""
     steps, members = 1024, 5
     shift = np.arange(members)[:, None] / 16
@@ -184,7 +184,7 @@ def test_constraints_hold_for_the_sum_of_high_and_low_words(name: str) -> None:
 
 @pytest.mark.parametrize("lengths", ["h", "tolerance", "monitor"])
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["forward", "back"])
-def test_the_last_step_ends_where_the_sum_of_both_words_of_time_does(lengths: str, sign: float) -> None:
+def test_last_step_ends_at_the_sum_of_both_words_of_time(lengths: str, sign: float) -> None:
     """Far from t = 0 times are rounded to 6e-8: positions at t_end do not show it."""
     system = sc.LagrangianSystem.from_text(name="spring", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     monitor = "1 + x**2" if lengths == "monitor" else None
@@ -268,7 +268,7 @@ BY_DESIGN = ("Newton", "rattle", "lobatto")
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if not any(each in name for each in BY_DESIGN)])
-def test_low_words_count_wherever_the_state_does(name: str) -> None:
+def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
     """A thousandth of the state as its low word, or in its high word: a step has the same forces and velocities."""
     ends = []
     for whole in (False, True):

@@ -41,7 +41,7 @@ def angle_alone():
 
 @pytest.mark.parametrize("method", ["svi:8", "scvi:4"])
 @pytest.mark.parametrize("tolerance", [None, 1e-9])
-def test_a_light_cart_is_flung_aside(cart, method, tolerance):
+def test_light_cart_is_accelerated_strongly(cart, method, tolerance):
     run = sc.compile_stepper(cart, method).integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=tolerance)
     allowed = 1e-9 if tolerance is None else 1e-5
     assert run.q[-1, 1] == pytest.approx(angle_alone(), abs=allowed)
@@ -54,14 +54,14 @@ def test_a_light_cart_by_its_hamiltonian(cart):
     assert run.rejected_steps < 100
 
 
-def test_it_takes_no_more_steps_than_tolerances_ask_for(stepper):
+def test_step_count_is_bounded_by_the_tolerance(stepper):
     """Rounding that were taken for unresolved motion would end in steps of 1e-17."""
     exact, loose = (stepper.integrate([0, 1], velocity=[0, 0], t_end=SPAN, tolerance=x) for x in (None, 1e-9))
     assert exact.steps < 3 * loose.steps
     assert exact.rejected_steps < 50
 
 
-def test_many_are_the_same_as_each_alone(stepper):
+def test_batched_and_single_steps_are_equal(stepper):
     angles = 1.0 + 0.01 * np.arange(9)
     start = np.column_stack([0.0 * angles, angles])
     runs = stepper.integrate_ensemble(start, velocity=0.0 * start, t_end=SPAN)
@@ -70,7 +70,7 @@ def test_many_are_the_same_as_each_alone(stepper):
     assert runs.q[len(alone.t) - 1, 4] == pytest.approx(alone.q[-1], abs=1e-9)
 
 
-def test_the_first_step_of_a_sleeping_top_is_no_speck():
+def test_first_step_of_a_sleeping_top_is_not_tiny():
     """At phi = psi = 0 the shortest steps show nothing but rounding, as a part of hardly any motion."""
     top = sc.LagrangianSystem.from_text(
         name="sleeping top",
@@ -85,7 +85,7 @@ def test_the_first_step_of_a_sleeping_top_is_no_speck():
 
 
 @pytest.mark.usefixtures("as_users_compile")
-def test_velocities_are_found_where_their_correction_creeps(cart):
+def test_velocities_are_found_where_newton_converges_slowly(cart):
     """At one state in a thousand Newton's corrections shrank the misfit by a rounding each, and were given up.
 
     Where products are fused with sums, whose misfits can be less than a rounding of either.

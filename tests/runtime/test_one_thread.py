@@ -104,7 +104,7 @@ def test_a_run_that_is_recorded_into_a_folder(stepper: sc.Stepper, tmp_path: Any
     assert len(sc.load_run(tmp_path / "run")) == 11
 
 
-def test_the_thread_that_holds_a_run_may_enter_it_again(stepper: sc.Stepper) -> None:
+def test_owner_thread_may_reenter_a_run(stepper: sc.Stepper) -> None:
     run, saved = stepper.start([1.0], [0.0], h=0.1), []
     run.record(5, progress=lambda _: saved.append(run.checkpoint()))
     assert saved[-1] == run.checkpoint()

@@ -111,7 +111,7 @@ def _lyapunov_orbit(x):
     return speed, 2.0 * half(speed)[1]
 
 
-def test_a_pendulum_swings_as_long_as_the_elliptic_integral_says():
+def test_pendulum_period_is_the_elliptic_integral():
     """The amplitude held, then the period, then the energy; and one that turns over."""
     pendulum = compile_stepper(problem("planar-pendulum").system, SVI(8))
     values = {"m": 1.0, "l": 1.0, "g": 1.0}
@@ -155,7 +155,7 @@ def test_orbits_of_a_galaxy_by_energy(galaxy):
     assert_allclose(turned.stability_indices, stable.stability_indices, atol=1e-9)
 
 
-def test_a_driven_oscillator_answers_in_its_period():
+def test_forced_oscillator_has_the_period_of_its_force():
     """x'' = -x - c x' + cos(w t): the closed form; multipliers exp(-c/2 +- i ..), no pairs."""
     driven = LagrangianSystem.from_text(
         name="driven oscillator",
@@ -177,7 +177,7 @@ def test_a_driven_oscillator_answers_in_its_period():
         periodic_orbit(stepper, [0.5], [0.5], period=period, steps=40, energy=1.0)
 
 
-def test_what_is_no_orbit(galaxy):
+def test_invalid_orbits_are_rejected(galaxy):
     with pytest.raises(OrbitError, match=r"an equilibrium|no periodic orbit was found"):
         periodic_orbit(galaxy, [0.01, 0.01], [0.0, 0.0], period=2.0, steps=40, fixed_period=True)
     with pytest.raises(OrbitError, match="no periodic orbit was found"):
@@ -193,7 +193,7 @@ def test_what_is_no_orbit(galaxy):
         periodic_orbit(galaxy, [0.0, 0.3], [0.4, 0.0], period=-6.5, h=0.1)
 
 
-def test_what_depends_on_time_returns_with_it():
+def test_nonautonomous_orbits_have_a_period_of_the_system():
     """A forced oscillator closes after any time from some state, and goes elsewhere the next time round."""
     system = LagrangianSystem.from_text(
         name="forced",
@@ -213,7 +213,7 @@ def test_what_depends_on_time_returns_with_it():
     assert_allclose(np.append(twice.q, twice.p), np.append(once.q, once.p), atol=1e-12)
 
 
-def test_an_orbit_has_the_energy_that_is_asked_for():
+def test_orbit_has_the_requested_energy():
     oscillator = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     stepper = compile_stepper(oscillator, SVI(3))
     with pytest.raises(OrbitError, match=r"has the energy 0\.5, not 0\.5001"):
@@ -222,7 +222,7 @@ def test_an_orbit_has_the_energy_that_is_asked_for():
     assert found.energy == pytest.approx(5.0, rel=1e-12)
 
 
-def test_no_input_is_taken_for_nothing_and_no_monitor_for_steps_of_one_length():
+def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
     pushed = LagrangianSystem.from_text(
         name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", forces={"x": "u"}, inputs=["u"]
     )
@@ -235,7 +235,7 @@ def test_no_input_is_taken_for_nothing_and_no_monitor_for_steps_of_one_length():
         watched.chaos_indicators_ensemble([[1.0, 0.0]], [[0.0, 1.0]], h=0.1, steps=4)
 
 
-def test_names_of_a_state_are_each_its_own():
+def test_names_of_a_state_are_unique():
     """A coordinate called p_x beside x: the momentum of x has another name."""
     plane = LagrangianSystem.from_text(
         name="plane", coordinates=["x", "p_x"], lagrangian="(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2"
@@ -249,7 +249,7 @@ def test_names_of_a_state_are_each_its_own():
 
 
 @pytest.mark.parametrize("q", [0.0, np.pi])
-def test_a_state_at_rest_is_named_as_such(q):
+def test_equilibrium_is_reported(q):
     """Every period closes it."""
     own = compile_stepper(problem("planar-pendulum").system, SVI(4))
     with pytest.raises(OrbitError, match="an equilibrium"):

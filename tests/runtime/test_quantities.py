@@ -156,7 +156,7 @@ every_setting = pytest.mark.parametrize("number", range(len(SETTINGS)), ids=name
 
 
 @every_setting
-def test_of_trajectories(number, tmp_path):
+def test_quantities_of_trajectories(number, tmp_path):
     given, run = SETTINGS[number], trajectory(number)
     times = given.t + given.h * given.save_every * np.arange((STEPS + 1) // given.save_every + 1)
     assert np.allclose(run.t, times, rtol=0, atol=1e-14)
@@ -181,7 +181,7 @@ def test_of_trajectories(number, tmp_path):
 
 
 @every_setting
-def test_some_of_the_states(number):
+def test_quantities_of_slices(number):
     run = trajectory(number)
     for rows in (slice(2, None), slice(None, 5), slice(1, -1, 2), slice(3, 4)):
         part = run[rows]
@@ -204,7 +204,7 @@ def test_some_of_the_states(number):
 
 
 @every_setting
-def test_between_kept_states(number):
+def test_quantities_of_dense_output(number):
     run = trajectory(number)
     times = run.t[0] + (run.t[-1] - run.t[0]) * np.array([0.0, 0.11, 0.345, 0.5, 0.87, 0.999, 1.0])
     for t, q, p in zip(times, *run.at(times), strict=True):
@@ -214,7 +214,7 @@ def test_between_kept_states(number):
 
 
 @every_setting
-def test_of_functions_of_states(number):
+def test_quantities_of_functions_of_states(number):
     given, run = SETTINGS[number], trajectory(number)
     compiled, own = stepper(given.system.name), arguments(given)["parameters"]
     for k in (0, -1):
@@ -231,7 +231,7 @@ def test_of_functions_of_states(number):
 
 
 @every_setting
-def test_of_events(number):
+def test_quantities_of_events(number):
     given, run = SETTINGS[number], trajectory(number)
     later = stepper(given.system.name).integrate(Q, velocity=V, events="(x - 0.3)**2 - 0.01", **arguments(given))
     assert np.array_equal(later.q, run.q)
@@ -245,7 +245,7 @@ def test_of_events(number):
 
 
 @every_setting
-def test_of_ensembles(number):
+def test_quantities_of_ensembles(number):
     """Each lane with parameters of its own, also where only some are given; the first like the single run."""
     given, run = SETTINGS[number], trajectory(number)
     name = next(iter(given.system.constants)).name
@@ -271,7 +271,7 @@ def test_of_ensembles(number):
 
 
 @every_setting
-def test_of_runs_saved_pickled_and_gone_on_with(number):
+def test_quantities_of_saved_pickled_and_continued_runs(number):
     given, run = SETTINGS[number], trajectory(number)
     compiled, own = stepper(given.system.name), arguments(given)["parameters"]
     options = sc.SolverOptions(tolerance=3e-15, max_iterations=47)

@@ -121,7 +121,7 @@ SPURIOUS = {
 
 
 @pytest.mark.parametrize(("name", "flags"), [(name, flags) for name in SPURIOUS for flags in (("-O1",), ("-O2",))])
-def test_a_spurious_solution_is_refused_or_its_error_is_told(name, flags):
+def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
     """Their curves are smooth: the energy of the first grows from -0.44 to 591."""
     system = sc.problem(name).system
     for method, q, p, h in SPURIOUS[name]:
@@ -148,7 +148,7 @@ def test_a_controlled_run_begins_with_no_spurious_step():
         assert abs(run.q[1, 0] - first) < 0.3
 
 
-def test_comparing_with_halves_leaves_a_run_as_it_is():
+def test_comparison_with_half_steps_does_not_change_a_run():
     """Every 512th step is compared: what goes from step to step stays, by Newton's iteration, too."""
     system = sc.problem("henon-heiles").system
     start = {"q": [0.1, 0.2], "p": [0.3, 0.1]}
@@ -164,7 +164,7 @@ def test_comparing_with_halves_leaves_a_run_as_it_is():
 
 @pytest.mark.parametrize("steps", [{"h": 0.1, "steps": 12}, {"t_end": 0.5, "tolerance": 1e-6}], ids=["h", "t_end"])
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-def test_comparing_with_halves_leaves_an_array_as_it_is(solver, steps):
+def test_comparison_with_half_steps_does_not_change_an_array_run(solver, steps):
     """Every step is compared, for any number of threads, and the run is that of which few are."""
     few = compiled("chain", "svi:4", solver)
 

@@ -173,7 +173,7 @@ def driven(steps=60, **options):
     return stepper, stepper.integrate([0.4], [-0.8], steps=steps, **values)
 
 
-def test_runs_tell_how_their_states_depend_on_all_they_started_from():
+def test_sensitivities_of_runs_by_all_arguments():
     """Against differences of whole runs, of fourth order."""
     stepper, run = driven()
     found = run.sensitivity()
@@ -242,7 +242,7 @@ def test_the_energy_at_the_end_of_a_run_does_not_depend_on_time():
     assert abs(found.t) < 1e-12
 
 
-def test_what_has_no_gradient():
+def test_systems_without_a_gradient_are_rejected():
     _, run = driven()
     with pytest.raises(
         StateError, match=r"cotangents, derivatives by \(q, p\) of each state, must have shape \(61, 2\)"
@@ -254,7 +254,7 @@ def test_what_has_no_gradient():
         driven(steps=9, t=0.0, t_eval=[0.03, 0.1])[1].sensitivity()
 
 
-def test_a_state_that_the_steps_do_not_lead_to_is_no_base_of_derivatives():
+def test_unreachable_state_is_rejected_for_derivatives():
     _, run = driven()
     run.q[30] += 1e-3
     with pytest.raises(StateError, match=r"from t = 3\.2, computed again, end in another state"):

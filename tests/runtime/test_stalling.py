@@ -13,7 +13,7 @@ NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
 
 
 @pytest.mark.parametrize("monitor", ["x", "x**2"])
-def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
+def test_run_stops_where_the_time_transformation_is_zero(monitor):
     stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, monitor), sc.SVI(4))
     with pytest.raises(StepFailedError, match="reaches 0") as failure:
         stretched.integrate([1.0], [0.0], h=0.1, t_end=4.0)
@@ -23,14 +23,14 @@ def test_no_step_of_tau_leads_beyond_a_rate_of_nothing(monitor):
 
 
 @pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
-def test_nor_under_the_reversible_controller(events):
+def test_reversible_controller_stops_where_the_time_transformation_is_zero(events):
     controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2", events=events)
     with pytest.raises(StepFailedError, match="reaches 0") as failure:
         controlled.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
 
 
-def test_solve_motion_says_so():
+def test_solve_ivp_reports_a_zero_time_transformation():
     motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
     assert not motion.success
     assert "reaches 0" in motion.message

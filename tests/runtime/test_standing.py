@@ -18,7 +18,7 @@ def stepper():
     return sc.compile_stepper(FREE, "svi:2", flags=QUICK_FLAGS)
 
 
-def test_a_run_and_what_it_kept(stepper):
+def test_display_of_a_run_and_its_saved_states(stepper):
     run = stepper.start([1.0], [0.0], h=0.5)
     kept = run.record(4)
     assert repr(run) == f"<Run {OF_FREE}; t = 2 after 4 steps of 0.5, solver fixed-point>"
@@ -27,7 +27,7 @@ def test_a_run_and_what_it_kept(stepper):
     assert repr(many).startswith("<EnsembleTrajectory of free, svi-2-gauss-legend..; 4 states of each of 2 ")
 
 
-def test_steps_that_choose_their_length(stepper):
+def test_display_of_adaptive_steps(stepper):
     run = stepper.start([1.0], [0.0], t_end=2.0)
     run.advance(1)
     assert repr(run).endswith("after 1 steps of adaptive size, t_end = 2, solver fixed-point>")
@@ -63,7 +63,7 @@ def test_inputs_that_are_missing():
     assert repr(driven).endswith("11 states from t = 0 to 1, 10 steps, breakpoints between: 1>")
 
 
-def test_runs_of_sums():
+def test_display_of_array_runs():
     chain = sc.IndexedSystem.from_text(
         name="chain",
         coordinates=["q[N]"],

@@ -51,7 +51,7 @@ def test_no_phase_of_a_motion_hides_its_error(name, method):
     check_all_phases(SYSTEMS[name], method)
 
 
-def test_where_momenta_are_unknowns_newtons_iteration_estimates_as_sweeps_do():
+def test_newton_and_fixed_point_error_estimates_agree_for_momentum_unknowns():
     vortices = sc.problem("point-vortices")
     steppers = [sc.compile_stepper(vortices.system, sc.SVI(4), solver=each) for each in ("auto", "newton")]
     errors = [each.integrate(vortices.q, vortices.p, h=0.1, steps=1).step_error for each in steppers]
@@ -61,7 +61,7 @@ def test_where_momenta_are_unknowns_newtons_iteration_estimates_as_sweeps_do():
 
 
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])
-def test_nor_of_a_step_by_newtons_iteration(method):
+def test_newton_error_estimate_is_independent_of_the_phase(method):
     check_all_phases(SYSTEMS["quartic"], method, "newton")
 
 

@@ -114,7 +114,7 @@ def test_every_thins_the_same_run(kepler, save_every):
     assert thin.iterations.sum() == dense.iterations[: 1000 // save_every * save_every + 1].sum()
 
 
-def test_progress_is_told_the_steps_done_up_to_the_last(kepler):
+def test_progress_receives_the_completed_steps(kepler):
     told = []
     kepler.integrate(*STATE, h=0.05, steps=3000, progress=told.append)
     assert told == sorted(told)
@@ -122,7 +122,7 @@ def test_progress_is_told_the_steps_done_up_to_the_last(kepler):
 
 
 @pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
-def test_a_symmetric_method_comes_back_along_its_own_trajectory(sample, compiled, method):
+def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
     out = stepper.integrate(*state, h=0.05, steps=200, t=0.3)
     back = stepper.integrate(out.q[-1], out.p[-1], h=-0.05, steps=200, t=out.t[-1])
@@ -146,7 +146,7 @@ def test_a_restored_run_continues_bit_for_bit(sample, compiled, method):
     assert same(one.record(200, save_every=3), other.record(200, save_every=3))
 
 
-def test_a_run_in_portions_is_one_run(kepler):
+def test_run_in_chunks_equals_one_run(kepler):
     whole = kepler.integrate(*STATE, h=0.05, steps=100)
     run = kepler.start(*STATE, h=0.05)
     parts = [run.record(steps) for steps in (1, 0, 39, 60)]
@@ -160,7 +160,7 @@ def test_every_counts_from_the_start_of_the_run(kepler):
     assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
 
 
-def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
+def test_restored_run_uses_parameters_only_if_supplied(kepler):
     run = kepler.start(*STATE, h=0.05, parameters={"mu": 0.9})
     saved = run.checkpoint()
     expected = run.record(5)
@@ -168,7 +168,7 @@ def test_a_restored_run_keeps_parameters_only_if_they_are_given(kepler):
     assert not same(kepler.from_checkpoint(saved).record(5), expected)
 
 
-def test_bytes_of_another_length_are_refused(kepler):
+def test_bytes_of_wrong_length_are_rejected(kepler):
     with pytest.raises(StateError, match="invalid saved run: it has 3 bytes"):
         kepler.from_checkpoint(b"abc")
 
@@ -233,7 +233,7 @@ def test_a_time_that_is_no_number_is_named(kepler, t):
 
 
 @pytest.mark.parametrize("steps", [-1, 2.5, True])
-def test_a_run_asks_for_a_whole_number_of_steps(kepler, steps):
+def test_run_requires_an_integer_number_of_steps(kepler, steps):
     with pytest.raises(StateError, match="steps must be"):
         kepler.start(*STATE, h=0.1).record(steps)
 
@@ -268,7 +268,7 @@ def test_defaults_cannot_be_changed_through_the_stepper(kepler):
 # Steps that fail.
 
 
-def test_a_step_beyond_the_domain_fails_and_says_so(compiled):
+def test_step_beyond_the_domain_fails_with_a_message(compiled):
     """Leapfrog falls into the centre, where the potential is infinite."""
     stepper = compiled("kepler", StoermerVerlet())
     with pytest.raises(StepFailedError, match=r"infinite or NaN.*undefined there") as caught:
@@ -311,7 +311,7 @@ def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step
     assert run.checkpoint() == before
 
 
-def test_a_failed_run_can_go_on_with_better_options(compiled):
+def test_failed_run_continues_with_other_options(compiled):
     state = compiled("kepler", SVI(4)), STATE
     run = state[0].start(*STATE, h=0.3, options=SolverOptions(max_iterations=1))
     with pytest.raises(StepFailedError, match=r"did not converge.*larger max_iterations") as failed:
@@ -378,7 +378,7 @@ def test_momentum_and_velocity_are_inverse_and_the_oracles(sample, compiled, nam
     assert v == pytest.approx(expected.astype(float), abs=1e-14)
 
 
-def test_there_is_a_velocity_where_momenta_are_small_beside_their_terms(quickly_compiled):
+def test_velocity_is_found_where_momenta_cancel(quickly_compiled):
     """p = v + 5 sin(q) in which the terms cancel, as of charges in magnetic fields."""
     system = LagrangianSystem.from_text(
         name="driven pivot", coordinates=["q"], lagrangian="q_dot**2/2 + 5.345*sin(q)*q_dot"
@@ -389,7 +389,7 @@ def test_there_is_a_velocity_where_momenta_are_small_beside_their_terms(quickly_
         assert stepper.velocity(q, p) == pytest.approx(p - 5.345 * np.sin(q), abs=2e-15)
 
 
-def test_there_is_no_velocity_beyond_the_range_of_the_momenta(compiled, sample):
+def test_velocity_is_undefined_beyond_the_range_of_the_momenta(compiled, sample):
     """A momentum that no velocity below c gives in a system where there is one to find; and one given as nan."""
     stepper = compiled("relativistic-particle", SVI(3))
     v = stepper.velocity([0.0], [3.0])
@@ -448,7 +448,7 @@ def test_step_is_the_plus_transform_after_the_inverse_of_the_minus_transform(sam
 
 
 @each_action
-def test_momenta_are_slopes_of_the_discrete_lagrangian(sample, compiled, method):
+def test_momenta_are_derivatives_of_the_discrete_lagrangian(sample, compiled, method):
     name = "pumped-cart-pole"
     stepper, (q0, p0) = compiled(name, method), sample(name).state
     q1, p1 = stepper.step(q0, p0, 0.1, 0.3)
@@ -525,7 +525,7 @@ def test_an_action_that_does_not_exist_is_an_error(compiled):
         compiled("kepler", StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
 
 
-def test_methods_without_a_discrete_lagrangian_say_so(compiled):
+def test_methods_without_a_discrete_lagrangian_are_reported(compiled):
     for method in (SpectralCollocation(2), RadauIIA(2), ExplicitEuler(), SCVI(3, variational=False)):
         stepper = compiled("kepler", method)
         for call in (stepper.discrete_lagrangian, stepper.discrete_legendre_minus, stepper.step_positions):
@@ -543,7 +543,7 @@ def test_threads_may_share_a_stepper(kepler):
     assert all(same(run, expected) for run in found)
 
 
-def test_threads_with_different_parameters_do_not_meet(kepler):
+def test_threads_with_different_parameters_are_independent(kepler):
     values = [0.8 + 0.05 * k for k in range(8)]
 
     def final(mu):
@@ -568,7 +568,7 @@ def test_a_stepper_shows_system_and_method(kepler):
 
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
 @pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
-def test_the_fixed_point_starts_from_rest(name, method):
+def test_fixed_point_iteration_starts_from_rest(name, method):
     """The first sweep from rest has no velocity to measure changes by."""
     chosen = problem(name)
     rest = np.zeros(chosen.system.dimension)

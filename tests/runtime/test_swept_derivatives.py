@@ -41,7 +41,7 @@ def numbers_of(gradient):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_sweeps_carry_what_factors_do(name):
+def test_iterated_derivatives_equal_those_by_factorisation(name):
     """Forward and back, by all that is given; more directions than factors take at a time; runs kept now and then."""
     system, method, h = CASES[name]
     iterated, factored = (compile_stepper(system, method, solver=solver) for solver in ("auto", "newton"))
@@ -64,7 +64,7 @@ def test_sweeps_carry_what_factors_do(name):
         assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
 
 
-def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
+def test_unconverged_steps_are_differentiated_by_factorisation():
     """A spring that is too stiff for sweeps now and then."""
     spring = LagrangianSystem.from_text(
         name="spring that stiffens",
@@ -83,7 +83,7 @@ def test_steps_that_sweeps_do_not_solve_are_carried_over_by_factors():
         steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
 
 
-def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch):
+def test_large_jacobians_are_factorised(monkeypatch):
     system = problem("kepler").system
     found = fixed_point(system, SVI(2))
     partials = point_derivatives.point_derivatives_of(system, found)
@@ -92,7 +92,7 @@ def test_slopes_that_are_too_many_for_the_stack_are_left_to_factors(monkeypatch)
     assert point_derivatives.point_derivatives_of(system, found) is None
 
 
-def test_units_of_coordinates_do_not_tell_when_sweeps_end():
+def test_convergence_does_not_depend_on_units_of_coordinates():
     """A stiff coordinate, in units a million times as small or large: the same derivative, entry by entry."""
     text = "x_dot**2/2 + {a}**2*y_dot**2/2 - (x**2 + 36*{a}**2*y**2)/2 - x**2*({a}*y) + ({a}*y)**3/3"
     derivatives = []

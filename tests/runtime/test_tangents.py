@@ -40,7 +40,7 @@ def test_a_keplerian_orbit_returns_with_its_shear():
     assert_allclose(gradient @ monodromy, gradient, atol=1e-6)
 
 
-def test_steps_that_a_monitor_chose_are_held():
+def test_derivatives_at_fixed_transformed_steps():
     """The product of the derivatives of steps of these lengths."""
     kepler = problem("kepler")
     chosen = compile_stepper(kepler.system, SVI(4), monitor="frequency")
@@ -52,7 +52,7 @@ def test_steps_that_a_monitor_chose_are_held():
     assert_allclose(run.tangent()[-1], product, rtol=1e-9, atol=1e-9 * np.abs(product).max())
 
 
-def test_what_has_no_derivative():
+def test_systems_without_derivatives_are_rejected():
     kepler = problem("kepler")
     stepper = compile_stepper(kepler.system, SVI(2))
     run = stepper.integrate(kepler.q, velocity=kepler.velocity, h=0.05, steps=4)

@@ -38,14 +38,14 @@ def test_the_time_of_a_run_is_the_sum_of_its_steps_rounded(free, t, h):
     assert max(in_last_places(float(time), t, h, n) for n, time in enumerate(run.t)) <= 0.5 + 1e-9
 
 
-def test_it_still_is_after_a_million_steps(free):
+def test_time_is_the_rounded_sum_after_a_million_steps(free):
     run = free.start([0.0], [0.0], h=0.1, t=0.7)
     run.advance(1_000_000)
     assert in_last_places(run.t, 0.7, 0.1, 1_000_000) <= 0.5 + 1e-9
 
 
 @pytest.mark.parametrize(("t", "h"), GRIDS)
-def test_times_after_are_rounded_and_leave_the_rest(t, h):
+def test_times_are_rounded_with_compensation(t, h):
     numbers = np.array([0, 1, 2, 3, 1000, 10**9 + 7, 2**53 - 1])
     for n, high, low in zip(numbers.tolist(), *times_after(t, h, numbers), strict=True):
         assert in_last_places(high, t, h, n) <= 0.5 + 1e-9
@@ -67,7 +67,7 @@ def test_a_run_restored_has_the_time_it_had(free):
     assert again.t == run.t
 
 
-def test_states_know_the_step_that_follows(free):
+def test_states_store_the_following_step_size(free):
     run = free.integrate([0.1], [0.0], h=0.25, steps=8, save_every=2)
     assert run.step_sizes.tolist() == [0.25] * 5
     between = free.integrate([0.1], [0.0], h=0.25, steps=8, t_eval=[0.0, 0.3, 0.5])

@@ -109,7 +109,7 @@ def test_the_differentiation_matrix_is_equation_11_on_descending_points(N: int) 
 
 
 @pytest.mark.parametrize("nodes", [chebyshev_lobatto(30), legendre_lobatto(30), equispaced(30)], ids=lambda n: n.name)
-def test_degree_thirty_keeps_fifty_digits(nodes: object) -> None:
+def test_degree_thirty_has_fifty_digits(nodes: object) -> None:
     points = nodes.points
     at = gauss_legendre(31).points
     values, partials = cardinal_values(points, at), cardinal_derivatives(points, at)
@@ -138,7 +138,7 @@ def test_values_at_the_points_are_the_unit_matrix_and_rows_sum_to_one() -> None:
     assert all(abs(mp.fsum(row) - 1) < FIFTY_DIGITS for row in cardinal_values(points, (-2, mp.mpf("0.3"), 5)))
 
 
-def test_slopes_agree_with_numerical_differentiation() -> None:
+def test_derivatives_agree_with_numerical_differentiation() -> None:
     points = (0, Fraction(1, 3), Fraction(4, 5), 2)
     at = mp.mpf("0.37")
     numerical = [mp.diff(lambda t, j=j: cardinal_values(points, (t,))[0][j], at, h=mp.mpf("1e-20")) for j in range(4)]

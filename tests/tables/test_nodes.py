@@ -90,7 +90,7 @@ def test_legendre_families_are_roots_to_fifty_digits_of_mpmath_polynomials(degre
                 assert polynomial(point - width) * polynomial(point + width) < 0
 
 
-def test_known_digits_of_lobatto_and_gauss_points() -> None:
+def test_lobatto_and_gauss_points_have_published_digits() -> None:
     golden = legendre_gauss(9).points[-1]
     assert abs(golden - mp.mpf("0.97390652851717172007796401208445205342826994669238211923121")) < FIFTY_DIGITS
     assert abs(legendre_lobatto(4).points[3] - mp.sqrt(mp.mpf(3) / 7)) < FIFTY_DIGITS
@@ -140,7 +140,7 @@ def test_numbers_of_many_kinds_are_converted() -> None:
 
 
 @pytest.mark.parametrize("value", ["x", 1j, None, [1], sp.Symbol("x"), sp.I, float("nan"), float("inf")])
-def test_what_is_not_a_finite_real_number_is_refused(value: object) -> None:
+def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
     with pytest.raises(MethodError, match="give a"):
         to_number(value)
 

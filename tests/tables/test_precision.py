@@ -10,7 +10,7 @@ from scvi_codegen.tables.precision import DIGITS, mp
 ROOT = "1.41421356237309504880168872420969807856967187537694807317668"
 
 
-def test_a_thread_that_rounds_does_not_take_digits_from_another():
+def test_precision_is_local_to_a_thread():
     """Both are inside of their precision at once; afterwards each has 60 digits again."""
     both = Barrier(2)
 

@@ -94,7 +94,7 @@ def test_chebyshev_rules_are_interpolatory(n: int) -> None:
         np.testing.assert_allclose(np.array(rule.weights, float), expected, rtol=1e-13)
 
 
-def test_known_fifty_digits() -> None:
+def test_quadratures_have_fifty_published_digits() -> None:
     rule = gauss_legendre(10)
     assert abs(rule.weights[0] - mp.mpf("0.066671344308688137593568809893331792857864834320158")) < FIFTY_DIGITS
     assert abs(rule.points[0] + mp.mpf("0.97390652851717172007796401208445205342826994669238")) < FIFTY_DIGITS
@@ -159,7 +159,7 @@ def test_the_order_of_a_users_rule_is_computed() -> None:
         ((-1, 1), (1, "one"), 0, "not a real number"),
     ],
 )
-def test_what_is_no_quadrature_is_refused(points: tuple, weights: tuple, order: int, message: str) -> None:
+def test_invalid_quadratures_are_rejected(points: tuple, weights: tuple, order: int, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         Quadrature(name="mine", points=points, weights=weights, order=order)
 
@@ -177,7 +177,7 @@ def test_what_is_no_quadrature_is_refused(points: tuple, weights: tuple, order: 
         ("", "unknown quadrature"),
     ],
 )
-def test_names_that_mean_nothing_are_refused(name: str, message: str) -> None:
+def test_unknown_names_are_rejected(name: str, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         quadrature_by_name(name)
 

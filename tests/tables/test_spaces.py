@@ -61,7 +61,7 @@ def test_trigonometric_derivatives_along_the_curve() -> None:
     assert abs(mp.fdot(line, given) + mp.mpf(0.7) ** 3 * mp.cos(mp.mpf(0.7) * mp.mpf("0.3"))) < mp.mpf("1e-15")
 
 
-def test_one_piece_is_a_polynomial() -> None:
+def test_single_interval_is_a_polynomial() -> None:
     points, at = Splines(1).points(4, gauss_legendre(4)), (mp.mpf("0.3"), mp.mpf("0.9"))
     assert Splines(1).velocities(points, at) == cardinal_values(points, at)
 
@@ -102,7 +102,7 @@ def test_refused_spaces(make, message: str) -> None:
         make()
 
 
-def test_too_few_points_for_the_pieces_are_warned_of() -> None:
+def test_too_few_points_for_the_intervals_warn() -> None:
     with pytest.warns(MethodWarning, match="use at least 7 points"):
         SVI(4, "gauss-legendre:3", space="splines:2")
 
@@ -188,7 +188,7 @@ def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> N
 
 
 @pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
-def test_the_discrete_lagrangian_sums_the_derivatives_too(method: SVI) -> None:
+def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
     """It generates the step: p0 = -D1 L_d and p1 = D2 L_d by differences; and it is the action to the order."""
     system, h = problem("planar-pendulum").system, 0.4
     own = stepper(system, method)
@@ -238,7 +238,7 @@ def test_hermite_rules_by_name() -> None:
 # Where each wins.
 
 
-def test_trigonometric_curves_win_on_a_perturbed_oscillator() -> None:
+def test_trigonometric_curves_are_more_accurate_on_a_perturbed_oscillator() -> None:
     """Henon-Heiles at small energy, one step a radian: a thousandth of the error of polynomials of the same degree."""
     system, start = problem("henon-heiles").system, ([0.05, 0.02], [0.03, 0.06])
     fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=800)
@@ -249,7 +249,7 @@ def test_trigonometric_curves_win_on_a_perturbed_oscillator() -> None:
     assert errors[0] < 1e-9 < 1e-7 < errors[1]
 
 
-def test_splines_win_where_a_force_has_a_kink() -> None:
+def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
     """A triangular wave drives a pendulum; its kinks lie in the middle of the steps, where the splines have theirs."""
     system = LagrangianSystem.from_text(
         name="kinked drive", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q) + q*asin(sin(t))/5"
@@ -263,7 +263,7 @@ def test_splines_win_where_a_force_has_a_kink() -> None:
     assert errors[0] < errors[1] / 1e4
 
 
-def test_hermite_wins_with_two_points_a_step() -> None:
+def test_hermite_is_more_accurate_with_two_points_per_step() -> None:
     """Where L is wanted at the ends of a step alone, derivatives along the curve give order 8 in place of 2."""
     system, start = problem("planar-pendulum").system, ([1.0], [0.0])
     fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=80)

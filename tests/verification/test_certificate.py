@@ -74,7 +74,7 @@ def test_faults_find_their_text() -> None:
     assert [what for what, place in places.items() if not any(re.search(place, text) for text in texts)] == []
 
 
-def test_nothing_of_a_fault_is_left_in_the_process() -> None:
+def test_planted_fault_leaves_no_trace_in_the_process() -> None:
     """Its iteration of Newton, say, borrowed by sweeps that are the same with the fault and without it."""
     (mutation,) = (one for one in MUTATIONS if one.name == "momentum by A for A^T")
     assert caught(mutation)
@@ -83,7 +83,7 @@ def test_nothing_of_a_fault_is_left_in_the_process() -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_sabotaged_passes_whole(name: str) -> None:
+def test_unmodified_systems_pass(name: str) -> None:
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
     assert "stage equations" in {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
@@ -165,7 +165,7 @@ def test_constraints_are_certified_under_inputs_that_stay_what_they_are() -> Non
     assert {check.name: check.outcome for check in checks}["constraints"] is Outcome.SATISFIED
 
 
-def test_another_integrator_than_the_one_promised_is_not_certified() -> None:
+def test_different_integrator_is_not_certified() -> None:
     system = problem("planar-pendulum").system
     other = compile_stepper(system, SpectralCollocation(2), flags=QUICK_FLAGS)
     names = {check.name for check in pendulum_certificate(stepper=other).violated}
@@ -185,7 +185,7 @@ def test_another_integrator_than_the_one_promised_is_not_certified() -> None:
         (lambda: violated(ZeroDivisionError("by zero")), Outcome.NOT_MEASURED),
     ],
 )
-def test_what_cannot_be_measured_is_never_called_kept(measure, outcome) -> None:
+def test_unmeasurable_properties_are_not_reported_as_satisfied(measure, outcome) -> None:
     (check,) = checked("name", "promise", measure)
     assert check.outcome is outcome
     assert check.outcome is not Outcome.NOT_MEASURED or check.remark
@@ -206,7 +206,7 @@ def test_the_exact_motion_is_exact() -> None:
 
 
 @pytest.mark.parametrize("name", ["relativistic-particle", "double-pendulum"])
-def test_velocities_are_found_where_newton_would_leave_the_domain(name: str) -> None:
+def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
     motion = exact_motion(problem(name).system)
     size = motion.system.dimension
     q, v = np.array([mp.mpf("0.3")] * size), np.array([mp.mpf("0.9")] * size)
@@ -256,7 +256,7 @@ def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> N
     assert command(str(folder), "--degree", "3")[0] == 2
 
 
-def test_a_certificate_says_what_takes_long_and_how_long(quickly_compiled, monkeypatch, capsys):
+def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, monkeypatch, capsys):
     entry = problem("harmonic-oscillator")
     said: list[str] = []
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.0)

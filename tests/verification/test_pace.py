@@ -37,7 +37,7 @@ def checks_of(given: Case) -> Iterator[Check]:
 
 
 @pytest.mark.parametrize("name", PACES)
-def test_what_runs_make_of_steps_is_measured(name: str) -> None:
+def test_local_error_of_run_steps_is_measured(name: str) -> None:
     given, promises = PACES[name]
     checks = list(checks_of(given))
     assert all(check.outcome is Outcome.SATISFIED for check in checks), "\n".join(map(str, checks))
