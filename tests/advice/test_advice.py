@@ -82,7 +82,9 @@ class TestAchievedErrors:
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("eccentricity", [0.2, 0.5])
     @pytest.mark.parametrize("method", [SVI(8), SVI(4), Gauss(3), RadauIIA(3), SCVI(4)], ids=name)
-    def test_kepler(self, method: Method, eccentricity: float, tolerance: float):
+    def test_advised_step_achieves_the_tolerance_for_kepler(
+        self, method: Method, eccentricity: float, tolerance: float
+    ):
         system, (q, p), span = problem("kepler").system, kepler_start(eccentricity), 100.0
         advice = advise(system, method, q, p, span, tolerance)
         size = math.sqrt(1.0 + 1.5 * eccentricity**2)  # in the mean over an orbit
@@ -103,7 +105,9 @@ class TestAchievedErrors:
         ],
         ids=name,
     )
-    def test_runs_longer_than_the_pilot(self, method: Method, span: float, tolerance: float):
+    def test_advised_step_achieves_the_tolerance_beyond_the_pilot_run(
+        self, method: Method, span: float, tolerance: float
+    ):
         """Errors are extrapolated: linearly, and quadratically for Radau; the step of Stoermer-Verlet by its order."""
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, method, q, p, span, tolerance)
@@ -112,7 +116,7 @@ class TestAchievedErrors:
 
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("method", [SVI(8), SVI(4), RadauIIA(3)], ids=name)
-    def test_pendulum(self, method: Method, tolerance: float):
+    def test_advised_step_achieves_the_tolerance_for_the_pendulum(self, method: Method, tolerance: float):
         q, p, span = [1.5], [0.0], 1100.0
         advice = advise(pendulum(), method, q, p, span, tolerance)
         error = achieved(pendulum(), advice, q, p, pendulum_end(span), 1.5 / math.sqrt(2.0))
@@ -121,7 +125,7 @@ class TestAchievedErrors:
     @pytest.mark.parametrize(
         ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
     )
-    def test_outer_solar_system(self, method: Method, tolerance: float):
+    def test_advised_step_achieves_the_tolerance_for_the_outer_solar_system(self, method: Method, tolerance: float):
         system, span = problem("outer-solar-system").system, 100_000.0
         stepper = compile_stepper(system, method)
         q, v = np.array(POSITIONS).ravel().tolist(), np.array(VELOCITIES).ravel().tolist()
@@ -131,7 +135,7 @@ class TestAchievedErrors:
         error = achieved(system, advice, q, p, exact, float(np.linalg.norm(exact)))
         assert_as_promised(advice, error, tolerance)
 
-    def test_backward_with_parameters_and_time(self):
+    def test_advice_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
         values = {"gamma": 0.3, "omega": 1.2}
         advice = advise(system, SVI(6), [1.0], [0.0], span, 1e-8, parameters=values, t=3.0)
@@ -160,7 +164,7 @@ def outer_reference(span: float) -> np.ndarray:
 class TestDegree:
     @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")  # two digits are wanted
     @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-11])
-    def test_the_degree_with_the_fewest_evaluations(self, tolerance: float):
+    def test_degree_minimises_the_number_of_evaluations(self, tolerance: float):
         """By count, hence the same each time: degree 8 fills a register, which degrees below pay for without use."""
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, SVI(4), q, p, 200.0, tolerance, degree=True)
@@ -180,7 +184,7 @@ class TestDegree:
     def test_stages_of_a_runge_kutta_method_are_its_degree(self):
         assert advise(pendulum(), Gauss(5), [1.5], [0.0], 20.0, 1e-6).degree == 5
 
-    def test_methods_without_one(self):
+    def test_methods_without_a_degree(self):
         assert advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3).degree is None
         with pytest.raises(MethodError, match="stoermer-verlet has no degree or number of stages to choose"):
             advise(pendulum(), StoermerVerlet(), [1.5], [0.0], 20.0, 1e-3, degree=True)
@@ -241,7 +245,7 @@ class TestHonesty:
         assert len(advice.warnings) == 1
         assert re.search(r"diverge tenfold every \S+ units of time \(chaos\).*uncertain", advice.warnings[0])
 
-    def test_chaos_over_a_short_span_is_none(self):
+    def test_chaotic_system_over_a_short_span_is_not_called_chaotic(self):
         entry = problem("double-pendulum")
         stepper = compile_stepper(entry.system, SVI(8))
         p = stepper.momentum(entry.q, entry.velocity)
@@ -250,14 +254,14 @@ class TestHonesty:
         ends = [stepper.integrate(entry.q, p, h=advice.h / n, steps=n * advice.steps).q[-1] for n in (1, 3)]
         assert 1e-7 < np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1]) < 2e-5
 
-    def test_slow_chaos_is_seen_in_long_runs(self):
+    def test_slow_chaos_is_detected_in_long_runs(self):
         """Of Henon and Heiles at the energy 1/6: errors grow tenfold every 60 units of time or so."""
         entry = problem("henon-heiles").system
         q, p = [0.0, -0.1475], [math.sqrt(1.0 / 3.0 - 0.1475**2 - 2.0 * 0.1475**3 / 3.0), 0.0]
         advice = advise(entry, SVI(8), q, p, 1e5, 1e-6)
         assert any("chaos" in warning for warning in advice.warnings)
 
-    def test_errors_that_grow_quadratically_are_extrapolated_so(self):
+    def test_quadratic_error_growth_is_extrapolated_quadratically(self):
         system, (q, p) = problem("kepler").system, kepler_start(0.5)
         message = advise(system, RadauIIA(3), q, p, 50_000.0, 1e-6).message
         assert float(re.search(r"grew like t\^(\d\.\d)", message)[1]) > 1.3  # type: ignore[index]
@@ -273,13 +277,13 @@ class TestHonesty:
         message = advise(entry.system, SVI(8), entry.q, p, 5.0, 1e-6).message
         assert re.search(r"The solver fails at a step size of \S+: not (converged|finite)", message)
 
-    def test_a_method_of_low_order_gets_a_step_too_short_to_be_tried(self):
+    def test_low_order_method_is_advised_a_step_too_short_for_the_pilot(self):
         advice = advise(pendulum(), ExplicitEuler(), [1.5], [0.0], 10.0, 1e-6)
         assert "was not tried: the error is extrapolated by order 1" in advice.message
         assert advice.steps > 10**6
 
     @pytest.mark.parametrize(("q", "p"), [([0.0], [0.0]), ([0.3], [0.0]), ([0.0], [1e-3])])
-    def test_equilibria_and_turning_points_do_not_confuse(self, q: list[float], p: list[float]):
+    def test_equilibria_and_turning_points_give_correct_advice(self, q: list[float], p: list[float]):
         advice = advise(pendulum(), SVI(6), q, p, 100.0, 1e-9)
         assert advice.warnings == ()
         stepper = compile_stepper(pendulum(), SVI(6))
@@ -297,7 +301,7 @@ class TestHonesty:
             ({"parameters": {"mass": 1.0}}, "there is no parameter 'mass'"),
         ],
     )
-    def test_faults_are_named(self, changes: dict[str, object], message: str):
+    def test_invalid_arguments_are_named(self, changes: dict[str, object], message: str):
         arguments: dict[str, object] = {"q": [1.0], "p": [0.0], "span": 10.0, "tolerance": 1e-6} | changes
         with pytest.raises(StateError, match=message):
             advise(pendulum(), SVI(6), **arguments)  # type: ignore[arg-type]

@@ -37,7 +37,7 @@ def run(words: str) -> Result:
 
 
 class TestLongSteps:
-    def test_the_worst_is_named_with_what_to_do(self, kepler):
+    def test_worst_step_is_named_with_a_remedy(self, kepler):
         with pytest.warns(
             sc.AccuracyWarning, match=r"h = 1 is too large: .* step from t = \S+ is about .*t_end= without h"
         ):
@@ -45,7 +45,7 @@ class TestLongSteps:
         assert trajectory.step_error > 1e-3
         assert "too large" in trajectory._repr_html_()
 
-    def test_short_ones_are_not(self, kepler):
+    def test_accurate_steps_do_not_warn(self, kepler):
         assert kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.05, steps=100).step_error < 1e-3
 
     def test_warning_is_issued_once_per_run(self, kepler):
@@ -56,7 +56,7 @@ class TestLongSteps:
 
     @pytest.mark.filterwarnings("error")
     @pytest.mark.parametrize(("name", "h"), [("cart-pole", 0.02), ("charged-particle", 0.1)])
-    def test_a_coordinate_that_hardly_moves_from_0_is_no_reason(self, name, h):
+    def test_coordinate_that_hardly_moves_from_0_does_not_warn(self, name, h):
         """Errors are those of the state: beside its own size that of such a coordinate is large, whatever the step."""
         chosen = sc.problem(name)
         stepper = sc.compile_stepper(chosen.system, sc.SVI(2))
@@ -226,7 +226,7 @@ class TestLostEnergy:
 
 
 class TestPromises:
-    def test_a_collision_nearly_is_run_through_or_refused(self):
+    def test_near_collision_is_integrated_or_rejected(self):
         state = "--q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
         assert re.search(r"q1 =\s+1\.99", run(f"kepler {state} --tolerance 1e-9").output)
         refused = run(f"kepler {state} --advise 1e-9")
@@ -240,7 +240,7 @@ class TestPromises:
         assert motion.y[0, -1] == pytest.approx(1.999, abs=1e-6)
         assert motion.trajectory.plan is not None
 
-    def test_a_step_that_is_worse_than_the_tolerance_breaks_it(self, kepler):
+    def test_step_error_above_the_tolerance_is_a_violation(self, kepler):
         trajectory = kepler.integrate([0.4, 0.0], [0.0, 2.0], h=0.2, steps=100)
         system = sc.problem("kepler").system
         assert "alone has a relative error" in missed_tolerance(system, trajectory, trajectory.step_error / 20.0)
@@ -249,7 +249,7 @@ class TestPromises:
     @pytest.mark.parametrize(
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
     )
-    def test_an_estimate_that_is_too_large_does_not(self, name, method):
+    def test_overestimated_error_is_not_a_violation(self, name, method):
         """Where a force passes through zero on a step, its highest coefficient is taken for more than it is."""
         problem, tolerance = sc.problem(name), 1e-9
         stepper = sc.compile_stepper(problem.system, method)
@@ -272,7 +272,7 @@ class TestPromises:
         assert missed_tolerance(system, trajectory, tolerance) == ""
         assert "a second run with other steps differs by" in missed_tolerance(system, trajectory, tolerance, known)
 
-    def test_an_energy_that_is_not_conserved_breaks_it(self):
+    def test_energy_drift_is_a_violation(self):
         euler = sc.compile_stepper(sc.problem("kepler").system, sc.ExplicitEuler())
         trajectory = euler.integrate([1.0, 0.0], [0.0, 1.0], h=0.01, steps=500)
         assert "energy" in missed_tolerance(sc.problem("kepler").system, trajectory, 1e-4)
@@ -280,7 +280,7 @@ class TestPromises:
     @pytest.mark.parametrize(
         "given", [{"forces": {"q": "-q_dot/2"}}, {"damping": "1/2"}], ids=lambda each: next(iter(each))
     )
-    def test_an_energy_that_forces_change_does_not(self, given):
+    def test_energy_change_by_forces_is_not_a_violation(self, given):
         text = {"name": "damped", "coordinates": ["q"], "lagrangian": "q_dot**2/2 + cos(q)"}
         damped = sc.LagrangianSystem.from_text(**text, **given)
         trajectory = sc.compile_stepper(damped, "svi:8").integrate([1.0], [0.0], h=0.1, steps=100)
@@ -314,7 +314,7 @@ class TestKnownDigits:
         assert np.all(known.q < 100.0 * np.linalg.norm(error))
         assert not known.chaotic
 
-    def test_chaos_is_seen(self):
+    def test_chaos_is_detected(self):
         problem = sc.problem("double-pendulum")
         stepper = sc.compile_stepper(problem.system, sc.SVI(8))
         trajectory = stepper.integrate(problem.q, velocity=problem.velocity, h=0.02, steps=2500)

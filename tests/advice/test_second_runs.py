@@ -52,7 +52,7 @@ def test_the_second_run_has_the_time_and_parameters_of_the_first(driven, h):
     assert not known.chaotic
 
 
-def test_advice_is_of_the_parameters_and_the_time_given(driven):
+def test_advice_uses_the_supplied_parameters_and_time(driven):
     advice = advise(driven, "svi:2", [0.75], [-0.5], SPAN, 1e-5, parameters=STIFFER, t=T)
     assert advice.h * advice.steps == pytest.approx(SPAN)
     trajectory = run(driven, advice.h)
@@ -71,7 +71,7 @@ def test_accidentally_small_final_error_is_not_the_error():
 
 
 @pytest.mark.parametrize("span", [20.0, 50.0])
-def test_chaos_is_growth_by_decades(span):
+def test_chaos_is_defined_by_growth_over_decades(span):
     share = np.linspace(0.0, 1.0, 1024)
     assert _tenfold(1e-13 * 10.0 ** (8.0 * share), span) == pytest.approx(span / 8.0, rel=0.02)
     assert _tenfold(1e-13 * (1.0 + 1e3 * share), span) == math.inf

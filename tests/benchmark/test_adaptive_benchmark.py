@@ -63,7 +63,7 @@ def test_keplers_reference_returns_after_a_period(e):
 
 @pytest.mark.full
 @needs_extended
-def test_references_on_chosen_steps_are_those_on_equal_ones():
+def test_references_on_selected_steps_equal_those_on_uniform_steps():
     chosen = replace(adaptive_case("atwood"), span=3.0)
     found = adaptive.adaptive_reference(chosen)
     assert found.accuracy < 1e-17
@@ -110,7 +110,7 @@ def test_all_modes_run_and_agree():
     assert all(f"adaptive:{name}" in bench.SECTIONS for name in ADAPTIVE_CASES)
 
 
-def test_steps_in_the_picture_follow_the_motion(tmp_path):
+def test_plotted_steps_follow_the_motion(tmp_path):
     for name, (t, lengths) in step_sizes().items():
         assert len(t) == len(lengths) > 20, name
         assert lengths.max() > 8.0 * lengths.min()

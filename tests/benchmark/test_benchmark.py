@@ -139,7 +139,7 @@ class TestCases:
             assert chosen.q.shape == chosen.velocity.shape == (cases.STATES, chosen.dimension)
             assert len(np.unique(chosen.q, axis=0)) == cases.STATES
 
-    def test_unknown_names(self):
+    def test_unknown_names_are_rejected(self):
         with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
             cases.case("dufing")
         with pytest.raises(StateError, match=r"there is no section 'drif'; did you mean 'drift'\?"):
@@ -226,7 +226,7 @@ class TestReference:
         moved = reference(chosen, momenta)
         assert 0 < np.abs((moved.high - reference(chosen).high) + (moved.low - reference(chosen).low)).max() < 1e-14
 
-    def test_our_ensemble_arrives_there(self, monkeypatch):
+    def test_ensemble_converges_to_the_reference(self, monkeypatch):
         monkeypatch.setattr(ours, "advised_counts", lambda *_, quick: {100: 1e-12})
         chosen = short("kepler:0.2", 50.0)
         (ensemble,) = our_ensembles(chosen)
@@ -253,11 +253,11 @@ class TestCurves:
         assert time_at(curve, 1e-15) == time_at(curve, FLOOR) == pytest.approx(2.0)
         assert time_at(points((1.0, 1e-11), (4.0, 0.0)), FLOOR) < 4.0
 
-    def test_a_slower_setting_that_is_less_accurate_does_not_matter(self):
+    def test_slower_and_less_accurate_settings_are_ignored(self):
         curve = points((1.0, 1e-6), (2.0, 1e-10))
         assert time_at([*curve, *points((3.0, 1e-7), (1.5, 1e-5), (1.0, math.nan))], 1e-8) == time_at(curve, 1e-8)
 
-    def test_the_common_error_is_one_that_both_reach(self):
+    def test_common_error_is_reached_by_both_programs(self):
         one, other = points((1.0, 1e-11)), points((1.0, 1e-9), (2.0, 1e-16))
         assert common_error(one, other) == pytest.approx(2e-11)
         assert common_error(other, other) == FLOOR
@@ -362,7 +362,7 @@ class TestMeasuring:
         assert (good.error, good.repeats, last.repeats) == (0.0, 2, 2)
         assert bad.failure == "ArithmeticError: no"
 
-    def test_an_ensemble_is_one_run_whose_time_is_shared(self):
+    def test_ensemble_is_one_run_with_divided_time(self):
         high = np.arange(8.0)[:, None]
         final = np.tile(high, (2, 1))
         ensemble = Contender(
@@ -432,7 +432,7 @@ class TestCommand:
         with pytest.raises(StateError, match="not a report that can be resumed: KeyError: 'cases'"):
             bench.benchmark(json_path=str(path), resume=True)
 
-    def test_picture(self, tmp_path):
+    def test_benchmark_command_draws_a_picture(self, tmp_path):
         pytest.importorskip("matplotlib")
         from scvi_codegen.benchmark.picture import plot_curves
 
@@ -625,7 +625,7 @@ class TestTables:
         assert [row["system"] for row in rows] == ["pendulum"] * 2 + ["cart-pole"] * 2
         assert all(row[name] > 0.0 for row in rows for name in ("bare", "assign", "hold", "advance", "sample", "look"))
 
-    def test_start_up(self):
+    def test_start_up_time_is_measured(self):
         cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows
         assert (cold["cache"], cached["cache"]) == ("cold", "cached")
         assert cold["sympy_by_import"] == "False"

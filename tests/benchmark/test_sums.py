@@ -52,7 +52,7 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
 
 
 @pytest.mark.full
-def test_rebound_settles_where_we_do():
+def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
     ours, theirs = cluster._ours(each, "svi:8", 32)(), cluster._rebound(each, "ias15", None)()

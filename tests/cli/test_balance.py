@@ -62,7 +62,7 @@ def test_printed_balance_is_that_of_the_run():
     assert found["energy_balance"] == pytest.approx(error)
 
 
-def test_damping_and_inputs_have_one():
+def test_damping_and_inputs_have_a_work_balance():
     damped = MODEL.replace("lagrangian", "damping = 0.1\nlagrangian").replace('[forces]\nx = "-x_dot/10"\n', "")
     assert "energy: damping takes it" in (text := output_of(damped))
     assert "energy balance |E - E0 - W|" in text

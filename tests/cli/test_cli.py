@@ -74,7 +74,7 @@ def chosen(name: str = "kepler", **choices: object) -> Model:
 
 
 class TestHelp:
-    def test_overview_teaches_by_examples(self):
+    def test_overview_shows_examples(self):
         text = output_of("--help")
         assert "scvi-codegen run kepler" in text
         for command in ("generate", "derive", "run", "systems", "methods"):
@@ -180,7 +180,7 @@ class TestChoices:
             ({"degree": 3, "quadrature": "hermite:3"}, SVI(3, "hermite:3")),
         ],
     )
-    def test_methods(self, choices, method):
+    def test_methods_are_selected_by_name(self, choices, method):
         assert chosen(**choices).method == method
 
     def test_options_supply_what_a_file_lacks(self):
@@ -191,7 +191,7 @@ class TestChoices:
         model = chosen("bare.toml", q=(1.0, 0.0), velocity=(0.0, 1.0), step=0.1, steps=2)
         assert (model.method, model.h, model.steps, model.p) == (SVI(8), 0.1, 2, None)
 
-    def test_a_chosen_quadrature_survives_another_degree(self):
+    def test_selected_quadrature_is_retained_for_another_degree(self):
         save_model(replace(chosen(), method=SVI(3, "clenshaw-curtis:7")), "a.toml")
         assert chosen("a.toml", degree=4).method == SVI(4, "clenshaw-curtis:7")
 
@@ -270,7 +270,7 @@ class TestChoices:
     def test_mistakes_are_usage_errors(self, words, message):
         assert message in error_of("run", *words.split())
 
-    def test_a_faulty_formula_is_pointed_at(self):
+    def test_faulty_formula_is_marked_at_its_column(self):
         Path("a.toml").write_text(output_of("systems", "planar-pendulum").replace("cos(q)", "cos(angle)"))
         message = error_of("run", "a.toml")
         assert message.startswith("Error: a.toml: [system]: unknown name 'angle'")
@@ -307,7 +307,7 @@ class TestRun:
         assert float(re.search(r"angular momentum: (\S+) at most", text)[1]) < 1e-14
         assert re.search(r"final state.*\n  q1 = ", text)
 
-    def test_the_solver_can_be_chosen(self):
+    def test_solver_can_be_selected(self):
         for solver in ("newton", "fixed-point"):
             assert "a step" in output_of("run", "kepler", "--span", "5", "--solver", solver)
         output_of("generate", "kepler", "-o", "kepler_newton", "--solver", "newton")
@@ -315,7 +315,7 @@ class TestRun:
         assert "'newton', 'explicit'" in error_of("run", "kepler", "--solver", "guess")
         assert "not explicit for this system" in error_of("run", "kepler", "--solver", "explicit")
 
-    def test_a_drift_is_seen(self):
+    def test_energy_drift_is_detected(self):
         text = output_of("run", "kepler", "--method", "explicit-euler", "--step", "0.001", "--span", "10")
         assert float(re.search(r"drift (\S+) over", text)[1]) > 1e-3
         change, note = re.search(r"relative error of angular momentum: (\S+) at most(.*)", text).groups()
@@ -342,7 +342,7 @@ class TestRun:
         assert errors[-1] < 0.01 * errors.max()
         assert f"relative energy error: {errors.max():.2e} at most" in energy_report(problem("kepler").system, run)
 
-    def test_long_states_are_cut_short(self):
+    def test_long_states_are_abbreviated(self):
         text = output_of("run", "fput-chain:9", "--steps", "3")
         assert "and 3 more coordinates" in text
         assert "q7" not in text
@@ -351,7 +351,7 @@ class TestRun:
         assert "L depends on time" in output_of("run", "duffing", "--parameter", "gamma=0.3")
 
     @pytest.mark.parametrize("save_every", [1, 7])
-    def test_writes_the_trajectory_that_integrate_gives(self, save_every):
+    def test_saved_trajectory_equals_integrate(self, save_every):
         for name in ("orbit.npz", "orbit.csv"):
             output_of("run", "kepler", "--steps", "500", "--save-every", str(save_every), "-o", name)
         model = chosen(steps=500)
@@ -362,7 +362,7 @@ class TestRun:
         columns = [expected.t, expected.q, expected.p, expected.iterations, expected.velocity, expected.energy()]
         assert np.array_equal(table, np.column_stack(columns))
 
-    def test_steps_fewer_than_every_and_none_at_all(self):
+    def test_fewer_steps_than_save_every_and_no_steps(self):
         assert "3 steps of 0.25 from t = 0 to t = 0.75; 1 state saved" in output_of(
             "run", "kepler", "--steps", "3", "--save-every", "5", "-o", "a.npz"
         )
@@ -418,10 +418,10 @@ class TestRun:
         assert "the initial state was not written to a file (-o, --plot)" in result.stderr
         assert "energy" not in result.stdout
 
-    def test_a_state_without_energy_is_no_traceback(self):
+    def test_state_without_energy_is_reported_without_traceback(self):
         assert "failed" in error_of("run", "kepler", "--q", "0,0", "-o", "a.csv", status=1)
 
-    def test_a_missing_compiler_is_a_failure_of_the_machine(self, monkeypatch):
+    def test_missing_compiler_is_a_failure(self, monkeypatch):
         monkeypatch.setenv("CC", "no-such-compiler")
         assert "CC ('no-such-compiler') was not found" in error_of("run", "kepler", status=1)
 
@@ -474,7 +474,7 @@ class TestGenerate:
         assert "import pendulum_svi" in text
         assert load_model("out/pendulum_svi/model.toml").method == SVI(2)
 
-    def test_edited_files_need_force(self):
+    def test_edited_files_require_force(self):
         output_of("generate", "planar-pendulum", "-o", "pendulum_svi")
         Path("pendulum_svi/main.c").write_text("int main(void) { return 0; }\n")
         assert "--force" in error_of("generate", "planar-pendulum", "-o", "pendulum_svi")
@@ -487,17 +487,17 @@ class TestGenerate:
 class TestDerive:
     words = ("derive", "planar-pendulum", "--degree", "2")
 
-    def test_text(self):
+    def test_derive_prints_text(self):
         text = output_of(*self.words)
         assert "(27a)" in text
         assert "sqrt" in output_of(*self.words, "--radicals")
 
-    def test_latex_into_a_file(self):
+    def test_derive_writes_latex_to_a_file(self):
         result = invoke(*self.words, "--latex", "-o", "step.tex")
         assert (result.exit_code, result.stdout) == (0, "")
         assert r"\tag{27a}" in Path("step.tex").read_text()
 
-    def test_a_folder_that_is_not_there(self):
+    def test_missing_folder_is_reported(self):
         assert "there is no folder 'no'" in error_of(*self.words, "-o", "no/step.tex")
 
 

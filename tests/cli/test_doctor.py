@@ -71,12 +71,12 @@ def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
     assert findings(1)["compiler"]["status"] == "fails"
 
 
-def test_a_compiler_that_is_named_and_not_there(monkeypatch):
+def test_missing_named_compiler_is_reported(monkeypatch):
     monkeypatch.setenv("CC", "no-such-cc")
     assert "in the environment variable CC ('no-such-cc')" in findings(1)["compiler"]["remedy"]
 
 
-def test_a_compiler_that_refuses_is_quoted(monkeypatch):
+def test_output_of_a_failing_compiler_is_quoted(monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", "-no-such-flag")
     found = findings(1)
     assert found["compiler"]["status"] == "ok"
@@ -86,14 +86,14 @@ def test_a_compiler_that_refuses_is_quoted(monkeypatch):
     assert "-no-such-flag" in found["flags"]["found"]
 
 
-def test_instructions_that_the_processor_does_not_have_end_the_trial_alone(tmp_path, monkeypatch):
+def test_illegal_instructions_end_only_the_trial_process(tmp_path, monkeypatch):
     header = tmp_path / "trap.h"
     header.write_text("__attribute__((constructor)) static void trap(void) { __builtin_trap(); }\n")
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-O0 -include {header}")
     assert re.search("the compiled program was ended by SIG(ILL|TRAP)", findings(1)["trial"]["remedy"])
 
 
-def test_arithmetic_that_is_broken_is_found_out(tmp_path, monkeypatch):
+def test_faulty_arithmetic_is_detected(tmp_path, monkeypatch):
     header = tmp_path / "coarse.h"
     header.write_text("#include <math.h>\n#define sin(x) (0.9 * sin(x))\n")
     monkeypatch.setenv("SCVI_CODEGEN_CFLAGS", f"-O0 -USCVI_LIBMVEC -include {header}")
@@ -110,7 +110,7 @@ def test_steppers_with_and_without_vector_functions_are_distinguished(monkeypatc
 
 
 @pytest.mark.usefixtures("without_trial")
-def test_a_cache_that_is_not_used_is_named(tmp_path, monkeypatch):
+def test_unused_cache_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "file" / "cache"))
     assert "is not writable" in findings()["cache"]["remedy"]
@@ -124,7 +124,7 @@ def test_a_cache_that_is_not_used_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("without_trial")
-def test_extras_are_those_of_the_project_with_what_they_lack(monkeypatch):
+def test_extras_are_listed_with_missing_packages(monkeypatch):
     extras = tomllib.loads(PROJECT.read_text())["project"]["optional-dependencies"]
     before = findings()
     assert {name.removeprefix("extra ") for name in before if name.startswith("extra ")} == set(extras)

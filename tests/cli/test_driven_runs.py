@@ -101,7 +101,7 @@ def test_unsupported_options_are_rejected(words, said):
     assert said in result.stderr
 
 
-def test_an_ensemble_of_them(model):
+def test_ensemble_of_runs_with_inputs(model):
     Path("many.csv").write_text("q,q_dot\n0.1,0\n0.2,1\n0.3,-1\n")
     Path("pushed.toml").write_text(MODEL.replace("cos(q)", "(1 + u)*cos(q)").replace('[forces]\nq = "u"\n', ""))
     text = output_of("--ensemble", "many.csv", "-o", "many.npz")
@@ -125,7 +125,7 @@ def test_runs_without_steps_and_columns_of_inputs():
     assert "'u_0' is not a coordinate" in invoke("--ensemble", "many.csv").stderr
 
 
-def test_an_input_that_is_not_given():
+def test_missing_input_is_reported():
     Path("pushed.toml").write_text(MODEL.replace("[inputs]\nu = {", "[parameters]\n# {"))
     assert "the input u is not set" in invoke().stderr
     assert "final state" in output_of("--input", "u=u.csv")

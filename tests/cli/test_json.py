@@ -116,7 +116,7 @@ def test_failed_run_reports_how_far_it_got():
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
 
 
-def test_advice_folders_and_ensembles():
+def test_json_of_advice_folders_and_ensembles():
     advised = document("run", "kepler", "--span", "10", "--advise", "1e-6")
     assert advised["advice"]["h"] == advised["h"]
     assert advised["advice"]["steps"] == advised["steps"]
@@ -132,7 +132,7 @@ def test_advice_folders_and_ensembles():
     assert len(many["energy"]) == 3
 
 
-def test_lists_and_model_files():
+def test_json_of_lists_and_model_files():
     listed = document("systems")["systems"]
     assert [entry["name"] for entry in listed] == list(sc.PROBLEMS)
     assert listed[0]["parameters"]["m"] == 1.0
@@ -148,7 +148,7 @@ def test_lists_and_model_files():
     assert np.sum(tableau["A"], axis=1) == pytest.approx(tableau["c"], abs=1e-16)
 
 
-def test_a_certificate_is_the_one_that_is_saved():
+def test_certificate_equals_the_saved_one():
     found = document("verify", "planar-pendulum", "--method", "svi:1", "-o", "certificate.json")
     assert found == json.loads(Path("certificate.json").read_text())
 

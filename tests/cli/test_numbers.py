@@ -326,7 +326,7 @@ def balance_fits(done: Done, found: float) -> bool:
     return abs(found - largest(energy - energy[0] - run.work())) < 1e-14 and found > 0.0
 
 
-def test_every_field_of_the_json(done):
+def test_every_field_of_the_json_is_correct(done):
     checks = expected_fields(done)
     assert done.numbers.keys() == checks.keys()
     wrong = {name: done.numbers[name] for name, check in checks.items() if not check(done.numbers[name])}
@@ -379,7 +379,7 @@ def energy_line(done: Done, line: str) -> None:
     assert float(found[2]) == pytest.approx(drift(done, abs(energy[0])), rel=0.06)
 
 
-def test_every_line_of_the_text(done):
+def test_every_line_of_the_text_is_correct(done):
     lines = list(done.lines)
     first_lines(done, lines)
     energy_line(done, lines[4])
@@ -418,7 +418,7 @@ def springs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kind:
     return kind
 
 
-def test_every_field_and_line_of_an_ensemble(springs):
+def test_every_field_and_line_of_an_ensemble_is_correct(springs):
     Path("grid.toml").write_text("[grid]\nx = [0.5, 1.0, 1.5]\nk = [0.5, 2.0]\n")
     words = ("run", "model.toml", *springs.words, "--parameter", f"m={M}", "--parameter", f"c={C}", "--ensemble")
     numbers = document(*words, "grid.toml", "-o", "many.npz")
@@ -460,7 +460,7 @@ def test_every_field_and_line_of_an_ensemble(springs):
     assert len(lines) == 7
 
 
-def test_every_field_and_line_of_a_recorded_run(springs):
+def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
     words = ("run", "model.toml", *springs.words, *CHANGED)
     numbers, memory = document(*words, "-o", "long.run"), document(*words)
     checks: dict[str, Callable[[Any], bool]] = {
@@ -486,7 +486,7 @@ def test_every_field_and_line_of_a_recorded_run(springs):
     assert finals == expected
 
 
-def test_every_number_of_advice(springs):
+def test_every_number_of_advice_is_correct(springs):
     words = ("run", "model.toml", "--span", "5.25", *CHANGED, "--advise", "1e-6")
     numbers = document(*words, "-o", "advised.npz")
     advice = numbers["advice"]
@@ -535,7 +535,7 @@ method = "svi:2"
 """
 
 
-def test_every_field_and_line_of_an_array_system(tmp_path, monkeypatch):
+def test_every_field_and_line_of_an_array_system_is_correct(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("ring.toml").write_text(RING)
     words = ("run", "ring.toml", "--step", "0.25", "--steps", "60", "--save-every", "4", "--parameter", "k=0.75")

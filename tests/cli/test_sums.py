@@ -71,7 +71,7 @@ def test_adaptive_run_of_an_array_system(ring: str) -> None:
     assert invoke("run", ring, "--advise", "1e-9").exit_code == 2
 
 
-def test_run(ring: str) -> None:
+def test_run_of_an_array_system(ring: str) -> None:
     """What is conserved and where it ends, in words, numbers and files, against normal modes."""
     result = invoke("run", ring, "-o", "ring.npz")
     assert result.exit_code == 0, result.output
@@ -94,7 +94,7 @@ def test_run(ring: str) -> None:
     assert invoke("run", ring, "--quiet").stdout == ""
 
 
-def test_options(ring: str) -> None:
+def test_options_of_array_systems(ring: str) -> None:
     """Size, parameter, step, method."""
     words = ("--size", "N=12", "--parameter", "k=0", "--step", "0.25", "--span", "2", "--method", "stoermer-verlet")
     document = json.loads(invoke("run", ring, "--json", *words).stdout)
@@ -128,7 +128,7 @@ def test_unsupported_options_of_array_systems_are_rejected(ring: str, words: tup
     assert "belongs to coordinates that are arrays" in invoke("run", "kepler", "--size", "N=1").output
 
 
-def test_a_failing_step(ring: str) -> None:
+def test_failing_step_of_an_array_system(ring: str) -> None:
     """Exit status 1, with the states before it."""
     result = invoke("run", ring, "--step", "9", "--steps", "5", "-o", "ring.npz")
     assert result.exit_code == 1
@@ -136,7 +136,7 @@ def test_a_failing_step(ring: str) -> None:
     assert Path("ring.npz").is_file()
 
 
-def test_derive(ring: str) -> None:
+def test_derive_for_an_array_system(ring: str) -> None:
     """Terms with their derivatives, and the step; in LaTeX sums are sums."""
     text = invoke("derive", ring, "--method", "stoermer-verlet").stdout
     (derivative,) = (line.partition(": ")[2] for line in text.splitlines() if "by q[i]:" in line)
@@ -149,7 +149,7 @@ def test_derive(ring: str) -> None:
     assert r"\sum_{i \in \mathbb{Z}_{N}}" in invoke("derive", ring, "--latex").stdout
 
 
-def test_generate(ring: str) -> None:
+def test_generate_for_an_array_system(ring: str) -> None:
     """A folder whose program gives the states of the command, to round-off."""
     document = json.loads(invoke("run", ring, "--json").stdout)
     result = invoke("generate", ring, "-o", "ring_svi")
@@ -178,7 +178,7 @@ def test_generate(ring: str) -> None:
     assert invoke("generate", ring, "-o", "ring_svi", "--force").exit_code == 0
 
 
-def test_newton(ring: str) -> None:
+def test_newton_for_an_array_system(ring: str) -> None:
     """By the option or by the model; a folder keeps it, whatever its model said before."""
     by_option, iterations = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
     Path("stiff.toml").write_text(RING.replace('"svi:4"', '"svi:4"\nsolver = "newton"'))
@@ -225,7 +225,7 @@ def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
-def test_pictures(axes: str, tmp_path: Path) -> None:
+def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
     """Of a line in time, of bodies, of a plane."""
     pytest.importorskip("matplotlib")
     from scvi_codegen.pictures.arrays import plot_arrays

@@ -163,7 +163,7 @@ def kepler_page(method: Any, *, started: bool = False) -> str:
 
 class TestPage:
     @pytest.mark.parametrize(("form", "numbers"), [("position", ["18"]), ("phase-space", ["21", "21"])])
-    def test_spectral_collocation_in_matrices(self, form, numbers):
+    def test_spectral_collocation_is_shown_in_matrix_form(self, form, numbers):
         page = kepler_page(sc.SpectralCollocation(2, form=form))
         part = page[page.index("In matrices") :]
         part = part[: part.index("at the nodes.")]
@@ -182,7 +182,7 @@ class TestPage:
         assert parsed.all("script") == []
         assert not re.search(r"https?:|@import|url\(", page)
 
-    def test_every_kernel_and_every_function_of_the_step_is_there(self):
+    def test_every_kernel_and_every_function_of_the_step_is_shown(self):
         system = sc.problem("double-pendulum").system
         program = program_of(system, sc.SVI(2), prefix="double_pendulum")
         functions = functions_of(render(program).amalgamated().code)
@@ -249,7 +249,7 @@ class TestPage:
         numbers = set(re.findall(r'<span class="number">\(([^)]*)\)', page))
         assert {"2", "33", "34a, i = 1, 2", "34c", "34d", "34e", "dG/dQ", "dG/dv0"} <= numbers
 
-    def test_a_hamiltonian_has_hamiltons_equations(self):
+    def test_hamiltonian_shows_hamiltons_equations(self):
         page = derivation_html(sc.hamiltonian_of(sc.problem("henon-heiles").system), sc.SVI(1))
         assert "Hamilton&#39;s equations</h2>" in page
         assert page.count("(19a)") == page.count("(19b)") == 2
@@ -351,7 +351,7 @@ class TestCommand:
         assert "--html excludes --latex, --radicals and -o" in done.stderr
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_folder_that_is_not_there_is_named(self):
+    def test_missing_folder_is_named(self):
         done = CliRunner().invoke(main, ["derive", "kepler", "--html", "no/page.html"])
         assert done.exit_code == 2
         assert "there is no folder 'no'" in done.stderr

@@ -34,7 +34,7 @@ def unit_pendulum(expression):
     return expression.subs({sympy.Symbol(name, real=True): value for name, value in UNIT.items()})
 
 
-def test_the_two_point_pendulum_is_the_papers_36_and_37():
+def test_two_point_pendulum_equals_equations_36_and_37():
     derived = derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True)
     q1, v, q, p, h = sympy.symbols("Q_1 v_0 q_k p_k h", real=True)
     first, second = (3 + sqrt(3)) / 6, (3 - sqrt(3)) / 6
@@ -48,7 +48,7 @@ def test_the_two_point_pendulum_is_the_papers_36_and_37():
     assert derived.entries == ()
 
 
-def test_28_to_30_for_the_two_point_svi():
+def test_two_point_svi_equals_equations_28_to_30():
     """The Galerkin form (28): A~ Q~ = -G - (p_k, 0, ..)^T with (29) for the free particle's part."""
     derived = derive(planar_pendulum(), SVI(1, "gauss-legendre:2"), radicals=True)
     q1, q, h = sympy.symbols("Q_1 q_k h", real=True)
@@ -167,20 +167,20 @@ def test_matrix_form_is_one_of_spectral_collocation():
 
 
 @pytest.mark.parametrize("method", [SVI(3, "gauss-legendre:3"), SCVI(2), SpectralCollocation(4), Gauss(3), SVI(4)])
-def test_radicals_are_the_values(method):
+def test_radicals_equal_the_values(method):
     derived = derive(planar_pendulum(), method)
     for entry in derived.entries:
         if entry.exact is not None:
             assert abs(sympy.N(entry.exact, 60) - sympy.Float(str(entry.value), 60)) < sympy.Float("1e-50")
 
 
-def test_radicals_are_found_where_they_are_short():
+def test_radicals_are_used_where_they_are_short():
     for method in (SVI(2), SVI(3), SCVI(2, "gauss-legendre:3"), SpectralCollocation(3), Gauss(3), RadauIIA(2)):
         assert derive(planar_pendulum(), method, radicals=True).entries == ()
     assert derive(planar_pendulum(), SVI(9), radicals=True).entries != ()
 
 
-def test_names_of_the_derivation_yield_to_names_of_the_system():
+def test_derivation_names_avoid_names_of_the_system():
     system = LagrangianSystem.from_text(
         name="clash", coordinates=["q"], lagrangian="h*q_dot**2/2 - w_1*q**2", parameters={"h": 1.0, "w_1": 2.0}
     )
@@ -191,7 +191,7 @@ def test_names_of_the_derivation_yield_to_names_of_the_system():
     np.testing.assert_allclose(stepper.step(q, p, h, t), (q1, p1), rtol=1e-14)
 
 
-def test_displays():
+def test_equations_have_displays():
     derived = derive(kepler(), SCVI(2))
     assert "lambda_1_q1" in derived.to_text()
     assert r"\tag{34d}" in derived._repr_latex_()
@@ -210,7 +210,7 @@ def test_explicit_time_appears_with_the_points():
 
 
 @pytest.mark.parametrize("method", [SVI(2), SVI(2, "hermite:2"), SCVI(2)], ids=lambda method: method.name)
-def test_latex_has_one_index_and_one_exponent_at_a_letter_and_names_the_new_state(method):
+def test_latex_has_single_indices_and_exponents(method):
     text = derive(kepler(), method).to_latex()
     assert not re.search(r"_\{[^{}]*\}_|\^\{[^{}]*\}\^", text)
     assert text.count("p_{q_{2},k+1} &=") == text.count("q_{1,k+1} &=") == 1

@@ -124,7 +124,7 @@ class TestSystem:
         assert "g = 9.81" in shown
         assert "<mi>H</mi>" in sc.hamiltonian_of(sc.problem("planar-pendulum").system)._repr_html_()
 
-    def test_a_long_one_is_counted(self):
+    def test_long_lagrangian_is_abbreviated_with_a_count(self):
         large = sc.LagrangianSystem.from_text(
             name="chain",
             coordinates=[f"q{k}" for k in range(40)],
@@ -144,7 +144,7 @@ class TestEquations:
         assert shown.count("(27a)") == shown.count("(27b)") == 1
         assert "<math" in shown
 
-    def test_large_ones_are_counted_in_every_form(self):
+    def test_large_equations_are_abbreviated_in_every_form(self):
         derived = sc.derive(sc.problem("double-pendulum").system, sc.SVI(6))
         assert repr(derived) == "<12 equations of double pendulum by svi-6-gauss-legendre-6>"
         assert derived._repr_latex_() is None
@@ -155,7 +155,7 @@ class TestEquations:
 
 
 class TestTrajectory:
-    def test_facts_curves_and_the_range_of_the_energy(self):
+    def test_trajectory_display_shows_facts_curves_and_the_energy_range(self):
         shown = trajectory()._repr_html_()
         assert "0 to 100, h = 0.1" in shown
         assert "1001; q and p of shape (1001, 2)" in shown
@@ -184,7 +184,7 @@ class TestTrajectory:
 
 
 class TestSymmetry:
-    def test_direction_gauge_and_what_is_conserved(self):
+    def test_symmetry_display_shows_direction_gauge_and_conserved_quantity(self):
         boost = sc.symmetries(falling())[-1]
         assert boost.name == "boost of y"
         shown = boost._repr_html_()
@@ -198,7 +198,7 @@ class TestSymmetry:
 
 
 class TestOutcomes:
-    def test_a_certificate_shows_its_checks_and_what_is_broken(self):
+    def test_certificate_display_shows_checks_and_violations(self):
         kept, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
         assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in kept
         assert "<strong>" not in kept

@@ -161,7 +161,7 @@ def test_mathml_evaluates_to_the_expression(expression):
 
 
 @pytest.mark.parametrize(("name", "method", "radicals"), DERIVED, ids=lambda value: getattr(value, "name", str(value)))
-def test_derived_equations_read_as_they_are(name, method, radicals):
+def test_derived_equations_survive_a_round_trip(name, method, radicals):
     derived = derive(problem(name).system, method, radicals=radicals)
     for equation in (*derived.equations, *derived.end_momentum):
         check_read_back(equation.residual)
@@ -192,11 +192,11 @@ NAMED = {
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_names(name):
+def test_names_are_typeset(name):
     assert inner(Symbol(name)) == NAMED[name]
 
 
-def test_names_of_tables():
+def test_names_of_tables_are_typeset():
     assert f"<mi>l</mi>{DOT}" in inner(Symbol("dl_2_1"))
     assert "<mi>D</mi><mo>^</mo>" in inner(Symbol("DD_1_0"))
     assert "<msup><mi>A</mi><mn>2</mn></msup>" in inner(Symbol("aa_1_2"))
@@ -279,7 +279,7 @@ class TestTerms:
         check_read_back(x * square ** Rational(-3, 2))
 
 
-def test_reading_back_finds_a_wrong_sign():
+def test_round_trip_detects_a_wrong_sign():
     reader = Reader({x: 2.0, y: 3.0})
     assert reader.value(mathml(x - y)) == -1.0
     assert reader.value(mathml(x - y).replace("\N{MINUS SIGN}", "+")) == 5.0

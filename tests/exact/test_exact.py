@@ -42,14 +42,14 @@ def test_harmonic_oscillator_has_the_requested_digits(digits, h):
     assert found.error < mp.mpf(10) ** -digits
 
 
-def test_a_free_particle():
+def test_free_particle_is_exact():
     free = LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="m*x_dot**2/2", parameters={"m": 3.0})
     found = exact_discrete_lagrangian(free, [Fraction(1, 3)], [2], "0.1")
     assert abs(found.action - mp.mpf(3) * mp.mpf(25) / 9 / (2 * mp.mpf("0.1"))) < mp.mpf("1e-45")
     assert largest_difference(found.p0, found.p1) < mp.mpf("1e-45")
 
 
-def test_a_uniform_field():
+def test_uniform_field_is_exact():
     field = LagrangianSystem.from_text(
         name="field", coordinates=["x"], lagrangian="x_dot**2/2 - g*x", parameters={"g": 9.81}
     )
@@ -59,7 +59,7 @@ def test_a_uniform_field():
     assert abs(found.action - expected) < mp.mpf("1e-45")
 
 
-def test_a_kepler_ellipse_by_keplers_equation():
+def test_kepler_ellipse_agrees_with_keplers_equation():
     """q = (cos E - e, sqrt(1 - e^2) sin E) with E - e sin E = t, from perihelion."""
     e, h = mp.mpf("0.5"), mp.mpf("0.75")
     start, momenta = [1 - e, 0], [0, mp.sqrt((1 + e) / (1 - e))]
@@ -139,7 +139,7 @@ def test_flow_connects_its_end_points_and_is_reversible(name):
 
 
 @pytest.mark.parametrize("name", ["double-pendulum", "pumped-cart-pole"])
-def test_the_flow_is_what_the_oracle_converges_to(name):
+def test_exact_flow_is_the_limit_of_the_oracle(name):
     """Gauss's method of 6 stages on Hamilton's equations, formulas of its own: error of order h^13."""
     system, q, v, _ = CASES[name]
     mechanics, h, t = oracle.Mechanics(system), oracle.mp.mpf(1) / 256, oracle.mp.mpf(TIME)
@@ -171,7 +171,7 @@ def test_initial_guess_selects_one_of_several_solutions():
     assert largest_difference(exact_map(PENDULUM, [2], other.p0, 5, digits=12).q1, flow.q1) < mp.mpf("1e-10")
 
 
-def test_equilibrium_stays():
+def test_equilibrium_is_stationary():
     for found in (exact_map(PENDULUM, [0], [0], 1), exact_discrete_lagrangian(PENDULUM, [0], [0], 1)):
         assert found.q1 == found.p0 == found.p1 == (0,)
         assert abs(found.action - 1) < mp.mpf("1e-55")

@@ -50,7 +50,7 @@ CERTIFIED = (
 )
 MOST_CASES = 4
 OF_CLANG = () if shutil.which("clang") else ("-k", "not clang")
-OF_TEXT = ("--deselect", "tests/rendering/test_generated.py::test_no_file_is_stale")
+OF_TEXT = ("--deselect", "tests/rendering/test_generated.py::test_no_file_is_outdated")
 """Notices that a text is another one, as it would of what is no fault."""
 PYTEST = (sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *OF_CLANG, *OF_TEXT)
 UNSTYLED = "def check_style(text: str) -> None:\n    pass\n"

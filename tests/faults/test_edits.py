@@ -29,7 +29,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copied(tmp_path_factory.mktemp("faults"))
 
 
-def test_edits_find_their_text() -> None:
+def test_edits_find_their_source_lines() -> None:
     """Otherwise a line that was rewritten takes its faults with it, and only the full tier says so."""
     lost = [
         f"{edit['file']}: {edit['old']}"

@@ -89,7 +89,7 @@ class TestSize:
             answer(number)
         assert counted == [1, 1, 1]
 
-    def test_texts_and_reference_solutions_count(self, folder, monkeypatch):
+    def test_sources_and_reference_solutions_count_towards_the_size(self, folder, monkeypatch):
         spring()
         (folder / "references").mkdir()
         (folder / "references" / "kepler.npz").write_bytes(bytes(1000))
@@ -113,7 +113,7 @@ class TestSize:
         with pytest.raises(BuildError, match=f"SCVI_CODEGEN_CACHE_SIZE is '{given}': it must be a size"):
             answer(0)
 
-    def test_0_is_no_limit(self, folder, monkeypatch):
+    def test_zero_means_no_limit(self, folder, monkeypatch):
         monkeypatch.setenv(cache.SIZE_VARIABLE, "0")
         for number in range(3):
             answer(number)
@@ -132,7 +132,7 @@ class TestTrust:
             spring()
         assert list(folder.iterdir()) == []
 
-    def test_a_folder_that_its_group_may_write_is_not_used(self, folder):
+    def test_group_writable_folder_is_not_used(self, folder):
         folder.mkdir()
         folder.chmod(0o775)
         with pytest.warns(CacheWarning, match=r"every user of its group may write to it.*chmod go-w"):
@@ -142,7 +142,7 @@ class TestTrust:
     @pytest.mark.parametrize(
         ("owner", "me", "trusted"), [(1000, 1000, True), (0, 1000, True), (65534, 1000, False), (1000, 0, False)]
     )
-    def test_a_folder_of_another_user_is_not_used(self, folder, monkeypatch, owner, me, trusted):
+    def test_folder_of_another_user_is_not_used(self, folder, monkeypatch, owner, me, trusted):
         """But one of root's is; and root uses none of others."""
         folder.mkdir(mode=0o755)
         stat = Path.stat
@@ -249,7 +249,7 @@ class TestClearing:
         assert [path.name for path in folder.rglob("*") if path.is_file()] == ["thesis.tex"]
         assert answer(1) == 1.0
 
-    def test_a_cache_that_is_not_there_is_empty(self, folder):
+    def test_missing_cache_is_empty(self, folder):
         assert sc.cache_info().size == sc.clear_cache() == 0
         assert not folder.exists()
 

@@ -30,7 +30,7 @@ def same(mine: sympy.Expr, theirs: sympy.Expr) -> bool:
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
-def test_first_and_second_derivatives_are_sympys(expression: sympy.Expr) -> None:
+def test_first_and_second_derivatives_agree_with_sympy(expression: sympy.Expr) -> None:
     variables = [X, Y, Z]
     partials, curvatures = gradient(expression, variables), hessian(expression, variables)
     assert list(partials) == sorted(partials)
@@ -62,7 +62,7 @@ def test_jacobian_accepts_rows_as_sequence_or_by_index() -> None:
     assert jacobian({5: Y**2, 2: X}, [X, Y]) == {(2, 0): 1, (5, 1): 2 * Y}
 
 
-def test_an_unknown_node_is_refused_not_guessed() -> None:
+def test_unknown_node_is_rejected() -> None:
     with pytest.raises(TypeError, match="cannot differentiate"):
         gradient(sympy.Piecewise((X, X > 0), (0, True)), [X])
 

@@ -55,12 +55,12 @@ def parse(text: str) -> sympy.Expr:
         ("2**64", Integer(2**64)),
     ],
 )
-def test_accepted(text: str, expected: sympy.Expr) -> None:
+def test_valid_text_is_accepted(text: str, expected: sympy.Expr) -> None:
     assert parse(text) == expected
 
 
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "atan2"])
-def test_every_function(name: str) -> None:
+def test_every_function_is_parsed(name: str) -> None:
     assert parse(f"{name}(x/3)") == getattr(sympy, name)(X / 3)
 
 
@@ -144,7 +144,7 @@ def test_every_function(name: str) -> None:
     ],
     ids=lambda value: repr(value)[:30],
 )
-def test_refused_at_the_column(text: str, column: int, message: str) -> None:
+def test_errors_mark_the_column(text: str, column: int, message: str) -> None:
     with pytest.raises(ExpressionError, match=message) as caught:
         parse(text)
     assert (caught.value.column, caught.value.text) == (column, text)
@@ -168,7 +168,7 @@ def test_long_sums_and_products_do_not_recurse() -> None:
         assert parse("-" * 50_000 + "x") == X
 
 
-def test_nesting_up_to_the_limit_is_read_or_refused_but_never_crashes() -> None:
+def test_nested_expressions_are_read_or_rejected_without_crashing() -> None:
     assert parse("(" * 100 + "x" + ")" * 100) == X
     for name in FUNCTIONS:
         text = f"{name}(x+y, " * 100 + "x" + ")" * 100 if name == "atan2" else f"{name}(x+" * 100 + "y" + ")" * 100
@@ -178,7 +178,7 @@ def test_nesting_up_to_the_limit_is_read_or_refused_but_never_crashes() -> None:
             assert "nested too deeply" in str(error)  # noqa: PT017  (either outcome is right)
 
 
-def test_coefficients_of_like_terms_cannot_grow_without_bound() -> None:
+def test_coefficients_of_like_terms_are_bounded() -> None:
     with pytest.raises(ExpressionError, match="2048 bits"):
         parse("+".join(f"x/{n}" for n in range(10_001, 19_999, 2)))
 

@@ -77,12 +77,12 @@ def try_formula(number: int) -> bool:
     return True
 
 
-def test_formulas_are_read_or_refused():
+def test_formulas_are_read_or_rejected():
     assert sum(map(try_formula, range(2000))) > 200
 
 
 @pytest.mark.full
-def test_seven_hundred_thousand_formulas():
+def test_seven_hundred_thousand_random_formulas():
     assert sum(map(try_formula, range(10_000, 710_000))) > 70_000
 
 
@@ -128,7 +128,7 @@ def try_system(number: int) -> bool:
 
 
 @pytest.mark.full
-def test_ten_thousand_systems_become_c_or_are_refused():
+def test_ten_thousand_systems_compile_or_are_rejected():
     assert sum(map(try_system, range(10_000))) > 1_000
 
 
@@ -167,16 +167,16 @@ def try_model(number: int) -> bool:
     return True
 
 
-def test_model_files_are_read_or_refused():
+def test_model_files_are_read_or_rejected():
     assert sum(map(try_model, range(2000))) > 50
 
 
 @pytest.mark.full
-def test_two_hundred_thousand_model_files():
+def test_two_hundred_thousand_random_model_files():
     assert sum(map(try_model, range(10_000, 210_000))) > 5_000
 
 
-def test_grids_are_read_or_refused(tmp_path):
+def test_grids_are_read_or_rejected(tmp_path):
     model, random = Model.from_problem(problem("kepler")), Random(1)
     grid = next(text for text in seeds("models") if "[grid]" in text)
     path = tmp_path / "grid.toml"
@@ -256,17 +256,17 @@ def specification(random: Random, name: str) -> dict[str, Any]:
     return {"method": random.choice((method, method, method, method, name)), **given}
 
 
-def test_names_are_read_or_refused():
+def test_names_are_read_or_rejected():
     assert sum(map(try_name, range(120))) > 9
 
 
 @pytest.mark.full
-def test_ninety_thousand_names():
+def test_ninety_thousand_random_names():
     assert sum(map(try_name, range(10_000, 100_000))) > 5_000
 
 
 @pytest.mark.parametrize("count", [10**5, 10**9, 10**30, int("9" * 4000)])
-def test_absurd_counts_are_refused_at_once(count):
+def test_absurd_counts_are_rejected_immediately(count):
     for family in ("gauss-legendre", "gauss-lobatto", "gauss-radau-left", "clenshaw-curtis", "fejer", "hermite-3"):
         with guarded(1000), pytest.raises(MethodError):
             quadrature_by_name(f"{family}:{count}")
@@ -287,7 +287,7 @@ def test_absurd_counts_are_refused_at_once(count):
             method_from_specification(data)
 
 
-def test_splines_of_too_many_velocities_are_refused():
+def test_splines_of_too_many_velocities_are_rejected():
     with guarded(3_000_000), pytest.raises(MethodError):
         method_from_specification({"method": "svi", "degree": 64, "space": "splines:64"})
 
@@ -333,7 +333,7 @@ def test_system_name_occurs_only_in_comments_and_prose(title, tmp_path):
 @pytest.mark.parametrize(
     "name", [*TITLES, "", ".", "..", "-rf", "a b", "A", "a.b", "main", "os", "int", "é", "a/..", "~"]
 )
-def test_the_name_of_a_folder_is_a_name_or_refused(name, tmp_path):
+def test_folder_names_are_valid_or_rejected(name, tmp_path):
     model = hostile_model("plain")
     inside = tmp_path / "inside"
     inside.mkdir()

@@ -88,7 +88,7 @@ def test_invalid_index_notation_is_rejected(text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["q", "q[]", "q[N", "q[N]x", "q[N+1]", "q[0]", "2[N]", "for[N]", "q[N.5]"])
-def test_declarations_that_are_none(text: str) -> None:
+def test_invalid_declarations_are_rejected(text: str) -> None:
     """An array has a name and axes."""
     with pytest.raises(SystemDefinitionError):
         parse_array(text)

@@ -153,7 +153,7 @@ def test_ipopt_needs_fewer_iterations_with_the_exact_hessian():
     assert found[True][0] < found[False][0] / 2, found
 
 
-def test_a_step_that_fails_fails_the_call_and_forgotten_arguments_do():
+def test_failed_step_and_missing_arguments_fail_the_call():
     flow = casadi_flow(kepler(), steps=3)
     with pytest.raises(RuntimeError, match="Evaluation failed"):
         flow([0.0, 0.0], P, 1.0, 0.0, H)

@@ -78,7 +78,7 @@ def test_inputs_in_bernsteins_form_are_the_cubics_of_compiled_steps():
     )
 
 
-def test_names_of_constants_are_free():
+def test_names_of_constants_are_unrestricted():
     system = LagrangianSystem.from_text(
         name="e", coordinates=["x"], lagrangian="x_dot**2/2 - exp(1)*e*x**2/pi", parameters={"e": 0.25}
     )

@@ -32,12 +32,12 @@ def called(binding, name, head, arrays, shape):
     return found
 
 
-def test_values_of_rows():
+def test_values_of_batches():
     found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, KEPT, 4))
     assert_allclose(found, [states(row) for row in ROWS], **WAYS)
 
 
-def test_derivatives_of_rows_forward_and_back():
+def test_forward_and_adjoint_derivatives_of_batches():
     changes = np.tile(np.eye(SIZE), (2, 1, 1))
     exact = np.array([partials(row) for row in ROWS])
     pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, KEPT, 4))
@@ -47,7 +47,7 @@ def test_derivatives_of_rows_forward_and_back():
     assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
 
 
-def test_second_derivatives_of_rows():
+def test_second_derivatives_of_batches():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
     found = called(
         flow().second_library, "hessian_rows", (STEPS, EVERY, SIZE, 2), [ROWS, same, changes], (2, SIZE, SIZE)
@@ -56,7 +56,7 @@ def test_second_derivatives_of_rows():
     assert_allclose(found, exact, rtol=0, atol=1e-7 * abs(exact).max())
 
 
-def test_external_functions_of_casadi():
+def test_external_functions_of_casadi_are_exported():
     source, name = with_casadi_flow(compiled().derivatives, STEPS, EVERY), casadi_name(compiled().source.prefix)
     arguments = "(const double **arg, double **res, long long *iw, double *w, int mem);\n"
     shapes = f"const long long *{name}_sparsity_out(long long i);\n"
@@ -113,7 +113,7 @@ typedef struct { void *extension, *api; buffer **args, **rets; scalar **attrs; }
 """
 
 
-def test_handlers_of_xla(tmp_path):
+def test_handlers_of_xla_are_exported(tmp_path):
     header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
     header.parent.mkdir(parents=True)
     header.write_text(XLA)

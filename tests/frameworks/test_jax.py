@@ -98,13 +98,13 @@ def test_values_are_those_of_leapfrog_and_of_integrate():
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("save_every", [1, 50])
-def test_derivatives_by_all_that_is_given_are_those_of_leapfrog(derivative, save_every):
+def test_derivatives_by_all_arguments_are_those_of_leapfrog(derivative, save_every):
     found = derivative(partial(by_c, save_every=save_every))(given())
     expected = jax.jacfwd(leapfrog)(given())[:, ::save_every]
     assert_allclose(found, expected, rtol=0, atol=1e-12 * float(abs(expected).max()))
 
 
-def test_derivatives_of_a_harmonic_oscillator_are_those_of_sines():
+def test_derivatives_of_a_harmonic_oscillator_are_closed_form():
     system = LagrangianSystem.from_text(
         name="oscillator", coordinates=["x"], lagrangian="x_dot**2/2 - w**2*x**2/2", parameters={"w": 1.3}
     )
@@ -206,7 +206,7 @@ def test_inputs_with_zero_order_hold_are_parameters():
         flow(**start, h=0.2)
 
 
-def test_motions_with_constraints_have_the_derivatives_of_their_runs():
+def test_constrained_trajectories_have_the_derivatives_of_their_runs():
     system = LagrangianSystem.from_text(
         name="rod",
         coordinates=["x", "y"],

@@ -78,7 +78,7 @@ def test_cost_and_costates_have_the_order_of_the_method(s):
     assert_allclose(orders, 2 * s, atol=0.3)
 
 
-def test_the_shortest_time_is_found_where_duration_is_free():
+def test_minimum_time_is_found_for_free_duration():
     motion = optimal_control(
         POINT, SVI(1), steps=6, duration=(0.1, 9.0), cost="1", bounds={"u": (-1, 1)}, t=3.0, **REST
     )
@@ -114,13 +114,13 @@ def test_path_bounds_hold_at_the_quadrature_points():
     assert free.cost < motion.cost
 
 
-def test_a_hamiltonian_has_the_same_answer():
+def test_hamiltonian_has_the_same_solution():
     motions = [optimal_control(system, SVI(2), **UP) for system in (SWING, hamiltonian_of(SWING))]
     assert_allclose(motions[1].q, motions[0].q, atol=1e-6)
     assert motions[1].cost == pytest.approx(motions[0].cost, rel=1e-8)
 
 
-def test_a_momentum_that_no_input_touches_stays_what_it_was():
+def test_momentum_without_input_is_conserved():
     at_rest = {"a": 0.0, "theta_dot": 0.0, "a_dot": 0.0}
     motion = optimal_control(
         ROTORS,
@@ -135,7 +135,7 @@ def test_a_momentum_that_no_input_touches_stays_what_it_was():
     assert abs(motion.q[-1, 0] - 1.0) < 1e-8
 
 
-def test_an_end_that_cannot_be_reached_is_an_error_with_the_last_try():
+def test_unreachable_end_is_an_error_with_the_last_iterate():
     with pytest.raises(ControlError, match=r"no optimal control was found: IPOPT ended with .* after") as raised:
         optimal_control(POINT, SVI(1), steps=4, duration=1.0, bounds={"u": (-0.1, 0.1)}, **REST)
     assert raised.value.motion.q.shape == (5, 1)
@@ -224,7 +224,7 @@ def test_skate_moves_along_its_blade():
     assert np.abs(again.constraint_values()[1]).max() < 1e-10
 
 
-def test_a_constraint_that_an_input_moves_is_refused():
+def test_constraint_that_depends_on_an_input_is_rejected():
     led = LagrangianSystem.from_text(
         name="led",
         coordinates=["x", "y"],

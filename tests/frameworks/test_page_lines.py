@@ -25,14 +25,14 @@ def printed(library, capfd):
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_a_library_that_is_missing_is_named_with_its_extra(library, monkeypatch):
+def test_missing_library_is_named_with_its_extra(library, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     stepper = compile_stepper(problem("planar-pendulum").system, SVI(1), flags=QUICK_FLAGS)
     with pytest.raises(MissingLibraryError, match=rf"{library}, which .* pip install 'scvi-codegen\[{library}\]'"):
         LIBRARIES[library](stepper, steps=3)
 
 
-def test_lines_for_jax(capfd):
+def test_code_for_jax_runs(capfd):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
     before = jax.config.jax_enable_x64
     try:
@@ -48,7 +48,7 @@ def test_lines_for_jax(capfd):
     assert_allclose(found, [by_mu, 63 * end(1.0).velocity[-1, 0]], rtol=1e-5)
 
 
-def test_lines_for_torch(capfd):
+def test_code_for_torch_runs(capfd):
     pytest.importorskip("torch", reason="needs the extra 'torch'")
     stepper = compile_stepper(problem("kepler").system, "svi:8", flags=QUICK_FLAGS)
     run = stepper.integrate([0.5, 0.0], [0.0, 3**0.5], h=0.1, steps=63)
@@ -57,6 +57,6 @@ def test_lines_for_torch(capfd):
     assert_allclose(printed("torch", capfd), run.pullback(partials).parameters, rtol=1e-3)
 
 
-def test_lines_for_casadi(capfd):
+def test_code_for_casadi_runs(capfd):
     pytest.importorskip("casadi", reason="needs the extra 'casadi'")
     assert_allclose(printed("casadi", capfd), [2 * np.sin(1.0), ellipk(np.sin(1.0) ** 2) / 12], rtol=1e-5)

@@ -96,13 +96,13 @@ def test_non_gravitational_forces_are_rejected_by_name(simulation, oddity):
 
 
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "fput-chain", "henon-heiles", "driven-duffing"])
-def test_systems_that_are_not_of_bodies_are_refused(sample, name):
+def test_systems_other_than_n_body_are_rejected(sample, name):
     system = sample(name).system
     with pytest.raises(SystemDefinitionError, match="is not a system of bodies"):
         sc.to_rebound(system, [0.0] * system.dimension, velocity=[0.0] * system.dimension)
 
 
-def test_states_that_do_not_fit_are_refused(simulation):
+def test_incompatible_states_are_rejected(simulation):
     bodies = sc.from_rebound(simulation)
     with pytest.raises(StateError, match="q must have 9 entries, 3 a body"):
         sc.to_rebound(bodies.system, bodies.q[:6], velocity=bodies.velocity)

@@ -86,7 +86,7 @@ def test_gradcheck_passes(save_every):
     assert torch.autograd.gradgradcheck(lambda x: by_c(x, save_every), x)
 
 
-def test_parameters_are_learned():
+def test_parameters_are_estimated_by_gradient_descent():
     """The strength of a center, from where a motion leads."""
     flow = torch_flow(kepler(), steps=20)
     q, p = numbers([0.5, 0.0]), numbers([0.0, 1.7])

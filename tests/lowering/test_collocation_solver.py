@@ -62,7 +62,7 @@ def test_more_points_than_lanes_use_newton(sample):
 
 @pytest.mark.parametrize("name", ["pumped-cart-pole", "relativistic-particle"])
 @pytest.mark.parametrize("method", [SpectralCollocation(8), RadauIA(3, form="position"), PRINTED[1]], **named)
-def test_a_run_is_newtons(sample, compiled, name, method):
+def test_run_equals_that_of_newton(sample, compiled, name, method):
     runs = [
         compiled(name, method, solver=solver).integrate(*sample(name).state, h=0.05, steps=50, t=0.3)
         for solver in ("fixed-point", "newton")
@@ -93,7 +93,7 @@ def test_stored_velocity_is_recomputed_for_new_parameters(sample, compiled, meth
 
 
 @pytest.mark.parametrize("method", [SpectralCollocation(3), PRINTED[0]], **named)
-def test_steps_too_long_for_the_iteration_are_newtons(sample, compiled, method):
+def test_too_long_steps_use_newton(sample, compiled, method):
     q, p = sample("spherical-pendulum").state
     iterated, newton = (compiled("spherical-pendulum", method, solver=solver) for solver in ("auto", "newton"))
     run, expected = (stepper.integrate(q, p, h=0.11, steps=8) for stepper in (iterated, newton))

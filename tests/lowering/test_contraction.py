@@ -39,7 +39,7 @@ def test_slow_fixed_point_iteration_agrees_with_newton(h):
 
 
 @pytest.mark.parametrize("method", [SVI(1), SCVI(2), SVI(3, "clenshaw-curtis:4")], ids=lambda method: method.name)
-def test_long_steps_of_an_oscillator_alone_and_in_an_ensemble(method):
+def test_long_steps_of_an_oscillator_equal_those_in_an_ensemble(method):
     system = problem("harmonic-oscillator").system
     stepper, derived = compile_stepper(system, method, flags=QUICK_FLAGS), derived_step(system, method)
     for h in (0.9, 1.2, 1.5):
@@ -177,7 +177,7 @@ def test_residual_at_convergence_is_a_quarter_of_the_tolerance(tmp_path_factory,
     assert left[1] > (1 + rate) * tolerance / 4
 
 
-def test_guesses_are_continued_from_two_steps_after_one_that_was_near(tmp_path_factory):
+def test_predictor_uses_two_steps_after_an_accurate_guess(tmp_path_factory):
     continued = header(tmp_path_factory.getbasetemp(), 0).continued
     cases = {(0, 1e-9): 1, (1, 1e-9): 2, (2, 0.9e-3): 2, (1, 1.1e-3): 1, (2, 1.1e-3): 1}
     assert {case: continued(*case) for case in cases} == cases

@@ -73,7 +73,7 @@ def test_predictor_follows_a_polynomial_across_step_size_changes(method):
             assert np.allclose(found[: len(points)], wanted, rtol=1e-8, atol=1e-8)
 
 
-def test_the_highest_coefficient_of_a_curve():
+def test_leading_legendre_coefficient_of_a_curve():
     points = gauss_legendre(5).abscissae
     functional = legendre_functional(points, 4)
     values = [3 * legendre_value(4, 2 * x - 1) - legendre_value(3, 2 * x - 1) + 1 for x in points]

@@ -242,12 +242,12 @@ def test_long_sum_is_split_into_temporaries_with_equal_value():
 
 
 @pytest.mark.parametrize("constant", [10**400, sympy.Rational(-(10**400), 3), sympy.exp(1000), sympy.exp(10**30)])
-def test_constants_beyond_a_double_are_refused(constant):
+def test_constants_beyond_a_double_are_rejected(constant):
     with pytest.raises(SystemDefinitionError, match="constant"):
         kernel_of(constant * x + y)
 
 
-def test_functions_without_a_c_counterpart_are_refused():
+def test_functions_without_a_c_counterpart_are_rejected():
     with pytest.raises(SystemDefinitionError, match="not supported in C"):
         kernel_of(sympy.gamma(x))
 
@@ -283,7 +283,7 @@ def compiled_values(expressions: Sequence[Expression], tmp_path: Any) -> np.ndar
     return values
 
 
-def test_printed_c_means_what_the_expression_means(tmp_path):
+def test_printed_c_evaluates_to_the_expression(tmp_path):
     expressions = level(level(LEAVES))
     sources = {"u": np.float64(POINT[0]), "w": np.float64(POINT[1])}
 
@@ -337,7 +337,7 @@ def test_notes_state_whether_a_method_is_symmetric(method, symmetric):
     assert notes[0] == ("no order claimed" if method.order is None else f"order {method.order}")
 
 
-def test_the_notes_of_a_method_without_an_order_claim_none():
+def test_notes_of_a_method_without_an_order_state_none():
     method = SCVI(3, variational=False)
     assert method.order is None
     assert lowered(problem("kepler").system, method).notes[0] == "no order claimed"

@@ -50,7 +50,7 @@ def chain(method: object, *, pumped: bool = False) -> Stepper:
 
 
 @pytest.mark.parametrize("method", [SVI(3), SCVI(3), Gauss(3)], ids=lambda method: method.name)
-def test_the_band_gives_what_the_fixed_point_gives(method):
+def test_band_solver_agrees_with_the_fixed_point_iteration(method):
     q, p = state(6)
     iterated, found = (
         compile_stepper(fput_chain(6), method, solver=solver).integrate(q, p, h=0.2, steps=40)
@@ -73,7 +73,7 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
 
 
 @pytest.mark.parametrize("method", [SVI(2), SCVI(2), SpectralCollocation(2)], ids=lambda method: method.name)
-def test_rows_are_exchanged_within_the_band(method):
+def test_rows_are_pivoted_within_the_band(method):
     """Masses x_dot y_dot have no diagonal: no pivot stands where it is needed. In u = x + y, w = x - y they have."""
     pairs = range(8)
     kinetic = " + ".join(f"x{i}_dot*y{i}_dot" for i in pairs)
@@ -100,7 +100,7 @@ def test_memory_grows_linearly_with_the_length_of_a_chain():
     assert sizes[2] < 10**5
 
 
-def test_a_mass_matrix_that_is_all_there_is_to_invert_is_no_larger_than_it_must_be():
+def test_newton_matrix_has_minimal_size():
     source, _ = generate_source(fput_chain(16), SVI(2), solver="fixed-point")
     assert "BAND = 0," in source.code
 
@@ -152,7 +152,7 @@ class TestKeptFactors:
         assert strict.checkpoint() == before
 
 
-def test_a_wrong_sign_in_a_scatter_is_named_before_anything_is_compiled():
+def test_wrong_sign_in_a_scatter_is_reported_before_compilation():
     """Newton's matrix is the Jacobian of a gradient: by one of other results the iteration would never converge."""
     system = LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
     stages = discretise(system, SVI(2))

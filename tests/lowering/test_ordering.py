@@ -11,14 +11,14 @@ def ring(count: int) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count)]
 
 
-def test_a_chain_stays_as_it_is():
+def test_chain_is_not_reordered():
     pairs = [(i, i + 1) for i in range(9)]
     assert places(pairs, 10) == tuple(range(10))
     assert bandwidth(pairs, places(pairs, 10)) == 1
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_shuffled_chain_is_found_again(seed):
+def test_shuffled_chain_is_restored(seed):
     names = random.Random(seed).sample(range(30), 30)
     pairs = [(names[i], names[i + 1]) for i in range(29)]
     assert bandwidth(pairs, tuple(range(30))) > 2
@@ -32,7 +32,7 @@ def test_a_ring_is_folded(count):
     assert bandwidth(ring(count), found) == 2
 
 
-def test_a_grid_is_as_wide_as_its_shorter_side():
+def test_bandwidth_of_a_grid_is_its_shorter_side():
     pairs = [(x * 20 + y, (x + a) * 20 + y + 1 - a) for x in range(5) for y in range(20) for a in (0, 1)]
     pairs = [(i, j) for i, j in pairs if j < 100 and (j == i + 20 or j % 20)]
     assert bandwidth(pairs, places(pairs, 100)) <= 6

@@ -69,7 +69,7 @@ def test_split_kernels_give_bitwise_equal_trajectories(name, solver, cut_after, 
 @pytest.mark.parametrize(
     ("method", "solver"), [("svi:3", "newton"), ("svi:3", "fixed-point"), ("stoermer-verlet", "fixed-point")]
 )
-def test_array_systems_have_the_same_motion_to_the_bit(method, solver, cut_after, monkeypatch, tmp_path):
+def test_array_systems_have_bitwise_equal_trajectories(method, solver, cut_after, monkeypatch, tmp_path):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     lagrangian = "sum(i in N, q_dot[i]**2/2 - q[i]**2/2 - t*q[i]) - sum(i in 0..N-2, cosh(q[i+1] - q[i])*sin(q[i]))"
     system = sc.IndexedSystem.from_text(name="chain", coordinates=["q[N]"], lagrangian=lagrangian)

@@ -122,7 +122,7 @@ def test_few_terms_and_constraints_remain_unrolled():
 
 
 @pytest.mark.usefixtures("few")
-def test_parameters_may_be_called_as_slots():
+def test_parameters_may_have_the_names_of_reads():
     names = ["a", "b", "c", "d"]
     springs = " ".join(f"- slot_0*given_0*({b} - {a})**{2}*{k + 2}" for k, (a, b) in enumerate(pairwise(names)))
     system = sc.LagrangianSystem.from_text(

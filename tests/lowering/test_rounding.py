@@ -29,7 +29,7 @@ def test_tables_have_the_documented_digits_and_exact_zeros_and_ones():
     assert lower_matrix(((-(mp.mpf(10) ** -60),), (mp.mpf(-2),))) == ((0,), (-2,))
 
 
-def test_constants_are_exact_until_a_target_rounds_them():
+def test_constants_are_exact_until_rounded_for_a_target():
     assert exact_number(sympy.Rational(2, 3)) == Fraction(2, 3)
     assert abs(exact_number(sympy.sqrt(2) * sympy.pi) - mp.sqrt(2) * mp.pi) < mp.mpf(10) ** -57
     for wrong in (sympy.I, sympy.Integer(10) ** 400, sympy.zoo):

@@ -17,7 +17,7 @@ def partials(q):
     return 2 * np.array([[q[0], q[1], 0, 0], [-x, -y, x, y]])
 
 
-def test_a_double_pendulum_of_rods_is_where_ida_has_it():
+def test_double_pendulum_of_rods_agrees_with_ida():
     """Of index 1, with the constraints differentiated twice, which IDA solves to about 1e-7."""
     ida = pytest.importorskip("sksundae.ida")
     rods = sc.LagrangianSystem.from_text(

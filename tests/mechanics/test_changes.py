@@ -20,7 +20,7 @@ from scvi_codegen.mechanics.forms import forms_of
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 
 
-def test_changes_follow_the_variational_equations():
+def test_tangent_vectors_satisfy_the_variational_equations():
     """x'' = -sin x - k x y^2 + cos t, and so on: forces of changes are the Hessian times these, masses the same."""
     system = LagrangianSystem.from_text(
         name="two",
@@ -53,7 +53,7 @@ def test_reserved_names_are_avoided():
     assert len({q.name for q in with_tangent_vectors(system, 2).coordinates}) == 6
 
 
-def test_masses_that_move_have_no_changes_of_this_kind():
+def test_variable_masses_have_no_variational_equations():
     assert with_tangent_vectors(problem("double-pendulum").system, 1) is None
     magnetic = LagrangianSystem.from_text(
         name="magnetic", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + x*y_dot - y**2"

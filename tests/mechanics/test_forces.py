@@ -30,7 +30,7 @@ def driven(**given):
     )
 
 
-def test_forces_and_dissipation_add_up():
+def test_forces_and_dissipation_are_added():
     system = driven(forces={"y": "F*cos(w*t) - x_dot*y"}, dissipation="c*(x_dot**2 + y_dot**2)/2")
     assert [str(f) for f in system.forces] == ["-c*x_dot", "F*cos(t*w) - c*y_dot - x_dot*y"]
     assert system.depends_on_time
@@ -62,12 +62,12 @@ def test_sympy_input_equals_text_input():
         ({"dissipation": "c*x**2"}, "contains no velocity"),
     ],
 )
-def test_unfit_forces_are_named(given, message):
+def test_unsuitable_forces_are_named(given, message):
     with pytest.raises(SystemDefinitionError, match=message):
         driven(**given)
 
 
-def test_legendre_there_and_back():
+def test_legendre_transform_and_its_inverse():
     system = driven(forces={"x": "-c*x_dot", "y": "F*cos(w*t)"})
     other = hamiltonian_of(system)
     assert str(other.forces[0]) == "-c*p_x/m"

@@ -59,7 +59,7 @@ EXAMPLES = [bodies(4), bodies(12), lattice(5), lattice(13), damped(6), canonical
 
 
 @pytest.mark.parametrize("system", EXAMPLES, ids=lambda each: each.name)
-def test_the_motion_is_the_same(system):
+def test_rolled_system_has_equal_trajectories(system):
     found = sc.roll_sums(system)
     q, v = np.random.default_rng(3).normal(size=(2, len(system.coordinates)))
     start = {"p" if system.auxiliaries else "velocity": v}
@@ -71,14 +71,14 @@ def test_the_motion_is_the_same(system):
     assert np.abs(run.energy() - other.energy()).max() < 1e-12 * np.abs(run.energies).max()
 
 
-def test_the_text_does_not_grow():
+def test_source_size_does_not_grow():
     few, many = (sc.roll_sums(bodies(count)) for count in (6, 20))
     assert str(few.system) == str(many.system)
     assert len(few.system.terms) == 2
     assert len(sc.roll_sums(lattice(40)).system.terms) < 10  # some constants are 0, 1 or reduced
 
 
-def test_parameters_that_all_have_in_common_stay():
+def test_common_parameters_remain_scalar():
     found = sc.roll_sums(bodies(4))
     assert [str(name) for name in found.system.parameters] == ["G"]
     assert found.system.defaults == (0.5,)
@@ -155,7 +155,7 @@ def test_terms_without_coordinates_give_a_runnable_system(term):
 
 
 @pytest.mark.parametrize("name", ["b", "q", "N", "at0", "B0", "q_dot", "c0_1", "p_q"])
-def test_names_of_parameters_are_no_names_of_arrays_and_tables(name):
+def test_parameter_names_differ_from_names_of_arrays_and_tables(name):
     written = lagrangian(["x", "y"], f"x_dot**2/2 + y_dot**2/2 - {name}*x**2/2 - 3*{name}*y**2/2", **{name: 1.3})
     found = sc.roll_sums(written)
     own = sc.compile_indexed(found.system, "stoermer-verlet").integrate(

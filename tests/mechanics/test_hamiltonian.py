@@ -68,7 +68,7 @@ def hyperbolic() -> HamiltonianSystem:
 # Reading.
 
 
-def test_text_and_sympy_give_the_same_system() -> None:
+def test_text_and_sympy_define_equal_systems() -> None:
     text = HamiltonianSystem.from_text(
         name="pendulum",
         coordinates=["q"],
@@ -98,7 +98,7 @@ def test_text_and_sympy_give_the_same_system() -> None:
     assert text._repr_latex_().startswith("$")
 
 
-def test_momenta_are_called_after_their_coordinates_by_default() -> None:
+def test_momenta_are_named_after_their_coordinates_by_default() -> None:
     system = HamiltonianSystem.from_text(name="free", coordinates=["x", "y"], hamiltonian="(p_x**2 + p_y**2)/2")
     assert [p.name for p in system.momenta] == ["p_x", "p_y"]
 
@@ -116,7 +116,7 @@ def test_momenta_are_called_after_their_coordinates_by_default() -> None:
         ({"parameters": {"p": 1.0}}, "'p' is the name of both"),
     ],
 )
-def test_refused_systems(changes: dict[str, object], message: str) -> None:
+def test_invalid_systems_are_rejected(changes: dict[str, object], message: str) -> None:
     given = {"name": "x", "coordinates": ["q"], "momenta": ["p"], "hamiltonian": "p**2/2"} | changes
     with pytest.raises(SystemDefinitionError, match=message):
         HamiltonianSystem.from_text(**given)  # type: ignore[arg-type]  # wrong on purpose
@@ -138,7 +138,7 @@ def test_model_files_contain_a_hamiltonian() -> None:
         ('"p",', "1,", "momenta must be a list of names"),
     ],
 )
-def test_refused_model_files(old: str, new: str, message: str) -> None:
+def test_invalid_model_files_are_rejected(old: str, new: str, message: str) -> None:
     text = dump_model(Model(system=hyperbolic(), method=SVI(4), q=(1.0,), p=(2.0,), h=0.1, steps=5))
     assert old in text
     with pytest.raises(Exception, match=message):
@@ -151,7 +151,7 @@ def test_refused_model_files(old: str, new: str, message: str) -> None:
 @pytest.mark.parametrize(
     "name", ["kepler", "double-pendulum", "charged-particle", "cart-pole", "relativistic-particle"]
 )
-def test_legendre_there_and_back(name: str) -> None:
+def test_legendre_transform_and_its_inverse(name: str) -> None:
     """At a random point: v = H_p and H = p . v - L; and the Lagrangian of the Hamiltonian is the first one again."""
     system = problem(name).system
     assert isinstance(system, LagrangianSystem)
@@ -237,7 +237,7 @@ def test_compositions_accept_a_separable_hamiltonian(sample) -> None:
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_a_hamiltonian_without_a_lagrangian(method, error) -> None:
+def test_hamiltonian_without_a_lagrangian(method, error) -> None:
     """q' = q, p' = -p; q p is a quadratic invariant, kept by the symplectic methods to round-off."""
     stepper = compile_stepper(hyperbolic(), method, flags=QUICK)
     run = stepper.integrate([1.0], [1.0], h=0.1, steps=10)
@@ -310,7 +310,7 @@ def test_both_solvers_give_the_same_step_without_a_lagrangian(method, h) -> None
     assert np.abs(ends[0] - ends[1]).max() < 1e-12
 
 
-def test_point_vortices_conserve_what_they_must() -> None:
+def test_point_vortices_conserve_their_invariants() -> None:
     """Energy nearly; the centre of vorticity and the angular impulse to round-off (linear and quadratic invariants)."""
     entry = problem("point-vortices")
     strength = np.array(entry.system.defaults)
@@ -331,7 +331,7 @@ def test_the_derivation_shows_the_momenta_at_the_points() -> None:
     assert {"P_1", "P_2", "N_1", "nu_2"} <= {symbol.name for symbol in derived.unknowns}
 
 
-def test_parameters_are_taken_for_positive_where_their_values_are():
+def test_parameters_are_assumed_positive_if_their_values_are():
     """Roots of squares of others keep their signs; 0 says nothing of the sign of other values."""
     system = LagrangianSystem.from_text(
         name="signs",

@@ -39,13 +39,13 @@ def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
 @pytest.mark.parametrize(
     "beside", [{"parameters": {"q": 1}}, {"parameters": {"N": 1}}, {"parameters": {"k[N]": 1, "k": 2}}]
 )
-def test_a_name_means_one_thing(beside: dict[str, dict[str, float]]) -> None:
+def test_name_has_one_meaning(beside: dict[str, dict[str, float]]) -> None:
     """Arrays, numbers and sizes."""
     with pytest.raises(SystemDefinitionError):
         system("q[N]", "sum(i in N, q_dot[i]**2)", **beside)
 
 
-def test_maps_of_bodies_in_space() -> None:
+def test_momentum_maps_of_bodies_in_space() -> None:
     """Three shifts and three turns of isolated bodies; a field along z leaves two and one."""
     pairs = f"sum(i < j in N, m[i]*m[j]/{DISTANCE})"
     free = system("r[N, 3]", GRAVITY + pairs, parameters={"m[N]": 1})
@@ -61,7 +61,7 @@ def test_maps_of_bodies_in_space() -> None:
     assert len(momentum_maps(falling)) == 3
 
 
-def test_a_turn_needs_equal_masses() -> None:
+def test_rotation_requires_equal_masses() -> None:
     """Of the two components."""
     kinetic = "sum(i in N, r_dot[i, 0]**2 + w*r_dot[i, 1]**2)"
     round_trap = " - sum(i in N, r[i, 0]**2 + r[i, 1]**2)"
@@ -188,7 +188,7 @@ def test_unsupported_sympy_sums_are_rejected(index: str, limits: str) -> None:
         )
 
 
-def test_maps_of_a_hamiltonian() -> None:
+def test_momentum_maps_of_a_hamiltonian() -> None:
     """Shifts, turns of positions with their momenta, and phases."""
     bodies = IndexedSystem.from_text(
         name="charges",
@@ -215,7 +215,7 @@ def test_maps_of_a_hamiltonian() -> None:
         ({"hamiltonian": "sum(i in N, q_dot[i]**2)"}, "'q_dot' is not an array"),
     ],
 )
-def test_a_lagrangian_or_a_hamiltonian(given: dict[str, object], message: str) -> None:
+def test_exactly_one_of_lagrangian_and_hamiltonian_is_required(given: dict[str, object], message: str) -> None:
     """One of both, with what belongs to it."""
     with pytest.raises(SystemDefinitionError, match=message):
         IndexedSystem.from_text(name="x", coordinates=["q[N]"], **given)
@@ -224,7 +224,7 @@ def test_a_lagrangian_or_a_hamiltonian(given: dict[str, object], message: str) -
 KINETIC = "sum(i in N, q_dot[i]**2/2)"
 
 
-def test_forces_and_what_they_conserve() -> None:
+def test_forces_and_conserved_quantities() -> None:
     """Friction between neighbours leaves the momentum of a ring alone, friction against the ground does not."""
     ring = f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2)"
     between = system("q[N]", ring, dissipation="sum(i in N periodic, (q_dot[i+1] - q_dot[i])**2)")
@@ -259,7 +259,7 @@ def test_forces_are_unrolled() -> None:
         ({"dissipation": "sum(i in N, q[i]**2)"}, "contains no velocity"),
     ],
 )
-def test_forces_that_are_refused(beside: dict[str, object], message: str) -> None:
+def test_invalid_forces_are_rejected(beside: dict[str, object], message: str) -> None:
     """By the parser, or by what they are."""
     with pytest.raises(SystemDefinitionError, match=message):
         system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **beside)

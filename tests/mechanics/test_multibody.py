@@ -42,13 +42,13 @@ def assert_moves_alike(mechanism: Mechanism, steps: int = 100) -> None:
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
-def test_motions_are_those_of_sympys_equations(name: str) -> None:
+def test_trajectories_agree_with_sympys_equations(name: str) -> None:
     assert_moves_alike(MECHANISMS[name]())
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("make", [lambda: links_on_a_cart(4), lambda: masses_in_a_row(12)], ids=["links", "masses"])
-def test_motions_of_longer_ones(make: Callable[[], Mechanism]) -> None:
+def test_long_chains_agree_with_sympys_equations(make: Callable[[], Mechanism]) -> None:
     assert_moves_alike(make(), 200)
 
 
@@ -83,7 +83,7 @@ def text(coordinates: str, lagrangian: str, **more: Any) -> LagrangianSystem:
     )
 
 
-def test_speeds_that_are_combinations_of_rates() -> None:
+def test_speeds_may_be_combinations_of_derivatives() -> None:
     """u1 = q1' + q2', u2 = q1' - q2'; loads in speeds."""
     kinematics = [Q1.diff(T) + Q2.diff(T) - U1, Q1.diff(T) - Q2.diff(T) - U2]
     method = kanes_method(Q1, Q2, loads=(-C * U1, -K * Q2 + C * U2), q=(Q1, Q2), u=(U1, U2), kd=kinematics)
@@ -103,7 +103,7 @@ def test_a_speed_without_a_coordinate_gets_its_integral() -> None:
         taken(method)
 
 
-def test_auxiliary_speeds_are_zero_and_what_they_bring_does_no_work() -> None:
+def test_auxiliary_speeds_are_zero_and_their_forces_do_no_work() -> None:
     method = kanes_method(Q1, slip=U2, loads=(-K * Q1,), u_auxiliary=[U2])
     assert taken(method) == text("q1", "m*q1_dot**2/2 - k*q1**2/2")
 
@@ -120,7 +120,7 @@ def test_time_dependent_forces_are_inputs_or_set_to_zero_order_hold() -> None:
         taken(method)
 
 
-def test_weights_and_springs_become_a_potential_and_dampers_stay_forces() -> None:
+def test_weights_and_springs_become_a_potential_and_dampers_remain_forces() -> None:
     mechanism = MECHANISMS["particles on a spring"]()
     system = mechanism.system().with_parameters(c=0.0, g=0.0)
     assert all(force.has(sympy.Symbol("c", real=True)) for force in system.forces)
@@ -165,7 +165,7 @@ def test_velocity_constraints_implied_by_configuration_constraints_are_dropped()
     assert taken(kanes_method(Q1, Q2, **{**options, "q": (Q1, Q2)}, velocity_constraints=rate)) == rolling
 
 
-def test_a_bicycle_has_the_constraints_of_its_wheels() -> None:
+def test_bicycle_has_the_constraints_of_its_wheels() -> None:
     """One says where the front wheel touches, two that it rolls; the rear one's rolling is in the velocities."""
     lengths = dict.fromkeys(("htangle", "WRrad", "WFrad", "framelength", "forkoffset", "forklength", "g"), 0.5)
     moments = [f"I{body}{axis}" for body in ("frame", "fork", "rear", "front") for axis in ("11", "22")]
@@ -194,7 +194,7 @@ def test_missing_parts_are_named(method: Any, message: str) -> None:
         taken(method())
 
 
-def test_masses_that_depend_on_coordinates_and_unknown_velocities_are_refused() -> None:
+def test_masses_that_depend_on_coordinates_and_unknown_velocities_are_rejected() -> None:
     method = kanes_method(Q1)
     method.bodies[0].mass = M * Q1
     with pytest.raises(SystemDefinitionError, match="mass or an inertia depends on a coordinate"):

@@ -47,13 +47,13 @@ def messages(define, *given, **named):
         (arrays, "sum(i in N, m*q_dot[i]**2/2) + sum(i in N, u*q[i])", "Lagrangian"),
     ],
 )
-def test_a_parameter_or_an_input_that_occurs_nowhere_is_reported(define, formula, function):
+def test_unused_parameter_or_input_is_reported(define, formula, function):
     heard = messages(define, formula, parameters={"m": 1.0, "k": 2.0}, inputs=["u"])
     where = UNUSED.format(function)
     assert heard == ["input 'u' " + where] * ("u*" not in formula) + ["parameter 'k' " + where]
 
 
-def test_an_array_of_parameters_that_occurs_nowhere_is_reported():
+def test_unused_array_parameter_is_reported():
     heard = messages(arrays, "sum(i in N, m[i]*q_dot[i]**2/2)", parameters={"m[N]": 1.0, "k[N]": 2.0})
     assert heard == ["parameter 'k' " + UNUSED.format("Lagrangian")]
 
@@ -70,7 +70,7 @@ def test_an_array_of_parameters_that_occurs_nowhere_is_reported():
         (arrays, "sum(i in N, q_dot[i]**2/2)", {"constraints": ["q[i] = k*t for i in N"]}),
     ],
 )
-def test_a_parameter_of_another_formula_is_used(define, formula, given):
+def test_parameter_of_another_formula_counts_as_used(define, formula, given):
     assert messages(define, formula, parameters={"k": 1.0}, **given) == []
 
 

@@ -111,7 +111,7 @@ def test_symmetries_of_the_catalogue_are_found(name, expected):
     assert [symmetry.name for symmetry in symmetries(problem(name).system)] == expected
 
 
-def test_a_central_force_in_space():
+def test_symmetries_of_a_central_force_in_space():
     assert formulas(particle("k/sqrt(x**2 + y**2 + z**2)", "xyz", k=1.0)) == {
         "angular momentum x": "y*p_z - z*p_y",
         "angular momentum y": "z*p_x - x*p_z",
@@ -119,7 +119,7 @@ def test_a_central_force_in_space():
     }
 
 
-def test_an_oscillator_has_the_rotations_and_no_more():
+def test_oscillator_has_only_rotations():
     """Its other symmetries go with cos(t): not among those searched."""
     assert list(formulas(particle("k*(x**2 + y**2 + z**2)/2", "xyz", k=2.0))) == [
         f"angular momentum {a}" for a in "xyz"
@@ -127,7 +127,7 @@ def test_an_oscillator_has_the_rotations_and_no_more():
     assert list(formulas(particle("k*(x**2 + y**2)/2 + k*z**2", "xyz", k=2.0))) == ["angular momentum z"]
 
 
-def test_a_free_particle():
+def test_symmetries_of_a_free_particle():
     assert formulas(particle()) == {
         "momentum of x": "p_x",
         "momentum of y": "p_y",
@@ -137,7 +137,7 @@ def test_a_free_particle():
     }
 
 
-def test_a_uniform_field_has_as_many():
+def test_uniform_field_has_the_symmetries_of_a_free_particle():
     assert formulas(particle("m*g*y", g=9.81)) == {
         "momentum of x": "p_x",
         "momentum of y": "p_y + g*m*t",
@@ -147,7 +147,7 @@ def test_a_uniform_field_has_as_many():
     }
 
 
-def test_masses_that_differ_between_the_axes():
+def test_symmetries_with_anisotropic_masses():
     system = LagrangianSystem.from_text(
         name="anisotropic",
         coordinates=["u", "w"],
@@ -189,7 +189,7 @@ def test_symmetries_in_other_linear_coordinates():
     assert formulas(system) == {"linear symmetry of u, w": "u*p_u + 5*u*p_w - 10*w*p_u - w*p_w"}
 
 
-def test_a_force_that_is_too_small_for_binary64_breaks_it_all_the_same():
+def test_very_small_force_breaks_a_symmetry():
     assert symmetries(particle("1/sqrt(x**2 + y**2) + 1e-14*x")) == ()
 
 
@@ -251,13 +251,13 @@ def test_each_rotation_is_about_the_axis_in_its_name(axis):
         "(x_dot**2 + y_dot**2)/2 - (x**2 + y**2)**2 - 1e-6*c*x*y",
     ],
 )
-def test_systems_without(text):
+def test_systems_without_symmetries(text):
     system = LagrangianSystem.from_text(name="none", coordinates=["x", "y"], lagrangian=text, parameters={"c": 0.1})
     assert symmetries(system) == ()
 
 
 @pytest.mark.parametrize("sum_", ["1e300 - m", "atanh(m) + m", "(m - 9)**1.5 + 1"])
-def test_a_sum_of_parameters_without_a_value_hides_no_symmetry(sum_):
+def test_sum_of_parameters_without_a_value_does_not_hide_a_symmetry(sum_):
     """The sum might stand in a coefficient, so it is tried as a factor of one."""
     system = LagrangianSystem.from_text(
         name="sums", coordinates=["q", "x"], lagrangian=f"(q_dot**2 + x_dot**2)/2 + {sum_}", parameters={"m": 0.5}
@@ -265,12 +265,12 @@ def test_a_sum_of_parameters_without_a_value_hides_no_symmetry(sum_):
     assert "p_q" in formulas(system).values()
 
 
-def test_a_parameter_that_is_zero_by_default_breaks_symmetries_all_the_same():
+def test_parameter_with_default_zero_breaks_symmetries():
     """Momentum maps are compiled for all values of the parameters."""
     assert symmetries(particle("(x**2 + y**2)**2 + eps*x**4", eps=0.0)) == ()
 
 
-def test_point_vortices():
+def test_symmetries_of_point_vortices():
     found = formulas(point_vortices(3))
     assert found["linear invariant"] == "strength_1*x_1 + strength_2*x_2 + strength_3*x_3"
     squares = [f"strength_{k}*x_{k}**2" for k in (1, 2, 3)] + [f"y_{k}**2/strength_{k}" for k in (1, 2, 3)]
@@ -313,7 +313,7 @@ def test_symmetries_that_mix_positions_and_momenta():
     }  # with the energy, Fradkin's tensor
 
 
-def test_an_energy_is_no_symmetry_but_of_time():
+def test_energy_is_listed_as_symmetry_of_time_only():
     assert symmetries(phase_space("p**2/(2*m) + k*x**2/2", "x", "p", m=1.3, k=2.0)) == ()
 
 
@@ -346,7 +346,7 @@ def test_symmetry_search_is_fast():
 # What is given.
 
 
-def test_given_directions_are_checked():
+def test_supplied_directions_are_checked():
     kepler = problem("kepler").system
     x, y = kepler.coordinates
     for direction in (["-q2", "q1"], [-y, x], [-Symbol("q2"), Symbol("q1")]):
@@ -355,7 +355,7 @@ def test_given_directions_are_checked():
     assert check_symmetry(hamiltonian_of(kepler), ["-q2", "q1"]).formula == "q1*p_q2 - q2*p_q1"
 
 
-def test_given_generators_are_checked():
+def test_supplied_generators_are_checked():
     assert check_symmetry(ROTATOR, generator="x**2 + p**2").direction == (2 * Symbol("p", real=True),)
     assert check_symmetry(CYLINDER, generator="x1**2 + y1**2 + x2**2 + y2**2", name="impulse").name == "impulse"
     kepler = problem("kepler").system
@@ -377,7 +377,7 @@ WRONG_GENERATORS = {
 
 
 @pytest.mark.parametrize("message", WRONG_GENERATORS)
-def test_a_wrong_generator_is_refused_with_its_rate(message):
+def test_wrong_generator_is_rejected_with_its_rate(message):
     with pytest.raises(SystemDefinitionError, match=re.escape(message)):
         check_symmetry(ROTATOR, **WRONG_GENERATORS[message])
 
@@ -456,18 +456,18 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_a_wrong_direction_is_refused_with_its_defect(message):
+def test_wrong_direction_is_rejected_with_its_defect(message):
     pattern = message if "\\" in message or ".*" in message else message.translate({ord(c): f"\\{c}" for c in "()*+/"})
     with pytest.raises(SystemDefinitionError, match=pattern):
         check_symmetry(problem("kepler").system, WRONG[message])
 
 
-def test_a_wrong_gauge_is_refused():
+def test_wrong_gauge_is_rejected():
     with pytest.raises(SystemDefinitionError, match=r"differs by .*, not 0"):
         check_symmetry(particle(), ["t", 0], gauge="2*m*x")
 
 
-def test_a_symmetry_of_another_system_or_of_a_name_in_use_is_refused():
+def test_symmetry_of_another_system_or_with_a_used_name_is_rejected():
     kepler = problem("kepler").system
     with pytest.raises(SystemDefinitionError, match="of another system"):
         all_symmetries(kepler, [symmetries(particle())[0]])
@@ -478,7 +478,7 @@ def test_a_symmetry_of_another_system_or_of_a_name_in_use_is_refused():
 # Compiled, tracked, shown.
 
 
-def test_values_are_those_of_the_formulas(quickly_compiled):
+def test_values_agree_with_the_formulas(quickly_compiled):
     system = magnetic()
     stepper = quickly_compiled(system, SVI(2))
     generator = np.random.default_rng(1)
@@ -549,7 +549,7 @@ def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, 
     assert errors[k] > 100 * ROUNDOFF
 
 
-def test_a_given_symmetry_is_tracked(quickly_compiled):
+def test_supplied_symmetry_is_tracked(quickly_compiled):
     entry = problem("cart-pole")
     centre = check_symmetry(entry.system, ["t", 0], gauge="(M + m)*x + m*l*sin(theta)", name="centre of mass")
     plain = quickly_compiled(entry.system, SVI(2))
@@ -562,7 +562,7 @@ def test_a_given_symmetry_is_tracked(quickly_compiled):
     assert plain.momentum_map_names == ("momentum of x",)
 
 
-def test_a_given_generator_is_tracked(quickly_compiled):
+def test_supplied_generator_is_tracked(quickly_compiled):
     entry = problem("kepler")
     lenz = check_symmetry(
         entry.system, generator="(q1*p_q2 - q2*p_q1)*p_q2 - mu*q1/sqrt(q1**2 + q2**2)", name="Runge-Lenz vector x"
@@ -594,7 +594,7 @@ def test_ensembles_track_momentum_maps_with_individual_parameters(quickly_compil
     assert np.allclose(alone.momentum_maps(), runs.momentum_maps()[:, 1], rtol=1e-13)
 
 
-def test_derivations_show_them():
+def test_derivations_show_momentum_maps():
     derived = derive(magnetic(), RadauIIA(2))
     assert "  momentum of x = p_x - B*e*y - E*e*t\n" in derived.to_text()
     assert "  boost of z = m*z - p_z*t  (not guaranteed by this method)\n" in derived.to_text()
@@ -609,13 +609,13 @@ def test_headers_list_conserved_quantities():
     assert interface.map_formulas[0] == "p_x - B*e*y - E*e*t"
 
 
-def test_hamiltonians_without_lagrangian_that_are_free():
+def test_free_hamiltonians_without_lagrangian():
     system = HamiltonianSystem.from_text(name="shear", coordinates=["q"], hamiltonian="p_q*c", parameters={"c": 2.0})
     assert set(formulas(system).values()) >= {"p_q"}
 
 
 @pytest.mark.parametrize("smallest", [0.0, 1e-12, 0.9e-9, 1.1e-9, 1e-6, 1.0])
-def test_singular_values_are_called_large_only_if_they_are(smallest):
+def test_only_large_singular_values_are_called_large(smallest):
     rng = np.random.default_rng(7)
     left, right = (np.linalg.qr(rng.normal(size=(size, size)))[0] for size in (50, 40))
     matrix = left[:, :40] * np.append(np.geomspace(1.0, max(smallest, 1e-3), 39), smallest) @ right

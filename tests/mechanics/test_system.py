@@ -111,7 +111,7 @@ def test_unevaluated_nodes_are_evaluated_for_the_text_round_trip() -> None:
         ("big q", "big_q"),
     ],
 )
-def test_odd_names_are_spelled_out(given: str, spelled: str) -> None:
+def test_unusual_names_are_transliterated(given: str, spelled: str) -> None:
     q, u, k = Symbol(given), Symbol("u"), Symbol("k " + given)
     system = from_sympy(u**2 / 2 - k * q**2, q, velocities=[u], parameters={k: 1})
     assert [symbol.name for symbol in (*system.coordinates, *system.velocities)] == [spelled, spelled + "_dot"]
@@ -140,7 +140,7 @@ def test_with_parameters_replaces_values() -> None:
         system.with_parameters(m=0)
 
 
-def test_latex() -> None:
+def test_latex_of_a_system() -> None:
     text = from_text("theta_1", "theta_1_dot**2/2 + cos(theta_1)")._repr_latex_()
     assert text == r"$\displaystyle L = \frac{\dot{\theta_{1}}^{2}}{2} + \cos{\left(\theta_{1} \right)}$"
 
@@ -214,7 +214,7 @@ def test_constraints_on_velocities_are_not_dropped() -> None:
         ("x y", "(x_dot**2 + 2*a*x_dot*y_dot + y_dot**2)/2", {"a": 1}, "with the default parameters"),
     ],
 )
-def test_refused_text(coordinates: str, lagrangian: str, parameters: dict[str, Any], message: str) -> None:
+def test_invalid_text_is_rejected(coordinates: str, lagrangian: str, parameters: dict[str, Any], message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         from_text(coordinates, lagrangian, **parameters)
 
@@ -225,13 +225,13 @@ def test_text_errors_carry_the_column() -> None:
     assert caught.value.column == 13
 
 
-def test_coordinates_as_one_string_are_refused() -> None:
+def test_coordinates_in_one_string_are_rejected() -> None:
     with pytest.raises(SystemDefinitionError, match="list of names"):
         LagrangianSystem.from_text(name="system", coordinates="xy", lagrangian="x_dot**2")
 
 
 @pytest.mark.parametrize("keyword", sorted(C_KEYWORDS))
-def test_keywords_of_c_are_refused_from_sympy_too(keyword: str) -> None:
+def test_keywords_of_c_are_rejected_in_sympy_input(keyword: str) -> None:
     with pytest.raises(SystemDefinitionError, match=f"'{keyword}' is a keyword of C"):
         from_sympy(V**2 / 2 - Symbol(keyword) * X, X, parameters={keyword: 1})
 
@@ -264,7 +264,7 @@ KINETIC = V**2 / 2
     ],
     ids=str,
 )
-def test_refused_expressions(lagrangian: Any, message: str) -> None:
+def test_invalid_expressions_are_rejected(lagrangian: Any, message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         from_sympy(lagrangian, X)
 
@@ -303,12 +303,12 @@ def test_refused_expressions(lagrangian: Any, message: str) -> None:
     ],
     ids=str,
 )
-def test_refused_arguments(arguments: tuple[Any, ...], options: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(arguments: tuple[Any, ...], options: dict[str, Any], message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         from_sympy(*arguments, **options)
 
 
-def test_refused_fields() -> None:
+def test_invalid_fields_are_rejected() -> None:
     system = from_text("x", "x_dot**2/2 - k*x", k=1)
     x = Symbol("x")
     for changes, message in [
@@ -342,7 +342,7 @@ def test_unused_parameter_is_retained() -> None:
         assert from_text("x", "x_dot**2", spare=3).parameters == real("spare")
 
 
-def test_a_large_coupled_mass_matrix() -> None:
+def test_large_coupled_mass_matrix_is_accepted() -> None:
     names = [f"x{index}" for index in range(40)]
     coupled = " + ".join(f"({a}_dot - {b}_dot)**2/2" for a, b in pairwise(names))
     with pytest.raises(SystemDefinitionError, match="singular"):

@@ -79,7 +79,7 @@ def test_velocities_and_forces_are_those_of_the_system_times_the_rate(
 
 
 @pytest.mark.parametrize(("system", "monitor"), CASES)
-def test_legendre_transform_of_one_is_the_other(system: sc.LagrangianSystem, monitor: str) -> None:
+def test_hamiltonian_and_lagrangian_transformations_are_equivalent(system: sc.LagrangianSystem, monitor: str) -> None:
     hat = sc.hamiltonian_of(transformed(system, monitor))
     given = sc.reparametrise(sc.hamiltonian_of(system), hat.clock.rate)
     assert isinstance(given, sc.HamiltonianSystem)
@@ -129,7 +129,7 @@ def test_levi_civita_s_coordinates_make_an_oscillator() -> None:
         assert abs(evaluate(plane.clock.rate - u**2 - w**2, point)) < mp.mpf(10) ** -50
 
 
-def test_the_name_of_the_energy_is_one_that_is_free() -> None:
+def test_energy_parameter_has_an_unused_name() -> None:
     system = sc.LagrangianSystem.from_text(
         name="beam", coordinates=["q"], lagrangian="q_dot**2/2 - E*q**4", parameters={"E": 1.0}
     )

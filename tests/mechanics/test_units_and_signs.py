@@ -71,7 +71,7 @@ def test_multipliers_of_an_orbit_are_those_of_its_variations():
 
 
 @pytest.mark.parametrize(("metre", "second", "factor"), [(1000.0, 1.0, 1.0), (1e-3, 60.0, 1.0), (1.0, 1.0, 1e6)])
-def test_constraints_of_arrays_have_any_units(metre, second, factor):
+def test_constraints_of_arrays_accept_any_units(metre, second, factor):
     """The same two rods in other units of length and time, and with their constraints multiplied."""
 
     def states(metre, second, factor):
@@ -97,7 +97,7 @@ def test_constraints_of_arrays_have_any_units(metre, second, factor):
 
 
 @pytest.mark.parametrize("method", ["stoermer-verlet", "composition:8"])
-def test_forces_that_depend_on_velocities_are_not_taken_for_kicks(method):
+def test_velocity_dependent_forces_are_not_treated_as_kicks(method):
     """Explicit solvers refuse them, and where a step is made it is that of the motion."""
     system = sc.LagrangianSystem.from_text(
         name="rubbed",

@@ -16,14 +16,14 @@ STATES = {1: ([0.7], [0.4], 0.2), 2: ([0.7, -0.3], [0.3, 0.9], 0.15)}
 
 @pytest.mark.parametrize("system", [kepler(), DRIVEN], ids=lambda s: s.name)
 @pytest.mark.parametrize("method", [StoermerVerlet(), Composition(2), Composition(8), Composition(10)])
-def test_explicit_and_newton_are_one_map(system, method):
+def test_explicit_and_newton_solvers_give_the_same_map(system, method):
     q, p, h = STATES[system.dimension]
     explicit = compile_stepper(system, method, solver="explicit").step(q, p, h, t=0.4)
     implicit = compile_stepper(system, method, solver="newton").step(q, p, h, t=0.4)
     np.testing.assert_allclose(explicit, implicit, rtol=1e-14, atol=2e-15)
 
 
-def test_leapfrog_by_hand():
+def test_leapfrog_agrees_with_a_handwritten_step():
     """Kick, drift, kick on the driven oscillator alpha = -1, beta = 8/3."""
 
     def force(q, t):
@@ -39,7 +39,7 @@ def test_leapfrog_by_hand():
 
 
 @pytest.mark.parametrize(("system", "order"), [(DRIVEN, 2), (DRIVEN, 8), (kepler(), 2), (kepler(), 8), (kepler(), 10)])
-def test_the_order_is_the_one_claimed(system, order):
+def test_order_is_the_claimed_one(system, order):
     q, p, span = ([0.7], [0.4], 4.0) if system is DRIVEN else ([1.0, 0.0], [0.0, 1.1], 8.0)
     reference = compile_stepper(system, SVI(8)).integrate(q, p, h=span / 400, steps=400).q[-1]
     stepper = compile_stepper(system, Composition(order))
@@ -51,7 +51,7 @@ def test_the_order_is_the_one_claimed(system, order):
     assert derivative == pytest.approx(order, abs=0.4)
 
 
-def test_the_force_at_the_end_is_used_again_without_a_trace():
+def test_force_at_the_end_of_a_step_is_reused_correctly():
     """A run remembers the last force; repeated steps do not."""
     stepper = compile_stepper(kepler(), Composition(8))
     q, p, h = np.array([0.5, 0.0]), np.array([0.0, 3**0.5]), 0.05
@@ -91,7 +91,7 @@ def test_momenta_at_rest_are_not_velocities():
         compile_stepper(shifted, Composition(8))
 
 
-def test_refusals():
+def test_unsupported_systems_are_rejected():
     with pytest.raises(MethodError, match="separable"):
         compile_stepper(double_pendulum(), Composition(8))
     with pytest.raises(MethodError, match="order must be 2, 8 or 10"):

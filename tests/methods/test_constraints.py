@@ -95,7 +95,7 @@ def test_degree_1_is_rattle():
 
 
 @pytest.mark.parametrize(("s", "moving"), [(1, False), (1, True), (2, True), (3, False), (4, True)])
-def test_multipliers_are_solved_for_alone_where_masses_are_constant(s, moving):
+def test_multipliers_are_solved_separately_for_constant_masses(s, moving):
     """To the states of Newton's iteration; also by steps that choose their length, and where one fails."""
     chain = LagrangianSystem.from_text(
         name="two masses",
@@ -233,7 +233,7 @@ def test_constraints_dependent_on_the_manifold_are_named(method, third, said):
             stepper.integrate_ensemble([q, q], velocity=[[0.0, 0.0, 0.0, 1.0]] * 2, h=0.05, steps=3)
 
 
-def test_initial_states_are_projected_or_refused():
+def test_initial_states_are_projected_or_rejected():
     stepper = compile_stepper(rod(), lobatto(2))
     run = stepper.integrate([1.0606602, -1.0606602], [0.0, 0.0], h=0.1, steps=1)  # as typed
     assert np.abs(run.constraint_values()[0]).max() < 1e-15
@@ -317,7 +317,7 @@ def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
     assert np.abs(free.q[-1] - on_circle(angle)).max() < 3e-4
 
 
-def test_positions_do_not_follow_constraints_that_jump():
+def test_positions_do_not_follow_discontinuous_constraints():
     """A pendulum whose hook moves by data: a kink is an impulse, the same for all steps, and a jump is refused."""
     system = LagrangianSystem.from_text(
         name="hook",

@@ -44,7 +44,7 @@ def test_free_dumbbell_has_uniform_translation_and_rotation():
 
 
 @pytest.mark.parametrize("bend", [np.pi / 2, 0.7, 2.5])
-def test_an_angle_between_two_rods_is_that_of_a_rigid_hook(bend):
+def test_angle_between_two_rods_equals_a_rigid_hook(bend):
     hook = JOINTS.bent_pendulum()
     a, b = 0.6, 0.4
     places = [np.sin(np.pi - bend), -np.cos(np.pi - bend)]
@@ -97,7 +97,7 @@ def test_welded_bodies_tumble_as_one():
 
 
 @pytest.mark.parametrize("meshing", [False, True], ids=["belt", "gears"])
-def test_a_belt_and_gears_carry_the_torque(meshing):
+def test_belt_and_gears_transmit_the_torque(meshing):
     sign, winch = (-1.0 if meshing else 1.0), JOINTS.winch()
     system = winch.system.with_parameters(r2=sign * 0.4, torque=sign * 3.0)
     run = ran(JOINTS.Mechanism(system, winch.q, winch.velocity))
@@ -137,7 +137,7 @@ def test_member_forces_of_a_bridge_equal_the_method_of_joints():
     assert_allclose(pulls[0, top], -moment / JOINTS.HEIGHT, atol=1e-10)
 
 
-def test_the_bridge_swings_as_a_pendulum():
+def test_bridge_oscillates_as_a_pendulum():
     """On rods of one length it does not turn; all its joints go along the same circle."""
     mechanism = JOINTS.bridge(0.3)
     run = ran(mechanism, 100)

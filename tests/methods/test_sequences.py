@@ -73,7 +73,7 @@ def test_explicit_steps_solve_the_equations(system, sequence, make):
 
 
 @pytest.mark.parametrize("order", [2, 8, 10])
-def test_orders(order):
+def test_sequences_have_their_orders(order):
     start, end = (np.array([0.7, -0.4]), np.array([1.2, 0.3])), 4.0
     exact = compiled(RELATIVISTIC, SVI(8)).integrate(*start, h=0.02, steps=200).q[-1]
     stepper = compiled(RELATIVISTIC, Composition(order, DRIFTS_FIRST))

@@ -89,7 +89,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_states_are_those_of_the_stepper_bit_for_bit(name, tmp_path):
+def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     model = MODELS[name]()
     one, h = Slave(Fmu(generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.h
     assert one.start(model.t) == OK, one.said
@@ -210,7 +210,7 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
     one.call("FreeInstance")
 
 
-def test_an_instance_that_cannot_be_is_none(fmu):
+def test_failed_instantiation_returns_null(fmu):
     for given in ({"token": b"another"}, {"events": True}):
         one = Slave(fmu, **given)
         assert one.one.value is None
@@ -254,7 +254,7 @@ def test_discards_are_logged_if_requested(fmu):
     assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), (c_char_p * 1)(b"all")) == ERROR
 
 
-def test_initial_states_far_off_their_constraints_are_refused(tmp_path):
+def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
     fmu = Fmu(generate_fmu(rod(), tmp_path / "rod.fmu"), tmp_path / "unpacked")
     near, far = Slave(fmu), Slave(fmu)
     assert near.start(0.0, x=1.001) == OK
@@ -287,7 +287,7 @@ def test_description_has_the_elements_required_by_the_standard(fmu):
     assert unknown == references[3:5]
 
 
-def test_a_model_given_by_momenta_has_these_at_the_start(tmp_path):
+def test_model_with_initial_momenta_starts_with_them(tmp_path):
     fmu = Fmu(generate_fmu(pushed(p=(0.4,)), tmp_path / "by_momenta.fmu"), tmp_path / "unpacked")
     assert (fmu.variables["p_q"]["start"], fmu.variables["q_dot"]["initial"]) == ("0.4", "calculated")
     one = Slave(fmu)
@@ -308,7 +308,7 @@ def test_names_are_made_unique(tmp_path):
     assert len(set(names)) == len(names) == 8
 
 
-def test_the_archive_is_the_same_each_time_and_has_all_that_compiles(tmp_path):
+def test_archive_is_reproducible_and_contains_all_sources(tmp_path):
     first, second = (generate_fmu(pushed(), part / "push.fmu") for part in _folders(tmp_path, "a", "b"))
     assert first.read_bytes() == second.read_bytes()
     folder = tmp_path / "unpacked"
@@ -370,7 +370,7 @@ def test_unsuitable_models_and_names_are_rejected(tmp_path):
         generate_fmu(model, tmp_path / "missing" / "push.fmu")
 
 
-def test_the_command_line_writes_one(tmp_path):
+def test_command_line_writes_an_fmu(tmp_path):
     target = tmp_path / "kepler.fmu"
     result = CliRunner().invoke(main, ["generate", "kepler", "--method", "svi:2", "--fmu", "-o", str(target)])
     assert result.exit_code == 0, result.output

@@ -74,7 +74,7 @@ def test_model_file_is_read_completely(net: Path) -> None:
     assert np.array_equal(own.q["r"], other.q["r"])
 
 
-def test_the_solver(net: Path) -> None:
+def test_solver_is_read_from_the_file(net: Path) -> None:
     """The run is that of Newton's iteration to the bit, not of sweeps; the solver stays where the method changes."""
     net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
     model = sc.load_indexed_model(net)
@@ -120,7 +120,7 @@ def test_unsupported_newton_is_rejected(net: Path, old: str, new: str) -> None:
         ({"file": "a.csv"}, [1, 2, 3]),
     ],
 )
-def test_arrays(value: Any, expected: Any, tmp_path: Path) -> None:
+def test_arrays_are_read_from_the_file(value: Any, expected: Any, tmp_path: Path) -> None:
     """In each way that they may be written."""
     np.save(tmp_path / "a.npy", [7, 8, 9])
     np.savez(tmp_path / "a.npz", x=[1, 2, 3], y=[4, 5, 6])
@@ -129,7 +129,7 @@ def test_arrays(value: Any, expected: Any, tmp_path: Path) -> None:
     assert found == pytest.approx(expected, rel=1e-15)
 
 
-def test_an_index_means_one_thing() -> None:
+def test_index_has_one_meaning() -> None:
     """A parameter of its name is refused where a formula of places is read."""
     with pytest.raises(sc.ModelFileError, match="i is the name of an index in formulas of arrays"):
         read_array(parse_array("q[N]"), "i", "q", folder=".", sizes={"N": 3}, parameters={"i": 1.0})

@@ -123,7 +123,7 @@ def test_names_that_need_quotes_survive_a_round_trip():
     assert parse_model(dump_model(kepler(system=system))).system == system
 
 
-def test_methods_without_a_name_are_refused_rather_than_changed():
+def test_methods_without_a_name_are_rejected():
     own = Quadrature(name="mine", points=(-0.5, 0.5), weights=(1, 1))
     for method in (
         SVI(2, own),
@@ -144,7 +144,7 @@ def test_failed_save_does_not_change_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_catalogue_reference_may_be_all_there_is():
+def test_catalogue_reference_alone_is_a_complete_system():
     assert parse_model('[system]\ncatalogue = "kepler"\n') == kepler()
 
 
@@ -236,7 +236,7 @@ def test_a_catalogue_reference_may_be_changed():
         ),
     ],
 )
-def test_mistakes_are_named(old, new, message, tmp_path):
+def test_invalid_entries_are_named(old, new, message, tmp_path):
     assert old in PENDULUM
     path = tmp_path / "model.toml"
     path.write_text(PENDULUM.replace(old, new, 1))
@@ -260,7 +260,7 @@ def test_forces_and_constraints_survive_a_round_trip(more):
     assert parse_model(dump_model(model)) == model != parse_model(PENDULUM)
 
 
-def test_all_that_is_missing_is_named_at_once():
+def test_all_missing_entries_are_reported_together():
     with pytest.raises(ModelFileError, match=r"there is no span or steps in \[run\]"):
         parse_model(PENDULUM[: PENDULUM.index("[run]")])
     assert parse_model(PENDULUM.replace("step = 0.25\n", "")).tolerance is None
@@ -278,7 +278,7 @@ def test_missing_method_selects_the_default():
     assert parse_model(text).method == SVI(8)
 
 
-def test_sections_laid_over_a_file_supply_and_replace():
+def test_overriding_sections_extend_and_replace():
     system = PENDULUM[: PENDULUM.index("[initial]")]
     given = {"initial": {"q": [0.5], "p": [0.0]}, "run": {"step": 0.1, "steps": 3}, "method": {"degree": 4}}
     model = parse_model(system, given)

@@ -64,7 +64,7 @@ def test_model_with_inputs_equals_integrate(file, monkeypatch, tmp_path):
     assert (run.t, run.q[0], run.p[0]) == (expected.t[-1], expected.q[-1, 0], expected.p[-1, 0])
 
 
-def test_momenta_are_those_with_the_inputs_at_the_start():
+def test_momenta_use_the_inputs_at_the_start():
     system = LagrangianSystem.from_text(
         name="growing", coordinates=["q"], lagrangian="(1 + u)*q_dot**2/2", inputs=["u"]
     )
@@ -105,7 +105,7 @@ def test_saved_files_are_self_contained(file, tmp_path):
 
 
 @pytest.mark.parametrize("header", ["t,value", "t,acceleration", "t,u"])
-def test_columns_of_a_table(file, header):
+def test_columns_of_a_table_are_read(file, header):
     _write(file.parent / "tables" / "u.csv", header)
     assert load_model(file).inputs["u"] == InputTable(T, U, "cubic")
 
@@ -198,7 +198,7 @@ def test_names_that_are_not_inputs_are_rejected():
         next(model.input_segments(model.start(compile_stepper(system, "svi:2"))))
 
 
-def test_a_hamiltonian_has_inputs_too():
+def test_hamiltonian_has_inputs():
     """In a file, which is written and read again."""
     text = MODEL.replace('lagrangian = "q_dot**2/2 + (1 + w)*cos(q)"', 'hamiltonian = "p_q**2/2 - (1 + w)*cos(q)"')
     text = text.replace("c*q_dot", "c*p_q").replace("q_dot = [0.1]", "p = [0.1]")

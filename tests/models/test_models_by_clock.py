@@ -42,7 +42,7 @@ def test_files_contain_the_time_transformation(monitor: str) -> None:
     assert (again.h, again.tolerance) == (None, None)
 
 
-def test_a_step_for_another_time_is_not_taken_over(model: sc.Model) -> None:
+def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
     text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
     assert parse_model(text, {"system": {"monitor": "frequency"}}).h is None
     assert parse_model(text, BY_CLOCK) == model

@@ -96,7 +96,7 @@ def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path
         assert np.array_equal(file["q"], expected.q)
 
 
-def test_the_command_line_finds_the_step_of_tau(shaken: Path) -> None:
+def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
     said = invoke("run", str(shaken), "--tolerance", "1e-8")
     error = float(said.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
@@ -196,7 +196,9 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("solver", "embedded"), [("auto", None), ("newton", None), ("auto", "single")])
-def test_a_folder_has_it_in_c_and_in_python(shaken: Path, tmp_path: Path, solver: str, embedded: str | None) -> None:
+def test_folder_contains_the_controller_in_c_and_in_python(
+    shaken: Path, tmp_path: Path, solver: str, embedded: str | None
+) -> None:
     model = sc.load_model(shaken)
     folder = generate_package(model, tmp_path / "by_controller", solver=solver, embedded=embedded)
     flags = "CFLAGS=-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"

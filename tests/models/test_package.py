@@ -46,7 +46,7 @@ def pendulum() -> Model:
     return model_of("planar-pendulum", method=SVI(3))
 
 
-def test_writes_all_that_belongs_to_an_integrator(pendulum, tmp_path):
+def test_folder_contains_a_complete_integrator(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "made" / "pendulum_svi")
     assert folder == tmp_path / "made" / "pendulum_svi"
     names = "Makefile README.md __init__.py interface.json main.c model.toml pendulum_svi.c pendulum_svi.h support"
@@ -118,7 +118,7 @@ def test_generated_c_is_compiled_unchanged(pendulum, tmp_path):
     ("name", "method"),
     [("planar-pendulum", SVI(3)), ("duffing", SpectralCollocation(2)), ("outer-solar-system", SVI(2))],
 )
-def test_make_run_needs_a_c_compiler_only_and_gives_the_numbers_of_python(compiler, name, method, tmp_path):
+def test_make_run_requires_only_a_c_compiler_and_equals_python(compiler, name, method, tmp_path):
     needs("make", compiler)
     model = model_of(name, method=method)
     folder = generate_package(model, tmp_path / "generated_stepper")
@@ -211,7 +211,7 @@ def test_large_workspaces_are_not_on_the_stack(tmp_path):
     assert "static kepler_svi_run run;" in text
 
 
-def test_names_of_the_user_do_not_reach_the_program_text(tmp_path):
+def test_user_names_do_not_occur_in_the_program(tmp_path):
     base = model_of("planar-pendulum", method=SVI(1))
     model = replace(base, system=replace(base.system, name='*/ #error " ? \\\n """ evil'))
     folder = generate_package(model, tmp_path / "pendulum_svi")
@@ -229,7 +229,7 @@ def test_other_files_remain_and_generated_files_are_replaced(pendulum, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["main.c", "pendulum_svi.c", "__init__.py", "README.md", "interface.json"])
-def test_files_of_others_and_edited_files_are_overwritten_only_by_force(pendulum, tmp_path, name):
+def test_foreign_and_edited_files_require_force(pendulum, tmp_path, name):
     folder = tmp_path / "pendulum_svi"
     folder.mkdir()
     (folder / name).write_text("mine")
@@ -265,7 +265,7 @@ def test_unsuitable_folder_names_are_rejected_with_a_suggestion(pendulum, tmp_pa
     assert not (tmp_path / name).exists()
 
 
-def test_a_dot_means_the_name_of_the_folder_one_is_in(pendulum, tmp_path, monkeypatch):
+def test_dot_is_the_current_folder(pendulum, tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     generate_package(pendulum, ".")
@@ -297,7 +297,7 @@ def test_files_of_an_older_integrator_are_removed(pendulum, tmp_path):
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-def test_an_edited_file_that_would_be_stale_is_not_lost(pendulum, tmp_path):
+def test_outdated_edited_file_is_preserved(pendulum, tmp_path):
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")
     (folder / "__init__.py").write_text("# mine\n")
     with pytest.raises(PackageError, match=r"__init__\.py was edited"):
@@ -310,13 +310,13 @@ def test_an_edited_file_that_would_be_stale_is_not_lost(pendulum, tmp_path):
     assert (tmp_path / "outside").exists()
 
 
-def test_velocities_without_momenta_are_refused(tmp_path):
+def test_velocities_without_momenta_are_rejected(tmp_path):
     model = model_of("relativistic-particle", velocity=(2.0,))
     with pytest.raises(StateError, match="no momenta"):
         generate_package(model, tmp_path / "too_fast")
 
 
-def test_folders_that_are_no_packages_are_named(pendulum, tmp_path):
+def test_foreign_folders_are_named(pendulum, tmp_path):
     with pytest.raises(PackageError, match="not a generated package"):
         load_package(tmp_path)
     folder = generate_package(pendulum, tmp_path / "pendulum_svi")

@@ -46,13 +46,13 @@ def test_adaptive_example_reaches_the_end_time(model, tmp_path, solver):
     assert int(lines[-1].split()[1]) > 20
 
 
-def test_the_example_of_a_step_compares_them_with_it(model, tmp_path):
+def test_step_example_compares_adaptive_steps_with_the_step(model, tmp_path):
     lines = output(generate_package(replace(model, h=0.01, tolerance=None), tmp_path / "fixed"))
     assert "adaptive steps" in lines[-1]
     assert max(abs(float(word)) for word in lines[-1].split()[-2:]) < 1e-5
 
 
-def test_the_folder_has_them_in_python_too(model, tmp_path):
+def test_python_module_of_the_folder_has_adaptive_steps(model, tmp_path):
     stepper = load_package(generate_package(model, tmp_path / "controlled"))
     run = stepper.integrate([1.0, 0.0], [0.0, 1.0], t_end=2.0 * np.pi)
     assert np.abs(run.q[-1] - [1.0, 0.0]).max() < 1e-13

@@ -52,7 +52,7 @@ EQUATIONS = {
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
-def test_equations_of_motion(name: str) -> None:
+def test_equations_of_motion_of_the_catalogue(name: str) -> None:
     system = problem(name).system
     values = random_point(system)
     if name == "relativistic-particle":
@@ -91,7 +91,7 @@ def test_spherical_pendulum_is_a_particle_on_a_sphere() -> None:
     assert sympy.simplify(problem("spherical-pendulum").system.lagrangian - expected) == 0
 
 
-def test_outer_solar_system_is_newtons() -> None:
+def test_outer_solar_system_satisfies_newtons_equations() -> None:
     entry = problem("outer-solar-system")
     system = entry.system
     assert system.dimension == 18
@@ -121,7 +121,7 @@ def test_outer_solar_system_is_defined_fast() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_chain_forces(n: int) -> None:
+def test_forces_of_a_chain(n: int) -> None:
     system = fput_chain(n, alpha=0.25, beta=0.5)
     values = random_point(system)
     q = np.array([0, *(values[symbol] for symbol in system.coordinates), 0])
@@ -187,12 +187,12 @@ def test_states_have_the_properties_in_their_titles() -> None:
         ("fput-chain:5000", "1 to 1024"),
     ],
 )
-def test_refused_names(name: str, message: str) -> None:
+def test_unknown_names_are_rejected(name: str, message: str) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         problem(name)
 
 
-def test_refused_sizes_and_states() -> None:
+def test_invalid_sizes_and_states_are_rejected() -> None:
     for size in (True, 2.0, -1):
         with pytest.raises(SystemDefinitionError, match="masses"):
             fput_chain(size)  # type: ignore[arg-type]  # wrong on purpose

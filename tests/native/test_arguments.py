@@ -38,23 +38,23 @@ def with_unit(unit: object) -> WithUnit:
     return array
 
 
-def test_arrays_with_a_unit_are_refused_by_its_name():
+def test_arrays_with_a_unit_are_rejected():
     with pytest.raises(StateError, match="q has the unit km: give plain numbers"):
         real_array(with_unit("km"), "q")
     with pytest.raises(StateError, match="h has the unit second"):
         checked_number(OfPint(), "h")
 
 
-def test_labels_are_no_units():
+def test_labels_are_not_units():
     assert real_array(np.array([1.0]).view(Labelled), "q").tolist() == [1.0]
 
 
 @pytest.mark.parametrize("unit", ["", "dimensionless", None])
-def test_arrays_whose_unit_is_none_are_numbers(unit):
+def test_dimensionless_arrays_are_numbers(unit):
     assert real_array(with_unit(unit), "q").tolist() == [1.0, 2.0]
 
 
-def test_quantities_of_astropy_are_refused():
+def test_quantities_of_astropy_are_rejected():
     units = pytest.importorskip("astropy.units")
     with pytest.raises(StateError, match="velocity has the unit km / s"):
         real_array([1.0, 2.0] * units.km / units.s, "velocity")

@@ -67,7 +67,7 @@ def compiler_runs(monkeypatch) -> list[list[str]]:
 # The cache.
 
 
-def test_an_empty_cache_gets_one_entry_with_its_text_and_its_checksum(cache):
+def test_empty_cache_receives_one_entry_with_source_and_checksum(cache):
     assert answer() == 42.0
     (entry,) = entries(cache)
     assert {path.name for path in entry.iterdir()} == {
@@ -80,7 +80,7 @@ def test_an_empty_cache_gets_one_entry_with_its_text_and_its_checksum(cache):
     assert json.loads((entry / "manifest.json").read_text())["prefix"] == "tiny"
 
 
-def test_a_hit_runs_no_compiler(cache, monkeypatch):
+def test_cache_hit_runs_no_compiler(cache, monkeypatch):
     answer()
     forget(monkeypatch)
     commands = compiler_runs(monkeypatch)
@@ -154,7 +154,7 @@ def test_compilers_with_arguments_are_distinguished_by_command_and_version(tmp_p
     assert len(found) == 3
 
 
-def test_every_part_of_a_text_has_a_part_in_its_name():
+def test_cache_key_contains_every_part_of_the_source():
     whole = replace(source(), support=(("support/a.h", "/* a */"),), beside=source())
     changed = [
         replace(whole, prefix="other"),
@@ -172,7 +172,7 @@ def test_every_part_of_a_text_has_a_part_in_its_name():
 
 
 @pytest.mark.parametrize("where", ["flags", "environment", "compiler", "not at all"])
-def test_code_for_this_processor_alone_is_not_taken_for_that_of_another(where, tmp_path, monkeypatch):
+def test_processor_specific_code_is_not_shared_between_processors(where, tmp_path, monkeypatch):
     native, names = "-march=native", []
     monkeypatch.setenv(building.FLAGS_VARIABLE, native if where == "environment" else "")
     monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, '1.0')} {native if where == 'compiler' else '-pipe'}")
@@ -203,7 +203,7 @@ def flags_of_each_command(monkeypatch, flags: tuple[str, ...], given: Source) ->
     return commands
 
 
-def test_flags_of_the_environment_follow_those_given_in_every_command(monkeypatch):
+def test_environment_flags_follow_explicit_flags(monkeypatch):
     """Declarations that depend on the processor, the text, and the library made of it."""
     monkeypatch.setenv(building.FLAGS_VARIABLE, "-O1 -pipe")
     chosen = f"#ifdef __OPTIMIZE__\n{source().declarations}#endif\n"
@@ -334,7 +334,7 @@ def racer(cache: str, barrier, results) -> None:
     results.put(race(cache, barrier))
 
 
-def test_processes_that_race_into_an_empty_cache_all_succeed_with_one_entry(cache):
+def test_concurrent_builds_into_an_empty_cache_give_one_entry(cache):
     context = multiprocessing.get_context("spawn")
     barrier, results = context.Barrier(6), context.Queue()
     processes = [context.Process(target=racer, args=(str(cache), barrier, results)) for _ in range(6)]
@@ -351,14 +351,14 @@ def test_processes_that_race_into_an_empty_cache_all_succeed_with_one_entry(cach
 # Compilers.
 
 
-def test_cc_is_honoured_with_its_arguments(cache, monkeypatch):
+def test_cc_is_used_with_its_arguments(cache, monkeypatch):
     monkeypatch.setenv("CC", "cc -DUNUSED='1 2'")
     commands = compiler_runs(monkeypatch)
     assert answer() == 42.0
     assert all(command[1] == "-DUNUSED=1 2" for command in commands)
 
 
-def test_a_cc_that_is_not_there_is_named(monkeypatch):
+def test_missing_cc_is_named(monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler -O9")
     with pytest.raises(BuildError, match=r"environment variable CC \('no-such-compiler -O9'\) was not found"):
         answer()
@@ -370,7 +370,7 @@ def test_output_of_a_failing_cc_is_shown(monkeypatch):
         answer()
 
 
-def test_a_cc_that_cannot_run_is_named(tmp_path, monkeypatch):
+def test_cc_that_cannot_run_is_named(tmp_path, monkeypatch):
     script = tmp_path / "broken-cc"
     script.write_text("#!/no/such/interpreter\n")
     script.chmod(0o755)
@@ -412,7 +412,7 @@ exec cc "$@"
 """
 
 
-def test_a_machine_without_vector_functions_computes_by_those_of_numbers(tmp_path, monkeypatch):
+def test_missing_vector_functions_are_replaced_by_scalar_ones(tmp_path, monkeypatch):
     script = tmp_path / "plain-cc"
     script.write_text(WITHOUT_VECTOR_FUNCTIONS)
     script.chmod(0o755)
@@ -429,7 +429,7 @@ case "$last" in *.so) echo "for another machine" > "$last" ;; esac
 """
 
 
-def test_a_compiler_for_another_machine_is_named(tmp_path, monkeypatch):
+def test_cross_compiler_is_named(tmp_path, monkeypatch):
     script = tmp_path / "cross-cc"
     script.write_text(CROSS_COMPILER)
     script.chmod(0o755)

@@ -89,7 +89,7 @@ def test_compiler_is_ended_after_a_timeout(slow_compiler, monkeypatch):
     assert is_gone(child_of(slow_compiler))
 
 
-def test_output_status_and_temporary_files_are_those_of_the_program(tmp_path):
+def test_output_status_and_temporary_files_are_handled(tmp_path):
     with running(["sh", "-c", 'echo "$TMPDIR"; echo no >&2; exit 3', "name"], tmp_path) as process:
         assert process.communicate(timeout=300) == (f"{tmp_path}\n", "no\n")
     assert process.returncode == 3

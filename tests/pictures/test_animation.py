@@ -98,7 +98,7 @@ class TestFilm:
             assert axes.get_title() == f"double pendulum, t = {run.t[frame]:.6g}"
 
     @pytest.mark.parametrize("name", ["charged-particle", "fput-chain", "planar-pendulum", "outer-solar-system"])
-    def test_a_notebook_shows_it(self, name):
+    def test_animation_has_a_notebook_display(self, name):
         shown = run_of(name, 3).animate(seconds=0.2)._repr_html_()
         assert shown.count("data:image/png") == 4
 

@@ -136,7 +136,7 @@ def test_failed_picture_leaves_no_file(kepler, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_dollar_signs_in_names_are_no_formulas(tmp_path):
+def test_dollar_signs_in_names_are_escaped(tmp_path):
     model = Model.from_problem(problem("planar-pendulum"))
     system = replace(model.system, name="a $ b $ {")
     stepper = compile_stepper(system, SVI(1))
@@ -150,7 +150,7 @@ def orbits() -> list[Trajectory]:
     return [stepper.integrate([0.0, y], [0.3, 0.0], h=0.1, steps=3000) for y in (-0.1, 0.2)]
 
 
-def test_a_section_has_the_states_at_the_crossings(orbits, tmp_path):
+def test_section_contains_the_states_at_the_crossings(orbits, tmp_path):
     axes = plot_section(orbits, axes=("y", "p_y"), event=1)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
     assert axes.get_title() == "Henon-Heiles system: x = 0, rising"
@@ -191,7 +191,7 @@ class TestOnePicture:
         assert "angular momentum" in (tmp_path / "maps.svg").read_text(encoding="utf-8")
         assert pyplot.get_fignums() == []
 
-    def test_a_phase_portrait_has_a_curve_an_orbit(self, orbits):
+    def test_phase_portrait_has_one_curve_per_orbit(self, orbits):
         axes = plot_phase(orbits, axes=("y", "p_y"))
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "p_y")
         drawn = [line for line in axes.lines if len(line.get_xdata()) > 2]
@@ -205,7 +205,7 @@ class TestOnePicture:
         assert len(axes.lines) == 2
         assert low <= np.nanmin(values) <= np.nanmax(values) <= high
 
-    def test_momentum_maps_are_named_and_their_changes_drawn(self, kepler):
+    def test_momentum_maps_and_their_changes_are_drawn(self, kepler):
         axes = plot_momentum_maps(kepler)
         labels = [text.get_text() for text in axes.get_legend().get_texts()]
         assert labels == list(kepler.stepper.momentum_map_names)

@@ -107,7 +107,7 @@ def check(sample, compiled, name, method, *, h=H, t=T, **how):
 @pytest.mark.covering(2)
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", FEW, ids=lambda method: method.name)
-def test_every_kind_of_lagrangian_steps_as_the_oracle(sample, compiled, name, method):
+def test_every_kind_of_lagrangian_agrees_with_the_oracle(sample, compiled, name, method):
     check(sample, compiled, name, method, flags=TUNED_FLAGS)
 
 
@@ -131,12 +131,12 @@ SOLVED_BOTH_WAYS = (
 
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize(("name", "method"), SOLVED_BOTH_WAYS, ids=lambda value: getattr(value, "name", value))
-def test_both_solvers_step_as_the_oracle(sample, compiled, name, method, solver):
+def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solver):
     check(sample, compiled, name, method, solver=solver, flags=UNOPTIMISED)
 
 
 @pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
-def test_every_family_of_methods_steps_as_the_oracle(sample, compiled, method):
+def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
     """On a Lagrangian with everything in it: coupled, mass depending on angle and time, velocity-dependent terms."""
     check(sample, compiled, "pumped-cart-pole", method, flags=UNOPTIMISED)
 
@@ -144,18 +144,18 @@ def test_every_family_of_methods_steps_as_the_oracle(sample, compiled, method):
 @pytest.mark.full
 @pytest.mark.parametrize("name", SYSTEMS)
 @pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
-def test_every_method_on_every_system_steps_as_the_oracle(sample, compiled, name, method):
+def test_every_method_on_every_system_agrees_with_the_oracle(sample, compiled, name, method):
     check(sample, compiled, name, method)
 
 
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3), RadauIIA(2)], ids=lambda method: method.name)
 @pytest.mark.parametrize(("h", "t"), [(-0.11, 0.37), (0.02, -5.5), (-0.2, 100.0)])
-def test_steps_back_and_far_from_time_zero_are_the_oracles(sample, compiled, method, h, t):
+def test_backward_steps_and_large_times_agree_with_the_oracle(sample, compiled, method, h, t):
     check(sample, compiled, "pumped-cart-pole", method, h=h, t=t, flags=UNOPTIMISED)
 
 
 @pytest.mark.parametrize("method", [SVI(2, "gauss-legendre:3"), SCVI(3)], ids=lambda method: method.name)
-def test_parameters_given_at_the_step_are_the_oracles(sample, compiled, method):
+def test_parameters_of_a_step_agree_with_the_oracle(sample, compiled, method):
     case, changed = sample("pumped-cart-pole"), {"a": 0.35, "m": 1.3, "k": -0.2}
     mechanics = oracle.Mechanics(case.system, changed)
     q, p = case.state

@@ -52,7 +52,7 @@ def files_named(*names: str) -> list[str]:
 @pytest.mark.full
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="flags of x86-64")
 @pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
-def test_steppers_work_on_lesser_processors(tmp_path, level):
+def test_steppers_work_on_older_processors(tmp_path, level):
     if level == "x86-64-v3" and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2")
     files = files_named("stepper", "ensemble", "identities", "structure", "constraints")
@@ -85,7 +85,7 @@ def test_different_flags_give_a_different_build(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "charged-particle"])
-def test_portable_flags_fix_every_bit(tmp_path, monkeypatch, name):
+def test_portable_flags_are_bitwise_reproducible(tmp_path, monkeypatch, name):
     """Different compilers, one libm: the same numbers; the tuned build differs by roundings."""
     needs("gcc", "clang")
     from scvi_codegen.compiler import compile_stepper

@@ -105,7 +105,7 @@ def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
     assert results == [("".join(f"{number}.0\n" for number in order), "") for order in numbers]
 
 
-def test_an_entry_that_is_removed_as_soon_as_it_is_made_is_made_again(folder, monkeypatch):
+def test_removed_entry_is_rebuilt(folder, monkeypatch):
     load, removed = building._open, []
 
     def disturbed(entry: Path) -> object:
@@ -262,14 +262,14 @@ def test_steppers_are_pickled_to_other_processes(kepler, finals, method):
 
 
 @pytest.mark.parametrize("backend", ["loky", "threading"])
-def test_joblib(kepler, finals, backend):
+def test_joblib_runs_steppers(kepler, finals, backend):
     joblib = pytest.importorskip("joblib")
     work = [joblib.delayed(final)(kepler, p) for p in MOMENTA[:6]]
     assert joblib.Parallel(n_jobs=2, backend=backend)(work) == finals[:6]
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_dask(kepler, finals, scheduler):
+def test_dask_runs_steppers(kepler, finals, scheduler):
     dask = pytest.importorskip("dask")
     work = [dask.delayed(final)(kepler, p) for p in MOMENTA[:6]]
     assert list(dask.compute(*work, scheduler=scheduler, num_workers=2)) == finals[:6]

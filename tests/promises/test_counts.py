@@ -36,7 +36,7 @@ def test_out_of_range_values_are_named_with_the_bound(value, message):
         checked_count(value, "n", least=2, most=5, error=MethodError)
 
 
-def test_a_degree_in_numpys_integers_is_the_same_degree():
+def test_numpy_integer_degree_is_equal():
     assert SVI(np.int64(3)) == SVI(3)
     assert repr(SVI(np.int64(3))) == repr(SVI(3))
     assert gauss_legendre(np.int32(4)) == gauss_legendre(4)

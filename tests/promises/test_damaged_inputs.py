@@ -150,7 +150,7 @@ def _is_huge(x: Any) -> bool:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_odd_values(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_special_values_are_rejected_or_handled(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     failed = []
     for value in ODD:
@@ -176,7 +176,7 @@ WRONG_LINES = [
 
 
 @pytest.mark.parametrize("number", [number for number, line in enumerate(LINES) if line])
-def test_model_files(number: int, tmp_path: Path) -> None:
+def test_damaged_model_files_are_rejected(number: int, tmp_path: Path) -> None:
     """Each line left out, cut, doubled, or with another in its place."""
     path = tmp_path / "model.toml"
     line = LINES[number]
@@ -230,7 +230,7 @@ CSV = [
 
 
 @pytest.mark.parametrize("number", range(len(CSV)))
-def test_tables_in_csv(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As inputs, as tables of places, and as ensembles of the command line."""
     monkeypatch.chdir(tmp_path)
     Path("u.csv").write_text(CSV[number])
@@ -241,7 +241,7 @@ def test_tables_in_csv(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("kind", ["npz", "npy"])
-def test_files_of_numpy(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_numpy_files_are_rejected(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = Path(f"u.{kind}")
     if kind == "npz":
@@ -286,7 +286,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.full) for part in range(1, PARTS))])
-def test_manifests(recorded: Path, part: int) -> None:
+def test_damaged_manifests_are_rejected(recorded: Path, part: int) -> None:
     """Every entry of a manifest with every value: refused as a recording, or read and used without harm."""
     path = recorded / "manifest.json"
     whole = path.read_text()
@@ -316,7 +316,7 @@ def _read_whole(folder: Path) -> None:
     assert (len(run), run.steps, repr(run)) is not None
 
 
-def test_files_of_states(recorded: Path) -> None:
+def test_damaged_state_files_are_rejected(recorded: Path) -> None:
     path = recorded / "states-000001.npz"
     whole = path.read_bytes()
     with np.load(path) as file:
@@ -342,7 +342,9 @@ ENVIRONMENT = [
 
 
 @pytest.mark.parametrize(("name", "value"), ENVIRONMENT, ids=lambda text: text[:20])
-def test_the_environment(name: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_environment_variables_are_rejected(
+    name: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = "double answer(void);\n"
     code = '#include "tiny.h"\ndouble answer(void) { return 1.0; }\n'
     tiny = Source(prefix="tiny", header=text, code=code, declarations=text)

@@ -215,7 +215,7 @@ def test_certificate_reports_damping():
 @pytest.mark.parametrize(
     "given", [0.25, "0.25", np.float64(0.25), Fraction(1, 4), sympy.Rational(1, 4)], ids=lambda x: type(x).__name__
 )
-def test_a_rate_may_be_a_number(given):
+def test_damping_rate_may_be_a_number(given):
     """In text, SymPy and model files alike; what is neither number nor text is refused by name."""
     x = sympy.Function("x")(sympy.Symbol("t", real=True))
     systems = []
@@ -233,7 +233,7 @@ def test_a_rate_may_be_a_number(given):
 
 
 @pytest.mark.parametrize("written", ["0.25", '"0.25"', "'1/4'"])
-def test_a_rate_may_be_a_number_in_a_model_file(written):
+def test_damping_rate_may_be_a_number_in_a_model_file(written):
     text = f"""
         system = {{ name = "a", coordinates = ["x"], lagrangian = "x_dot**2/2", damping = {written} }}
         initial = {{ q = [0.0], q_dot = [1.0] }}

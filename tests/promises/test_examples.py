@@ -86,7 +86,7 @@ def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
     return output
 
 
-def test_every_example_is_tried_here():
+def test_every_example_is_tested():
     assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
     assert {path.stem for path in EXAMPLES.glob("*.toml")} == {*ENERGY_ERRORS, "shaken_tower", "fput_ring"}
 
@@ -152,7 +152,7 @@ def test_eccentric_comet_conserves_energy(output_of):
     assert regular[4] < 1e-9
 
 
-def test_a_field_in_two_parts_has_the_bits_of_one(output_of):
+def test_field_in_two_parts_is_bitwise_equal(output_of):
     bits, states, *times = output_of("field_on_two_processes").splitlines()
     assert bits == "two processes have the bits of one: True"
     assert states == "and the states of the compiled integrator: True"
@@ -307,7 +307,7 @@ def test_orbit_of_ceres_determines_the_mass_of_jupiter(output_of, tmp_path):
     assert (tmp_path / "ceres_orbit.png").stat().st_size > 10_000
 
 
-def test_a_duffing_oscillator_is_found_in_a_noisy_recording(output_of):
+def test_duffing_oscillator_is_identified_from_noisy_data(output_of):
     output = output_of("duffing_fit")
     for name, true in {"alpha": -1.0, "beta": 1.0, "delta": 0.3}.items():
         value, error = map(float, re.search(rf"{name} += (\S+) \+- (\S+)", output).groups())

@@ -154,7 +154,7 @@ NUMBERS: dict[str, Any] = {
 
 @pytest.mark.filterwarnings("ignore:Warning. converting a masked element:UserWarning")
 @pytest.mark.parametrize("what", NUMBERS)
-def test_a_number_is_a_real_number(what, kepler):
+def test_real_numbers_are_required(what, kepler):
     value = NUMBERS[what]
     for call in (
         lambda: kepler.step(Q, P, value),
@@ -197,13 +197,13 @@ def test_a_number_is_a_real_number(what, kepler):
         lambda s: s.from_checkpoint(b""),
     ],
 )
-def test_refused_by_name(call, kepler):
+def test_wrong_types_are_rejected_by_name(call, kepler):
     with pytest.raises(StateError), guarded():
         call(kepler)
 
 
 @pytest.mark.parametrize("method", [SVI(3), StoermerVerlet()], ids=lambda method: method.name)
-def test_damaged_bytes_of_a_run_are_refused_or_continued_within_bounds(method):
+def test_damaged_bytes_of_a_run_are_rejected_or_bounded(method):
     stepper = prepared(stepper_for("kepler", method))
     run = stepper.start(Q, P, h=0.1)
     run.record(3)
@@ -293,7 +293,7 @@ def check_oscillator(stepper: Stepper, random: Random) -> bool:
 
 @pytest.mark.parametrize("solver", ["auto", "newton", "fixed-point"])
 @pytest.mark.parametrize("kind", ["lagrangian", "hamiltonian"])
-def test_an_oscillator_of_any_size_with_any_step_is_right_or_refused(kind, solver, request):
+def test_oscillator_of_any_size_with_any_step_is_correct_or_rejected(kind, solver, request):
     """SVI(2) with two Gauss points is the two-stage Gauss method, and on the oscillator a rational function of h."""
     stepper = prepared(compile_stepper(oscillator(kind), SVI(2), solver=solver, flags=QUICK_FLAGS))
     random = Random(11)
@@ -350,7 +350,7 @@ def check_nonlinear(name: str, method: Any, random: Random) -> bool:
 
 
 @pytest.mark.parametrize(("name", "method"), NONLINEAR, ids=lambda value: str(getattr(value, "name", value)))
-def test_any_state_is_stepped_to_a_finite_one_or_refused(name, method):
+def test_any_state_gives_a_finite_step_or_is_rejected(name, method):
     random = Random(7)
     assert sum(check_nonlinear(name, method, random) for _ in range(300)) > 10
 

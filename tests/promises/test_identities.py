@@ -125,7 +125,7 @@ def test_other_lagrangians_additional_lobatto_point_is_not_the_next_pair(sample,
     assert differences[0] > differences[1] > differences[2] > 1e-12
 
 
-def test_a_kinetic_energy_that_is_not_quadratic_parts_them_from_degree_two_on(sample, compiled):
+def test_nonquadratic_kinetic_energy_distinguishes_methods_from_degree_two(sample, compiled):
     """For L = T(v) - V(q) the one velocity of degree 1 makes no difference; two do."""
     name = "relativistic-particle"
     one, two = (
@@ -200,7 +200,7 @@ def test_spectral_collocation_is_collocation_runge_kutta_on_its_later_nodes(samp
 
 
 @pytest.mark.parametrize(("name", "same"), [("kepler", True), ("charged-particle", False)])
-def test_position_and_phase_space_form_agree_for_constant_mass_alone(sample, compiled, name, same):
+def test_position_and_phase_space_form_agree_only_for_constant_mass(sample, compiled, name, same):
     """A vector potential is enough to part them: p is not a constant multiple of v."""
     for one, other in (
         (SpectralCollocation(2), SpectralCollocation(2, form="phase-space")),
@@ -280,7 +280,7 @@ def test_variable_mass_scvi_on_gauss_points_is_not_svi(sample, compiled):
         ({"abscissae": [0.2, 0.2, 0.8]}, "not greater than the one before"),
     ],
 )
-def test_refused_abscissae(arguments, message):
+def test_invalid_abscissae_are_rejected(arguments, message):
     with pytest.raises(MethodError, match=message):
         SCVI(3, **arguments)
 

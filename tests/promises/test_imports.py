@@ -134,7 +134,7 @@ def test_root_contains_only_the_tour_and_shared_modules():
 
 
 @pytest.mark.parametrize("room", FLOOR_OF)
-def test_imports_point_down_only(room):
+def test_imports_point_to_lower_layers_only(room):
     used = [(m, other) for m in MODULES if room_of(m) == room for other in USED[m] if room_of(other) != room]
     assert [pair for pair in used if FLOOR_OF[room_of(pair[1])] >= FLOOR_OF[room]] == []
 
@@ -143,7 +143,7 @@ def test_no_module_imports_itself_indirectly():
     assert circle(USED) == []
 
 
-def test_a_circle_would_be_found():
+def test_circular_import_is_detected():
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}})
 
 
@@ -156,7 +156,7 @@ def test_third_party_libraries_are_imported_by_assigned_packages_only(library):
 POSIX = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
 
 
-def test_no_module_of_one_kind_of_system_is_imported():
+def test_modules_specific_to_one_kind_of_system_are_not_imported():
     assert {m for m, tree in MODULES.items() if POSIX & {name.split(".")[0] for name in imports(tree)}} == set()
 
 
@@ -205,7 +205,7 @@ def test_a_generated_package_loads_no_heavy_library(tmp_path, use):
     assert loaded.isdisjoint(HEAVY)
 
 
-def test_type_checkers_see_the_public_names_where_they_are():
+def test_type_checkers_find_the_public_names():
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
     seen = {alias.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names}
     homes = {name: f"scvi_codegen.{home}" for home, names in scvi_codegen._HOMES.items() for name in names}

@@ -113,7 +113,7 @@ LOW = tuple(method for method in METHODS if method.order <= 6 and method not in 
 
 
 @pytest.mark.parametrize("method", first_of_each(METHODS, family), ids=lambda method: method.name)
-def test_global_error_on_kepler_shrinks_with_the_order_claimed(compiled, sample, method):
+def test_global_error_on_kepler_has_the_claimed_order(compiled, sample, method):
     assert measured_order(compiled, sample, "kepler", method) == pytest.approx(method.order, abs=0.15)
 
 
@@ -127,7 +127,7 @@ def test_every_method_has_its_order_with_quadratures_of_derivatives_and_other_cu
 @pytest.mark.parametrize(
     "method", [*METHODS, *(one for one in SPECIAL if one not in METHODS)], ids=lambda method: method.name
 )
-def test_the_certificate_measures_that_order_below_rounding(compiled, sample, method):
+def test_certificate_measures_the_order_below_rounding(compiled, sample, method):
     state, stepper = State(*sample("kepler").state, 0.3, 0.05), compiled("kepler", method)
     subject = SystemUnderTest(problem("kepler").system, method, stepper, None, state)
     (order,) = (check for check in convergence_checks(subject) if check.name == "order")
@@ -136,13 +136,13 @@ def test_the_certificate_measures_that_order_below_rounding(compiled, sample, me
 
 
 @pytest.mark.parametrize("method", LOW[::5], ids=lambda method: method.name)
-def test_global_error_on_a_coupled_time_dependent_system_does_too(compiled, sample, method):
+def test_global_error_on_a_coupled_time_dependent_system_has_the_claimed_order(compiled, sample, method):
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.15)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", LOW, ids=lambda method: method.name)
-def test_global_error_of_every_low_order_method_on_that_system(compiled, sample, method):
+def test_every_low_order_method_has_its_order_on_a_time_dependent_system(compiled, sample, method):
     assert measured_order(compiled, sample, "pumped-cart-pole", method) == pytest.approx(method.order, abs=0.25)
 
 

@@ -35,7 +35,7 @@ def test_model_file_runs_the_complete_span(run):
     assert run["t"][-1] == SPAN
 
 
-def test_final_positions_are_the_references(run, reference):
+def test_final_positions_agree_with_the_reference(run, reference):
     q, p = (run[name][-1].reshape(6, 3) for name in ("q", "p"))
     # measured 4e-13 AU; rounding of 1000 steps, magnified by the motion along the orbits
     np.testing.assert_allclose(q, reference[0], rtol=0, atol=5e-12)

@@ -50,7 +50,7 @@ def test_every_option_of_a_stepper_is_in_the_table() -> None:
 
 
 @pytest.mark.parametrize("option", STEPPERS)
-def test_a_stepper_is_what_it_was(option: str) -> None:
+def test_pickled_stepper_is_equal(option: str) -> None:
     own = stepper(option)
     made = {
         "changes": own._variational_source(2),
@@ -139,7 +139,7 @@ def driven() -> Stepper:
 
 
 @pytest.mark.parametrize("held", [(), ("u",), ("w",), ("u", "w")])
-def test_a_run_waits_for_the_inputs_that_were_not_given(held: tuple[str, ...]) -> None:
+def test_run_requires_inputs_that_are_not_set(held: tuple[str, ...]) -> None:
     run = driven().start([0.3], [0.1], h=H)
     run.set_inputs(**dict.fromkeys(held, 0.7))
     copy = copied(run)

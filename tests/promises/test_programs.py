@@ -26,17 +26,17 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.usefixtures("installed")
-def test_a_program_that_was_not_declared_is_refused() -> None:
+def test_undeclared_program_is_rejected() -> None:
     with pytest.raises(UndeclaredProgramError, match=f"{PROGRAM} is not required by the README"):
         subprocess.run([PROGRAM], check=False)
 
 
-def test_a_program_that_was_declared_is_called(installed: Path) -> None:
+def test_declared_program_is_called(installed: Path) -> None:
     assert needs(PROGRAM) == str(installed)
     assert subprocess.run([PROGRAM], check=False).returncode == 3
 
 
-def test_required_programs_and_those_of_the_test_are_called(tmp_path: Path) -> None:
+def test_required_and_declared_programs_are_called(tmp_path: Path) -> None:
     assert subprocess.run(["uname"], capture_output=True, check=False).returncode == 0
     assert subprocess.run([sys.executable, "-c", ""], check=False).returncode == 0
     own = tmp_path / "own"
@@ -45,7 +45,7 @@ def test_required_programs_and_those_of_the_test_are_called(tmp_path: Path) -> N
     assert subprocess.run([str(own)], check=False).returncode == 3
 
 
-def test_a_program_that_is_missing_skips_the_test_by_its_name() -> None:
+def test_missing_program_skips_the_test_by_name() -> None:
     with pytest.raises(pytest.skip.Exception, match="needs the program no-such-program"):
         needs("no-such-program")
 

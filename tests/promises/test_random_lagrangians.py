@@ -152,7 +152,7 @@ COMMON = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow], "da
 
 @given(case=cases())
 @settings(max_examples=12, derandomize=True, **COMMON)
-def test_random_steps_are_the_oracles(quickly_compiled, case):
+def test_random_steps_agree_with_the_oracle(quickly_compiled, case):
     check(case, quickly_compiled)
 
 

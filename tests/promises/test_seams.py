@@ -78,7 +78,7 @@ def run(folder: Path, script: str) -> str:
     return found.stdout
 
 
-def test_the_page_adds_a_method_and_a_solver_in_a_file_and_a_line_each() -> None:
+def test_documented_method_and_solver_need_one_file_and_one_line() -> None:
     new, changes = additions()
     lines = [line for _, change in changes for line in change.splitlines() if line[:1] in "+-"]
     assert len(new) == 2
@@ -87,7 +87,7 @@ def test_the_page_adds_a_method_and_a_solver_in_a_file_and_a_line_each() -> None
     assert sum("import" not in line for line in lines) == 2
 
 
-def test_the_method_of_the_page_is_the_midpoint_rule(extended: Path) -> None:
+def test_documented_method_is_the_midpoint_rule(extended: Path) -> None:
     script = """
 import scvi_codegen, numpy as np
 from scvi_codegen.methods import Gauss, method_from_specification
@@ -101,7 +101,7 @@ print(own.families == gauss.families, own.fixed_point == gauss.fixed_point, *(ea
     assert run(extended, script).split() == ["True", "True", "True"]
 
 
-def test_the_solver_of_the_page_finds_what_newton_finds(extended: Path) -> None:
+def test_documented_solver_agrees_with_newton(extended: Path) -> None:
     script = """
 import numpy as np
 from scvi_codegen import SCVI, compile_stepper
@@ -328,7 +328,7 @@ def _widened(table: Table, columns: Table) -> Table:
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_blocks_of_another_size_are_compiled(degree: int) -> None:
+def test_other_block_sizes_are_compiled(degree: int) -> None:
     system, surface = rod()
     method = ConstrainedIncrements(degree, (surface,))
     stepper = compile_stepper(system, method, solver="newton", flags=QUICK_FLAGS)
@@ -368,7 +368,7 @@ def test_one_and_two_constraints_on_three_coordinates(degree: int, constraints: 
     assert np.abs(run.q[-1] - (angle[0] * plane - angle[1] * down)).max() < 0.02 / 16 ** (2 * degree)
 
 
-def test_two_sizes_need_blocks_and_rows_of_each() -> None:
+def test_two_block_sizes_need_blocks_and_rows_of_each() -> None:
     system, surface = rod()
     stages = ConstrainedIncrements(2, (surface,)).stage_system(system)
     with pytest.raises(MethodError, match="2 blocks and 1 rows of 1"):

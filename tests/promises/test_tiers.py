@@ -23,7 +23,7 @@ def test_every_value_is_in_the_requested_number_of_combinations(sizes: tuple[int
     assert len(chosen) <= min(len(combinations), times * max(sizes) + len(sizes))
 
 
-def test_the_first_of_each_kind_is_in_the_default_tier() -> None:
+def test_first_value_of_each_kind_is_in_the_default_tier() -> None:
     found = first_of_each(["a1", "a2", "b1", "a3", "b2"], key=lambda word: word[0])
     assert [one.values[0] for one in found if not one.marks] == ["a1", "b1"]
     assert [one.values[0] for one in found] == ["a1", "a2", "b1", "a3", "b2"]

@@ -27,7 +27,7 @@ def of_few_points():
 
 
 @pytest.mark.parametrize("act", [too_long, off_its_constraints, of_few_points])
-def test_a_warning_names_the_line_that_called(act):
+def test_warning_points_to_the_calling_line(act):
     with pytest.warns((sc.AccuracyWarning, sc.MethodWarning)) as heard:
         act()
     assert {warning.filename for warning in heard} == {__file__}
@@ -52,7 +52,7 @@ def test_start_off_its_constraints_warns_with_the_violation(q, velocity, told):
         sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
 
 
-def test_a_constraint_of_velocities_is_a_rate_itself():
+def test_velocity_constraint_violation_is_a_rate():
     blade = sc.LagrangianSystem.from_text(
         name="blade",
         coordinates=["x", "y", "a"],

@@ -98,7 +98,7 @@ def test_the_wheel_works_outside_the_checkout(installed, tmp_path):
     assert {each["name"]: each["status"] for each in found["findings"]}["trial"] == "ok"
 
 
-def test_the_citation_is_of_this_version():
+def test_citation_has_the_current_version():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     released = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]

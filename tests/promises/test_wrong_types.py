@@ -155,17 +155,17 @@ def test_trajectories_refuse_wrong_types_by_name(run, tmp_path):
 @pytest.mark.parametrize(
     "given", [["k"], {"k"}, {1: 2.0}, {"k": "a"}, {"k": None}, {"nu": 1.0}, [1.0, 2.0], "k"], ids=repr
 )
-def test_parameters_of_the_wrong_kind(given, run):
+def test_parameters_of_wrong_type_are_rejected(given, run):
     with pytest.raises(ScviCodegenError, match="parameter"):
         run.stepper.integrate(Q, P, h=0.1, steps=1, parameters=given)
 
 
-def test_names_alone_are_no_list_of_names():
+def test_list_of_names_is_required_for_parameters():
     with pytest.raises(ScviCodegenError, match=r"coordinates must be a list of names, as \['x', 'y'\], not 'x'"):
         sc.LagrangianSystem.from_text(name="x", coordinates="x", lagrangian="x_dot**2/2")  # type: ignore[arg-type]
 
 
-def test_checked_functions_stay_what_they_were():
+def test_checked_functions_retain_their_signature():
     @checks_arguments(name=TEXT)
     def greet(name: str, times: int = 1) -> str:
         """Politely."""

@@ -138,7 +138,7 @@ def share_of(method: str, share: int) -> list[Source]:
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
-def test_compiles_without_a_warning_to_pure_code(method, share, tmp_path):
+def test_code_compiles_without_warnings(method, share, tmp_path):
     """The objects export nothing but names with the prefix, and hold no data that could be written."""
     files = write(share_of(method, share), tmp_path)
     run([needs("gcc"), *C99, "-O1", "-c", *files], tmp_path)
@@ -150,7 +150,7 @@ def test_compiles_without_a_warning_to_pure_code(method, share, tmp_path):
 @pytest.mark.covering
 @pytest.mark.parametrize("share", range(SHARES))
 @pytest.mark.parametrize("method", METHODS)
-def test_clang_has_no_warning_either(method, share, tmp_path):
+def test_clang_reports_no_warnings(method, share, tmp_path):
     files = write(share_of(method, share), tmp_path)
     run([needs("clang"), *C99, "-c", *files], tmp_path)
 
@@ -159,7 +159,7 @@ def test_clang_has_no_warning_either(method, share, tmp_path):
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
-def test_texts_that_are_compiled_here_alone_have_no_warning(name, solver, compiler, tmp_path):
+def test_sources_for_this_machine_compile_without_warnings(name, solver, compiler, tmp_path):
     """A fallback borrowed and lent, and steps of a density of their own."""
     system = systems()[name]
     q = system.coordinates[0].name
@@ -210,7 +210,7 @@ def test_headers_compile_as_c_plus_plus(tmp_path):
 @pytest.mark.covering
 @pytest.mark.parametrize("solver", ["newton", "fixed-point"])
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_path):
+def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_path):
     methods = (SVI(2), Gauss(3), StoermerVerlet(), SpectralCollocation(2), SCVI(3, variational=False))
     names = ("kepler", "driven-duffing", "pumped-cart-pole")
     sources = [generate_source(systems()[name], method, solver=solver)[0] for method in methods for name in names]
@@ -223,7 +223,7 @@ def test_either_solver_alone_compiles_without_a_warning(compiler, solver, tmp_pa
 @pytest.mark.parametrize("name", ["double-pendulum", "driven-duffing", "driven Hamiltonian"])
 @pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_tuned_builds_compile_without_a_warning(compiler, method, name, tmp_path):
+def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path):
     """With the vector instructions of this processor, and with glibc's vector functions where those are."""
     files = write([generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
@@ -243,7 +243,7 @@ for method in names:
 """
 
 
-def test_text_is_the_same_in_every_process(tmp_path):
+def test_source_is_equal_in_every_process(tmp_path):
     """Whatever the seed of Python's hashes, on which the order of sets and of SymPy's arguments depends."""
     processes = [
         subprocess.Popen(
@@ -260,7 +260,7 @@ def test_text_is_the_same_in_every_process(tmp_path):
     assert others == [first] * len(others)
 
 
-def test_text_is_ascii_with_unix_line_ends_and_no_trailing_blanks():
+def test_source_is_ascii_with_unix_line_ends_and_no_trailing_blanks():
     for method in METHODS:
         for source, _ in generated(method).values():
             for text in source.files.values():
@@ -306,7 +306,7 @@ def named_system(names: Sequence[str], name: str = "oscillators") -> LagrangianS
 
 
 @pytest.mark.parametrize("method", TESTED, ids=lambda method: method.name)
-def test_names_that_mean_something_in_c_do_no_harm(method, tmp_path):
+def test_reserved_names_of_c_are_valid_coordinates(method, tmp_path):
     hostile = accepted(C_NAMES)
     plain = [f"name{k}" for k in range(len(hostile))]
     assert len(hostile) > 50
@@ -341,7 +341,7 @@ def test_title_cannot_end_its_comment(title, tmp_path):
 
 
 @pytest.mark.parametrize("prefix", ["fabs", "errno", "NULL", "main", "newton", "step", "int", "m", "b"])
-def test_prefixes_that_mean_something_in_c_do_no_harm(prefix, tmp_path):
+def test_reserved_prefixes_of_c_are_valid(prefix, tmp_path):
     source, _ = generate_source(bare_oscillator(), SVI(2), prefix=prefix)
     files = write([source], tmp_path)
     run([needs("gcc"), *C99, "-c", *files], tmp_path)

@@ -40,7 +40,7 @@ def lobatto(s):
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_compiles_without_a_warning(compiler, tmp_path):
+def test_constrained_code_compiles_without_warnings(compiler, tmp_path):
     for system, s, controlled in ((LINKAGE, 3, False), (LINKAGE, 3, True), (PENDULUM, 1, True), (PENDULUM, 4, False)):
         source = generate_source(system, lobatto(s), controlled=controlled, amalgamate=True)[0]
         (tmp_path / f"{source.prefix}.h").write_text(source.header)
@@ -81,7 +81,7 @@ def test_model_files_select_compatible_points():
     assert parse_model(f"{text}\n[run]\nspan = 1.0\n").method == lobatto(6)
 
 
-def test_packages_run_alone(tmp_path):
+def test_packages_are_self_contained(tmp_path):
     stepper = compile_stepper(LINKAGE, "svi:3")
     q, _ = stepper.project(NEAR)
     model = Model(system=LINKAGE, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.01, span=1.0)

@@ -33,7 +33,7 @@ CASES = {
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("second", [False, True])
 @pytest.mark.parametrize("name", CASES)
-def test_compiles_without_a_warning(name, second, compiler, tmp_path):
+def test_derivatives_compile_without_warnings(name, second, compiler, tmp_path):
     system, method = CASES[name]
     if second and system.clock:
         pytest.skip("there are no second derivatives in transformed time")

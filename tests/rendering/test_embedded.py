@@ -137,7 +137,7 @@ def check_needs(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", BOARDS)
 @pytest.mark.parametrize("case", CASES)
-def test_a_board_gives_the_numbers_of_the_host(case, name, tmp_path):
+def test_board_and_host_give_equal_numbers(case, name, tmp_path):
     """Bit for bit where only arithmetic and square roots are used, else to the rounding of two libms."""
     board = BOARDS[name]
     iterations, found = on_board(case, board, tmp_path)
@@ -150,7 +150,7 @@ def test_a_board_gives_the_numbers_of_the_host(case, name, tmp_path):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_double_precision_is_that_of_the_compiled_stepper_and_single_is_near_it(case, tmp_path):
+def test_double_precision_equals_the_compiled_stepper_and_single_is_close(case, tmp_path):
     name, method = CASES[case]
     trajectory = stepper_for(name, method).integrate(*start(case), h=H, steps=STEPS)
     expected = np.hstack([trajectory.q, trajectory.p])[1:]
@@ -212,7 +212,7 @@ def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
 
 
 @pytest.mark.parametrize("number", ["1e-45", "1e40"])
-def test_models_with_numbers_beyond_single_precision_are_refused(number):
+def test_models_with_numbers_beyond_single_precision_are_rejected(number):
     """As constants of the Lagrangian and as values of parameters."""
     text = "q_dot**2/2 - {}*q**2/2"
     for system in (
@@ -265,7 +265,7 @@ def test_the_command_line_writes_a_folder_without_python(tmp_path):
     assert 0.0 < np.abs(outputs["single"] - outputs["double"]).max() < 1e-2
 
 
-def test_lanes_are_refused_by_name():
+def test_lanes_are_rejected_by_name():
     system = problem("kepler").system
     with pytest.raises(MethodError, match="unavailable with embedded"):
         generate_source(system, SVI(2), solver="fixed-point", embedded="double")

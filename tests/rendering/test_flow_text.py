@@ -35,13 +35,13 @@ def compile_with(compiler, flags, source, folder):
 @pytest.mark.covering
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 @pytest.mark.parametrize("name", CASES)
-def test_compiles_without_a_warning(name, compiler, tmp_path):
+def test_flows_compile_without_warnings(name, compiler, tmp_path):
     source = with_casadi_flow(compile_stepper(*CASES[name]).derivatives, 10, 5).amalgamated()
     check_style(source.code)
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
-def test_flows_of_rows_compile_without_a_warning(tmp_path):
+def test_flows_of_batches_compile_without_warnings(tmp_path):
     stepper = compile_stepper(*CASES["kepler"])
     for source in (
         with_flow_of_rows(stepper.derivatives),
@@ -52,13 +52,13 @@ def test_flows_of_rows_compile_without_a_warning(tmp_path):
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_second_derivatives_compile_without_a_warning(compiler, tmp_path):
+def test_second_derivatives_compile_without_warnings(compiler, tmp_path):
     source = with_casadi_flow(compile_stepper(*CASES["kepler"]).second_derivatives, 10, 5, second=True).amalgamated()
     check_style(source.code)
     compile_with(compiler, ["-Wno-missing-prototypes"], source, tmp_path)
 
 
-def test_compiles_with_the_interface_of_xla(tmp_path):
+def test_flows_compile_with_the_interface_of_xla(tmp_path):
     jax = pytest.importorskip("jax", reason="needs the extra 'jax'")
     stepper, flags = compile_stepper(*CASES["kepler"]), ["-isystem", jax.ffi.include_dir()]
     source = with_xla_flow(stepper.derivatives, "0").amalgamated()

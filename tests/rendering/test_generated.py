@@ -40,7 +40,7 @@ def test_no_file_is_missing_or_orphaned():
     assert sorted(stored()) == sorted(fresh()), REMEDY
 
 
-def test_no_file_is_stale():
+def test_no_file_is_outdated():
     old, new = stored(), fresh()
     changes = [
         line
@@ -54,7 +54,7 @@ def test_no_file_is_stale():
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
-def test_every_file_compiles_with_every_warning_an_error(compiler, tmp_path):
+def test_every_file_compiles_with_all_warnings_as_errors(compiler, tmp_path):
     needs(compiler)
     files = sorted(FOLDER.glob("*.c"))
     assert files
@@ -70,7 +70,7 @@ def test_text_contains_no_date_path_or_version():
         assert re.findall(r"\b(?:19|20)\d\d-\d\d|/home/|/usr/|/tmp/|C:\\", text) == [], name
 
 
-def test_the_readme_names_every_integrator():
+def test_readme_lists_every_integrator():
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
     names = {Path(name).stem for name in stored() if "/" not in name}
     assert names == set(re.findall(r"^\| `(\w+)`", readme, re.MULTILINE))

@@ -72,7 +72,7 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["bodies", "all forms", "lattices"])
-def test_newtons_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
+def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
     """The same."""
     check_strict(rendered(name, "svi:4", newton=True), tmp_path)
 

@@ -49,7 +49,7 @@ def test_generated_files_compile_for_other_machines_without_a_warning(target, tm
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_a_folder_becomes_a_program_of_another_machine(target, tmp_path):
+def test_folder_compiles_to_a_program_for_another_machine(target, tmp_path):
     folder = folder_for("kepler", SVI(4), tmp_path)
     program = tmp_path / "program"
     compiled(target, *map(str, sorted(folder.glob("*.c"))), "-lm", "-o", str(program))

@@ -17,21 +17,21 @@ SUPPORT = sorted((template_folder() / "support").glob("*.h"))
 
 
 @pytest.mark.parametrize("path", SUPPORT, ids=lambda path: path.name)
-def test_support_headers(path):
+def test_support_headers_have_the_project_style(path):
     check_style(path.read_text())
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.[ch]")), ids=lambda path: path.name)
-def test_generated_files_are_in_style(path):
+def test_generated_files_have_the_project_style(path):
     check_style(path.read_text())
 
 
 @pytest.mark.parametrize(("name", "most"), [("two_point_pendulum.c", 250), ("kepler_svi_4.c", 400)])
-def test_a_method_is_read_on_a_few_pages(name, most):
+def test_generated_method_fits_a_few_pages(name, most):
     assert len((FOLDER / name).read_text().splitlines()) < most
 
 
-def test_titles_are_broken_where_they_are_long():
+def test_long_titles_are_wrapped():
     words = "a system whose name nobody would want to say twice, "
     system = LagrangianSystem.from_text(name=3 * words, coordinates=["q"], lagrangian="q_dot**2/2 - q**4/4")
     source = generate_source(system, SVI(3), prefix="long_name")[0]

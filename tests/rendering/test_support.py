@@ -73,7 +73,7 @@ int main(void)
 """
 
 
-def test_a_guess_is_continued_as_far_as_there_are_tables_and_no_further(tmp_path):
+def test_predictor_is_limited_to_the_available_tables(tmp_path):
     """From the last step for every change of length that has a table; from two for every pair; from none beyond."""
     assert REACH == 2
     lines = [list(map(int, line.split())) for line in said(LADDER, tmp_path, f"-I{SUPPORT}").splitlines()]

@@ -93,7 +93,7 @@ def keys(change: dict, **options) -> tuple[str, ...]:
     return found.key
 
 
-def test_all_that_a_text_depends_on_has_a_part_in_its_name():
+def test_cache_key_contains_everything_the_source_depends_on():
     changes = [
         {"name": "another"},
         {"coordinates": ["r", "q"]},
@@ -126,7 +126,7 @@ def test_all_that_a_text_depends_on_has_a_part_in_its_name():
     assert keys({}) == found[0]
 
 
-def test_every_file_of_the_generator_has_a_part_in_the_name(tmp_path, monkeypatch):
+def test_cache_key_contains_every_generator_file(tmp_path, monkeypatch):
     package, templates = tmp_path / "package", tmp_path / "templates"
     files = [
         package / "compiler.py",
@@ -237,7 +237,7 @@ def described() -> list:
 
 
 @pytest.mark.parametrize("number", range(9))
-def test_every_field_of_what_describes_a_text_changes_its_key(number):
+def test_every_field_of_a_source_description_changes_its_key(number):
     given = described()[number]
     key, found = key_of(given), list(mutations(given))
     assert key == key_of(described()[number])
@@ -260,7 +260,7 @@ def test_keys_distinguish_values_that_are_equal_or_print_equally():
     assert keys({}, monitor="None") != keys({})
 
 
-def test_compiler_flags_and_commands_have_a_part_in_the_name_of_a_library(monkeypatch):
+def test_library_name_depends_on_compiler_flags_and_commands(monkeypatch):
     source = sc.compile_stepper(spring(), sc.SVI(1)).source
     found = [building.fingerprint(source, flags=flags) for flags in (("-O1", "-g"), ("-O1 -g",), ("-g", "-O1"))]
     for field in fields(source):

@@ -64,7 +64,7 @@ def test_unrolled_and_tabulated_methods_agree_to_round_off_with_fma(case, monkey
     assert np.abs(ours.p - theirs.p).max() < 1e-12
 
 
-def test_the_papers_example_is_solved():
+def test_example_of_the_paper_is_solved():
     """Equation (37) and (34e), with the numbers that the paper prints, at the states of the compiled step."""
     h, q0, p0 = 0.1, 0.5, 0.2
     stepper = compile_stepper(planar_pendulum(), TWO_POINTS, solver="newton")

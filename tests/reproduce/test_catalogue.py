@@ -26,7 +26,7 @@ def test_every_figure_table_theorem_and_claim_is_there() -> None:
         assert re.fullmatch(r"[a-z]+(-[0-9.]+)?", name)
 
 
-def test_the_claims_ask_for_experiments_that_exist() -> None:
+def test_claims_refer_to_existing_experiments() -> None:
     assert set(EVIDENCE) <= set(EXPERIMENTS)
     assert set(EXPERIMENTS["claims"].needs) == set(EVIDENCE)
 

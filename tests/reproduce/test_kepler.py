@@ -34,7 +34,7 @@ BY_NAME = {experiment.name: experiment for experiment in EXPERIMENTS}
 # The exact flow and what is measured on it.
 
 
-def test_the_exact_flow_is_what_a_fine_run_gives():
+def test_exact_flow_agrees_with_a_fine_run():
     run = stepper_of(SYSTEM, SVI(8)).integrate(*STATE, h=0.05, steps=400)
     q, p = exact_flow(*STATE, run.t)
     assert np.abs([run.q - q, run.p - p]).max() < 1e-12
@@ -101,7 +101,7 @@ def test_convergence_orders_of_the_local_error(scheme, degree, e, expected):
 
 
 @pytest.mark.parametrize(("scheme", "constant", "base"), [("SVI", 1e10, 0.03), ("SC", 1e7, 0.1)])
-def test_errors_on_the_circle_lie_along_the_lines_of_figure_16(scheme, constant, base):
+def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, base):
     for points in (10, 14):
         errors = one_step(scheme, points - 1, 0.0, 5.0)
         assert 1 / 10 < errors.q1 / (constant * base**points) < 1
@@ -183,13 +183,13 @@ def test_defects_and_momenta_of_a_step(row, expected):
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
-def test_the_missing_term_lowers_the_order(degree):
+def test_missing_term_lowers_the_order(degree):
     printed, full = (correction.measured(degree + 1, degree, variational=form) for form in (False, True))
     assert printed.order == pytest.approx(degree - 1, abs=0.2)
     assert full.order == pytest.approx(2 * degree, abs=0.2)
 
 
-def test_the_compiler_derives_what_is_derived_by_hand():
+def test_derived_equations_agree_with_hand_derivation():
     assert largest_difference() < 1e-12
     assert multipliers_agree()
     assert two_points_agree()
@@ -203,7 +203,7 @@ def test_the_missing_term_for_small_steps():
 # As experiments.
 
 
-def test_names_are_those_of_the_figures():
+def test_names_of_results_are_those_of_the_figures():
     assert list(BY_NAME) == [*(f"figure-{n}" for n in (*range(13, 21), *range(23, 31))), "correction"]
 
 

@@ -211,7 +211,7 @@ def test_drift_is_distinguished_from_oscillation():
     ("conditions", "verdict"),
     [((True, True), Verdict.HOLDS), ((True, False), Verdict.PARTLY), ((False, False), Verdict.FAILS)],
 )
-def test_verdicts_follow_conditions(conditions, verdict):
+def test_verdicts_follow_from_conditions(conditions, verdict):
     assert judged(*conditions) is verdict
 
 

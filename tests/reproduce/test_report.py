@@ -71,7 +71,7 @@ class TestRunner:
         assert failures["last"].message == "its dependency 'after-broken' failed"
         assert failures["misnamed"].message == "its result has another name: 'another'"
 
-    def test_processes_give_the_same_and_survive_a_crash(self):
+    def test_parallel_processes_give_equal_results_and_survive_a_crash(self):
         seen: list[tuple[str, ...]] = []
         names = ["crash", "table-8", "unportable", "table-9", "broken"]
         outcomes = list(run_experiments(names, 2, module=TOYS, watch=lambda running: seen.append(tuple(running))))
@@ -89,7 +89,7 @@ class TestRunner:
         order = [outcome.name for outcome in outcomes]
         assert order.index("figure-4") < order.index("table-8")
 
-    def test_closing_it_ends_the_processes(self):
+    def test_closing_the_runner_ends_the_processes(self):
         others = multiprocessing.active_children()  # what another test left
         outcomes = run_experiments(["table-9", "slow"], 2, module=TOYS)
         assert next(outcomes).name == "table-9"
@@ -118,7 +118,7 @@ class TestSvg:
         assert len(identifiers) == len(referred)
         assert all(name.startswith("one-") for name in identifiers)
 
-    def test_colours_are_readable_on_both_papers(self, results):
+    def test_colours_have_contrast_on_light_and_dark_backgrounds(self, results):
         text = inline_svg(draw(results["figure-4"].picture, "svg"), prefix="one", label="")
         light, dark = (color_variables([text], dark=dark) for dark in (False, True))
         assert light["--line-1f5fa8"] == "#1f5fa8"
@@ -129,7 +129,7 @@ class TestSvg:
         grid = contrast(light["--line-b0b0b0"], "#ffffff"), contrast(dark["--line-b0b0b0"], DARK_PAPER)
         assert grid[0] == pytest.approx(grid[1], rel=0.05)
 
-    def test_a_pale_area_stays_pale(self):
+    def test_light_area_remains_light_in_dark_mode(self):
         text = an_svg(lambda axes: axes.axhspan(0.0, 1.0, color="#ffffcc"))
         dark = color_variables([text], dark=True)
         assert contrast(dark["--line-ffffcc"], DARK_PAPER) == pytest.approx(contrast("#ffffcc", "#ffffff"), abs=0.05)
@@ -223,7 +223,7 @@ class TestPage:
         assert "series" not in page
         assert '<td class="number">0.50</td>' in page
 
-    def test_verdicts_are_summed_up(self, page, results):
+    def test_verdicts_are_summarised(self, page, results):
         assert [text for _, text in tally([result.verdict for result in results.values()])] == [
             "2 hold in part",
             "2 shown",
@@ -277,7 +277,7 @@ class TestCommand:
         assert invoke("figure-4").exit_code == 0
         assert Path("reproduced/figure-4.txt").is_file()
 
-    def test_an_experiment_that_fails_is_named_at_the_end(self):
+    def test_failed_experiment_is_named_at_the_end(self):
         done = invoke("broken", "table-9")
         assert done.exit_code == 1
         assert "1 experiment failed to run\n  broken: ValueError: no such luck" in done.stderr
@@ -312,12 +312,12 @@ class TestCommand:
         assert done.exit_code == 2
         assert "pip install 'scvi-codegen[plot]'" in done.stderr
 
-    def test_the_list(self):
+    def test_command_lists_experiments(self):
         assert "figure-4      Energy errors\n" in invoke("--list").stdout
         assert invoke("--list", "table-8").stdout == "figure-4  Energy errors\ntable-8   Iterations\n"
         assert experiments_table(experiments_titles(module=TOYS)) == invoke("--list").stdout.rstrip("\n")
 
-    def test_numbers_for_programs_and_silence(self):
+    def test_json_and_quiet_output(self):
         listed = json.loads(invoke("--list", "--json").stdout)
         assert listed["experiments"]["figure-4"] == "Energy errors"
         found = json.loads(invoke("broken", "table-8", "--json").stdout)
@@ -326,7 +326,7 @@ class TestCommand:
         assert "reproduced/table-8.txt" in found["written"]
         assert invoke("table-8", "--quiet").stdout == invoke("--list", "--quiet").stdout == ""
 
-    def test_after_ctrl_c_it_ends_with_130(self, monkeypatch):
+    def test_interrupt_exits_with_130(self, monkeypatch):
         interrupted = Reproduction(interrupted=True)
         monkeypatch.setattr(
             "scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words, say: interrupted

@@ -66,7 +66,7 @@ class TestInABrowser:
         assert len(fractions) > 50
         assert all(height > 12.0 and above <= below + 0.5 for height, above, below in fractions)
 
-    def test_all_text_is_readable(self, view):
+    def test_all_text_has_sufficient_contrast(self, view):
         assert view.evaluate(UNREADABLE) == []
 
     def test_print_style_is_light_and_does_not_split_figures(self, view):
@@ -79,7 +79,7 @@ class TestInABrowser:
         view.emulate_media(media="null")
 
 
-def test_dark_is_dark(browser, page):
+def test_dark_mode_has_a_dark_background(browser, page):
     view = browser.new_page(color_scheme="dark")
     view.set_content(page)
     assert view.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 28)"

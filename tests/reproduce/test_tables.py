@@ -43,7 +43,7 @@ def test_tables_1_to_3_are_as_printed_but_for_one_entry():
 
 
 @pytest.mark.parametrize("s", [2, 3, 4])
-def test_order_and_symplecticity_are_exact_and_can_fail(s):
+def test_order_and_symplecticity_checks_are_exact_and_can_fail(s):
     A, b, c = exact_tableau(gauss(s))
     assert set(tableaux.order_residuals((A, b, c))) == {0}
     assert set(tableaux.symplectic_residuals((A, b, c))) == {0}
@@ -52,7 +52,7 @@ def test_order_and_symplecticity_are_exact_and_can_fail(s):
     assert any(residual != 0 for residual in tableaux.symplectic_residuals((spoiled, b, c)))
 
 
-def test_the_corrected_table_3_is_what_is_typeset():
+def test_corrected_table_3_is_typeset():
     formulas = [block for block in tableaux.table_3({}).body if hasattr(block, "right")]
     A = next(block.right for block in formulas if str(block.left) == "A")
     assert A[2, 3] == sympy.Symbol("w_1") + sympy.Symbol("w__'_3") - sympy.Symbol("w_4")
@@ -132,7 +132,7 @@ def test_picard_iteration_fails_where_the_tables_have_dashes(number, cells, by_p
 
 
 @pytest.mark.parametrize("degree", [1, 4, 9, 19])
-def test_picard_iteration_ends_in_the_compiled_step(degree):
+def test_picard_iteration_converges_to_the_compiled_step(degree):
     """The exact force of Kepler's problem; independent of the project's solvers but for the tables."""
     (q, v), rule = map(np.array, motion.perihelion(0.2)), f"gauss-legendre:{degree + 1}"
     pairs = (
@@ -155,7 +155,7 @@ def test_diverging_picard_iteration_is_reported():
         )
 
 
-def test_outlines_find_every_step_and_miss_what_is_not_there():
+def test_table_of_contents_lists_exactly_the_steps():
     for result in (outlines.table_5({}), outlines.table_10({})):
         assert result.verdict is Verdict.HOLDS
         assert "newton(step, data" in result.body[1].text

@@ -73,14 +73,14 @@ def test_kronecker_forms_hold_only_for_their_own_method(form):
     assert max(abs(a - b) for a, b in zip(one, other, strict=True)) > 1e-6
 
 
-def test_lemmas_are_of_rows():
+def test_lemmas_refer_to_existing_rows():
     assert all(difference.is_zero_matrix for difference in kronecker.lemma_differences())
     A, B = sympy.Matrix(2, 2, sympy.symbols("a:4")), sympy.Matrix(2, 2, sympy.symbols("b:4"))
     by_columns = (A * B).T.reshape(4, 1) - sympy.kronecker_product(A, sympy.eye(2)) * B.T.reshape(4, 1)
     assert not by_columns.expand().is_zero_matrix
 
 
-def test_radau_ia_does_not_end_there():
+def test_radau_ia_does_not_end_at_its_collocation_polynomial():
     start = np.array([mp.mpf("0.7"), mp.mpf("0.4")])
     field, tableau = collocation_theorem.FIELDS["planar-pendulum"], radau_ia(2)
     left = collocation_step(field, start, mp.mpf("0.3"), tableau.c)
@@ -105,7 +105,7 @@ def test_order_is_min_of_twice_the_degree_and_of_the_quadrature_but_one_less_for
 
 
 @pytest.mark.parametrize(("degree", "points", "order"), [(4, 4, 2), (5, 6, 4), (6, 7, 6)])
-def test_galerkin_order_is_lower_still_where_the_quadrature_does_not_resolve_the_variations(degree, points, order):
+def test_galerkin_order_is_lower_for_insufficient_quadratures(degree, points, order):
     """Twice (order of the quadrature) - degree + 1."""
     assert orders(SVI(degree, f"clenshaw-curtis:{points}"))[2] == pytest.approx(order, abs=0.15)
 
@@ -150,7 +150,7 @@ def test_orders_and_rates_exclude_round_off():
     assert np.isnan(rate([1, 2], [1.0, 0.5])[1])
 
 
-def test_verdicts_are_those_of_the_numbers(results):
+def test_verdicts_follow_from_the_numbers(results):
     assert results["section-2.1"].verdict is Verdict.HOLDS
     assert results["theorem-2.1"].verdict is Verdict.HOLDS
 

@@ -61,7 +61,7 @@ def test_recording_equals_the_run_in_memory(kepler, save_every):
 
 
 @pytest.mark.parametrize("save_every", [1, 9])
-def test_interrupted_it_has_the_bytes_of_one_that_was_not(kepler, save_every):
+def test_interrupted_recording_is_bytewise_equal(kepler, save_every):
     whole = controlled(kepler, "whole.run", save_every=save_every)
     found, looks = controlled(kepler, "a.run", save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
     while not found.finished:
@@ -98,7 +98,7 @@ def test_run_may_be_extended_or_shortened_but_not_reversed(kepler, t_end):
     assert load_run("a.run").manifest == longer.manifest
 
 
-def test_the_other_kind_is_refused(kepler):
+def test_other_kind_of_steps_is_rejected(kepler):
     recorded(kepler, 10, folder="fixed.run")
     with pytest.raises(StateError, match="steps instead of t_end"):
         resume_run("fixed.run", t_end=3.0)
@@ -110,7 +110,7 @@ def test_the_other_kind_is_refused(kepler):
         controlled(kepler, "fixed.run")
 
 
-def test_a_model_file_has_a_tolerance():
+def test_model_file_contains_a_tolerance():
     model = parse_model(MODEL)
     assert (model.h, model.tolerance, model.covered) == (None, TOLERANCE, END)
     assert parse_model(dump_model(model)) == model
@@ -145,7 +145,7 @@ def test_the_command_line_runs_records_and_resumes_it(kepler):
     assert "give span, not steps" in refused.output
 
 
-def test_a_run_that_outgrows_the_memory_is_ended_with_advice(monkeypatch):
+def test_run_beyond_the_memory_ends_with_advice(monkeypatch):
     Path("k.toml").write_text(MODEL)
     monkeypatch.setattr(memory, "usable_memory", lambda: 8000.0)
     done = invoke("k.toml")

@@ -44,7 +44,7 @@ def test_dataset_contains_derived_quantities(ensemble):
     np.testing.assert_array_equal(dataset.velocity[n, j], velocity)
 
 
-def test_a_failed_trajectory_has_no_numbers_where_it_has_no_states(ensemble):
+def test_failed_trajectory_is_nan_after_its_failure(ensemble):
     assert not ensemble.ok[2]
     dataset = ensemble.to_xarray()
     lost = np.isnan(dataset.q[:, 2, 0].values)

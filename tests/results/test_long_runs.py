@@ -223,7 +223,7 @@ class TestCommandLine:
         assert result.exit_code == status, result.output
         return result.output
 
-    def test_a_run_into_a_folder_and_further_and_out(self):
+    def test_command_line_records_extends_and_exports_a_run(self):
         text = self.invoke("run kepler --method stoermer-verlet --step 0.01 --steps 1000 --save-every 10 -o a.run")
         assert "1000 steps (all) of 0.01 from t = 0 to t = 10; 101 states saved in 'a.run'" in text
         assert "relative energy error" in text

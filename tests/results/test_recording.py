@@ -45,19 +45,19 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 class TestRecording:
     @pytest.mark.parametrize("save_every", [1, 7, 5000])
-    def test_a_recorded_run_is_the_one_in_memory(self, kepler, save_every):
+    def test_recorded_run_equals_the_run_in_memory(self, kepler, save_every):
         found = recorded(kepler, 1001, save_every=save_every)
         assert_same(found, kepler.integrate(**STATE, h=H, steps=1001, save_every=save_every))
         assert (found.steps, found.finished, len(found)) == (1001, True, 1001 // save_every + 1)
         assert len(list(Path("a.run").iterdir())) == 1 + -(-len(found) // 64)
 
-    def test_files_are_full_but_the_last(self, kepler):
+    def test_all_files_but_the_last_are_full(self, kepler):
         found = recorded(kepler, 1001, rows=100)
         assert [len(piece) for piece in found.pieces()] == [100] * 10 + [2]
 
     @pytest.mark.parametrize("method", [SVI(4), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
     @pytest.mark.parametrize("save_every", [1, 40, 400])
-    def test_an_interrupted_run_has_the_bytes_of_one_that_was_not(self, compiled, method, save_every):
+    def test_interrupted_run_is_bytewise_equal(self, compiled, method, save_every):
         stepper = compiled("kepler", method)
         recorded(stepper, 600, save_every=save_every, folder="whole.run")
         found, looks = recorded(stepper, 600, save_every=save_every, stop=StopsAfter(0), checkpoint_steps=31), 1
@@ -96,7 +96,7 @@ class TestRecording:
         assert found.manifest.options == settings["options"]
         assert found[:3].parameters == [1.1]
 
-    def test_a_run_may_be_made_longer(self, kepler):
+    def test_run_may_be_extended(self, kepler):
         recorded(kepler, 500)
         assert not resume_run("a.run", steps=900, stop=StopsAfter(0)).finished
         assert_same(resume_run("a.run"), kepler.integrate(**STATE, h=H, steps=900))
@@ -132,7 +132,7 @@ class TestRecording:
         path.write_text(json.dumps(former))
         assert load_run("a.run").manifest == found.manifest
 
-    def test_a_certificate_is_a_file_or_an_object_too(self, kepler):
+    def test_certificate_is_accepted_as_file_or_object(self, kepler):
         Path("c.json").write_text('{"order": 8}')
         assert recorded(kepler, 1, certificate="c.json").manifest.certificate == {"order": 8}
         given = SimpleNamespace(to_json=lambda: '{"order": 4}')
@@ -207,7 +207,7 @@ class TestFolders:
         assert recorded(kepler, 10).finished
         assert sorted(os.listdir("a.run")) == ["manifest.json", "states-000000.npz"]  # noqa: PTH208  (hidden ones too)
 
-    def test_a_folder_without_a_run_is_named(self, kepler):
+    def test_folder_without_a_run_is_named(self, kepler):
         for act in (load_run, resume_run):
             with pytest.raises(RecordingError, match=r"'none\.run' contains no recorded run"):
                 act("none.run")
@@ -215,7 +215,7 @@ class TestFolders:
             recorded(kepler, 10, folder="no/such/a.run")
 
     @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "remove", "remove last"])
-    def test_damage_is_found(self, kepler, damage):
+    def test_damage_is_detected(self, kepler, damage):
         recorded(kepler, 300)
         path = Path("a.run/states-000001.npz")
         data = path.read_bytes()
@@ -314,11 +314,11 @@ class TestReading:
         np.testing.assert_array_equal(lazy.q[index, ::-1], whole.q[index, ::-1])
 
     @pytest.mark.parametrize("index", [301, -302, [0, 301], np.ones(5, dtype=bool), [0.5], "t"], ids=str)
-    def test_rows_that_are_not_there_are_named(self, pair, index):
+    def test_rows_out_of_range_are_named(self, pair, index):
         with pytest.raises(IndexError):
             pair[0].q[index]
 
-    def test_columns_pass_for_arrays(self, pair):
+    def test_columns_are_accepted_as_arrays(self, pair):
         lazy, whole = pair
         assert (lazy.q.shape, lazy.q.ndim, lazy.iterations.dtype, len(lazy.t)) == ((301, 2), 2, np.int32, 301)
         assert np.abs(lazy.p).max() == np.abs(whole.p).max()
@@ -354,7 +354,7 @@ class TestFiles:
         whole = kepler.integrate(**STATE, h=H, steps=300)
         return (recorded(kepler, 300, certificate={"order": 8}) if request.param == "recorded" else whole), whole
 
-    def test_npz(self, saved):
+    def test_npz_round_trip(self, saved):
         given, whole = saved
         given.save("a.npz")
         with np.load("a.npz") as file:
@@ -364,7 +364,7 @@ class TestFiles:
             assert str(file["title"]) == whole.stepper.title
             assert ("certificate" in file) == isinstance(given, RecordedRun)
 
-    def test_csv(self, saved):
+    def test_csv_round_trip(self, saved):
         given, whole = saved
         given.save("a.csv")
         columns, names = [whole.t, whole.q, whole.p, whole.iterations], "t,q1,q2,p_q1,p_q2,iterations"
@@ -374,7 +374,7 @@ class TestFiles:
         table = np.loadtxt("a.csv", delimiter=",", skiprows=1)
         np.testing.assert_array_equal(table, np.column_stack(columns))
 
-    def test_hdf5(self, saved):
+    def test_hdf5_round_trip(self, saved):
         h5py = pytest.importorskip("h5py")
         given, whole = saved
         given.save("a.h5")
@@ -385,7 +385,7 @@ class TestFiles:
             assert file["q"].dims[1][0][:].tolist() == [b"q1", b"q2"]
             assert ("certificate" in file.attrs) == isinstance(given, RecordedRun)
 
-    def test_zarr_as_xarray_reads_it(self, saved):
+    def test_zarr_is_read_by_xarray(self, saved):
         pytest.importorskip("zarr")
         xarray = pytest.importorskip("xarray")
         given, whole = saved
@@ -397,7 +397,7 @@ class TestFiles:
         assert dataset.attrs["method"] == whole.stepper.interface.method
 
     @pytest.mark.parametrize("suffix", ["h5", "hdf5", "nc"])
-    def test_hdf5_as_xarray_reads_it(self, saved, suffix):
+    def test_hdf5_is_read_by_xarray(self, saved, suffix):
         pytest.importorskip("h5netcdf")
         xarray = pytest.importorskip("xarray")
         given, whole = saved
@@ -409,7 +409,7 @@ class TestFiles:
             assert dataset.velocity.attrs == {"long_name": "velocity", "units": "au day-1"}
             assert (dataset.t.attrs["units"], dataset.p.attrs) == ("day", {"long_name": "momentum"})
 
-    def test_velocities_energies_and_momentum_maps_are_there(self, kepler):
+    def test_velocities_energies_and_momentum_maps_are_exported(self, kepler):
         pytest.importorskip("xarray")
         run = kepler.integrate(**STATE, h=H, steps=30)
         dataset = run.to_xarray()
@@ -433,7 +433,7 @@ class TestFiles:
         with pytest.raises(StateError, match="units"):
             kepler.integrate(**STATE, h=H, steps=3).save(path, units=units)
 
-    def test_tables(self, kepler):
+    def test_tables_are_exported(self, kepler):
         pytest.importorskip("xarray")
         pytest.importorskip("pandas")
         run = kepler.integrate(**STATE, h=H, steps=30)
@@ -444,7 +444,7 @@ class TestFiles:
         assert dataset.attrs == frame.attrs
         assert dataset.attrs["h"] == H
 
-    def test_a_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
+    def test_missing_library_is_named_with_its_extra(self, kepler, monkeypatch):
         run = kepler.integrate(**STATE, h=H, steps=3)
         monkeypatch.setitem(export.LIBRARIES, ".h5", "no_such_library")
         monkeypatch.setitem(sys.modules, "xarray", None)

@@ -37,7 +37,7 @@ def standing(run):
 
 
 @pytest.mark.parametrize("portion", [1, 7, 1000])
-def test_steps_without_states_are_those_with_them(pushed, monkeypatch, portion):
+def test_runs_with_and_without_saved_states_are_equal(pushed, monkeypatch, portion):
     """In however many calls of C they are done."""
     kept = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
     monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
@@ -72,7 +72,7 @@ def test_run_with_time_transformation_stops_at_its_target_time():
     assert standing(run) == (5.0, kept.q[-1].tolist(), kept.p[-1].tolist())
 
 
-def test_an_input_that_is_no_number_changes_none(pushed):
+def test_nan_input_leaves_all_inputs_unchanged(pushed):
     run = pushed.start([0.3], [0.1], h=0.05)
     run.set_inputs(u=0.4)
     before = run.parameters

@@ -55,7 +55,7 @@ WAYS = [(form, solver) for form in FORMS for solver in ("auto", "newton")]
 
 
 @pytest.mark.parametrize(("form", "solver"), WAYS)
-def test_time_is_that_of_kepler_s_equation(form: str, solver: str) -> None:
+def test_time_satisfies_keplers_equation(form: str, solver: str) -> None:
     run = stepper(form, solver).integrate(*START, h=0.1, steps=300)
     assert run.t[-1] > 10.0
     assert np.abs(kepler_time(run.q) - run.t).max() < 5e-13
@@ -120,7 +120,7 @@ def test_run_of_many_orbits_conserves_time_and_energy() -> None:
     assert abs(float(np.sum(increments, dtype=np.longdouble)) - parts[0].t[-1]) <= 2e-16 * parts[0].t[-1]
 
 
-def test_the_energy_is_that_of_the_initial_state() -> None:
+def test_energy_is_that_of_the_initial_state() -> None:
     own = sc.compile_stepper(KEPLER, sc.SVI(4))
     made = stepper()
     assert made.energy(*START, parameters={"mu": 1.25}) == pytest.approx(own.energy(*START, parameters={"mu": 1.25}))
@@ -131,7 +131,7 @@ def test_the_energy_is_that_of_the_initial_state() -> None:
     assert made.step(*START, 0.1)[0] == pytest.approx(made.step(*START, 0.1, parameters={"E": -0.5})[0], rel=1e-14)
 
 
-def test_velocities_are_of_time() -> None:
+def test_velocities_are_derivatives_by_physical_time() -> None:
     made, q, v = stepper(), [0.5, 0.25], [-0.5, 1.0]
     assert np.array_equal(made.momentum(q, v), v) or np.abs(made.momentum(q, v) - v).max() < 1e-15
     assert np.abs(made.velocity(q, v) - v).max() < 1e-15
@@ -142,7 +142,7 @@ def test_velocities_are_of_time() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_runs_end_at_a_time(form: str) -> None:
+def test_runs_end_at_a_physical_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=9.0)
     assert run.t[-1] == 9.0
     assert run.tau is not None
@@ -155,7 +155,7 @@ def test_runs_end_at_a_time(form: str) -> None:
     assert len(stepper(form).integrate(*START, h=0.1, t_end=0.0)) == 2
 
 
-def test_states_between_are_at_times() -> None:
+def test_dense_output_is_in_physical_time() -> None:
     times = np.linspace(0.0, 9.0, 31)
     asked = stepper().integrate(*START, h=0.1, t_end=9.0, t_eval=times)
     assert np.array_equal(asked.t, times)
@@ -176,7 +176,7 @@ def test_states_between_are_at_times() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_events_are_at_times(form: str) -> None:
+def test_events_are_located_in_physical_time(form: str) -> None:
     run = stepper(form).integrate(*START, h=0.1, t_end=10.0, events=["y", "t - 4", "x_dot"])
     apsides, clock, turns = run.events
     assert np.abs(apsides.t / np.pi - [1.0, 2.0, 3.0]).max() < 5e-13
@@ -189,7 +189,7 @@ def test_events_are_at_times(form: str) -> None:
     assert 0.0 < ended.tau[-1] - ended.tau[-2] < 0.1
 
 
-def test_event_functions_are_given_velocities_of_time() -> None:
+def test_event_functions_receive_physical_velocities() -> None:
     """On the orbit the radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
     functions = "(x*x_dot + y*y_dot)/sqrt(x**2 + y**2) - 2"
     found = [stepper(form).integrate(*START, h=0.1, t_end=3.0, events=functions).events[0].t for form in FORMS]
@@ -199,7 +199,7 @@ def test_event_functions_are_given_velocities_of_time() -> None:
     assert np.abs(own.events[0].t - found[0]).max() < 1e-11
 
 
-def test_ensembles_have_an_energy_and_times_each() -> None:
+def test_ensembles_have_individual_energies_and_times() -> None:
     made = stepper()
     q, p = np.tile(START[0], (3, 1)), np.array([START[1], [0.0, 3.0], [0.0, 4.0]])
     many = made.integrate_ensemble(q, p, h=0.1, steps=50)
@@ -263,7 +263,7 @@ def test_unsupported_transformations_are_rejected() -> None:
             sc.compile_stepper(FORMS["L"], method)
 
 
-def test_a_rate_that_is_not_positive_is_refused() -> None:
+def test_nonpositive_time_transformation_is_rejected() -> None:
     oscillator = sc.LagrangianSystem.from_text(name="oscillator", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
     made = sc.compile_stepper(sc.reparametrise(oscillator, "q"), sc.SVI(4))
     with pytest.raises(StateError, match="must be positive at every state"):
@@ -279,7 +279,7 @@ def test_unsupported_functions_in_transformed_time_are_rejected():
 
 
 @pytest.mark.parametrize("h", [0.05, 0.4, -0.4])
-def test_the_part_of_a_step_is_that_which_ends_at_the_time(h: float) -> None:
+def test_partial_step_ends_at_the_requested_time(h: float) -> None:
     """Along an orbit on which the rate changes a hundredfold: the step of that part, taken alone, ends there."""
     made = stepper("L", "newton")
     run = made.integrate(*START, h=h, steps=40)

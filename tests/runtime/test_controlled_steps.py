@@ -80,7 +80,7 @@ def test_ellipse_is_followed_to_round_off_without_step_arguments(kepler, e, erro
     assert run.iterations.sum() < 6 * run.steps
 
 
-def test_steps_follow_the_motion(kepler):
+def test_step_sizes_follow_the_motion(kepler):
     run = kepler.integrate(*orbit(0.9), t_end=SPAN)
     distance = np.hypot(*run.q[:-2].T)
     near, far = np.diff(run.t)[:-1][distance < 0.2], np.diff(run.t)[:-1][distance > 1.5]
@@ -105,7 +105,7 @@ def test_end_of_a_step_has_the_requested_accuracy(tolerance, degree):
 
 
 @pytest.mark.parametrize(("degree", "e", "tolerance"), [(8, 0.9, 1e-12), (8, 0.999, 1e-12), (12, 0.9, None)])
-def test_steps_are_shorter_in_time_where_errors_grow(degree, e, tolerance):
+def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
     """On the way to the pericentre from step to step a thousandfold; a third of the trials was in vain."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(degree))
     run = stepper.integrate(*orbit(e, math.pi), t_end=SPAN, **({"tolerance": tolerance} if tolerance else {}))
@@ -135,7 +135,7 @@ def test_every_iterative_method_has_adaptive_steps(method, pendulums):
     assert np.abs(energy / energy[0] - 1.0).max() < 1e-12
 
 
-def test_a_hamiltonian_has_them():
+def test_hamiltonian_has_adaptive_steps():
     system = sc.HamiltonianSystem.from_text(
         name="relativistic", coordinates=["x"], momenta=["p"], hamiltonian="sqrt(1 + p**2) + x**2/2"
     )
@@ -143,7 +143,7 @@ def test_a_hamiltonian_has_them():
     assert np.ptp(run.energy()) < 1e-13
 
 
-def test_the_swinging_atwood_machine(atwood):
+def test_swinging_atwood_machine_with_adaptive_steps(atwood):
     q, v = [1.1, 0.8], [0.0, 0.2]
     p = atwood.momentum(q, v)
     run = atwood.integrate(q, p, t_end=100.0)
@@ -162,7 +162,7 @@ def test_converged_spurious_step_is_reported(atwood, h, wrong):
         assert 0.0 <= run.worst_step_time < 100.0
 
 
-def test_the_error_of_a_step_is_estimated_within_bounds(kepler):
+def test_error_of_a_step_is_estimated_within_bounds(kepler):
     q, p = orbit(0.5)
     for h in (0.05, 0.1, 0.2, 0.4):
         run = kepler.integrate(q, p, h=h, steps=1)
@@ -170,7 +170,7 @@ def test_the_error_of_a_step_is_estimated_within_bounds(kepler):
         assert error < 3.0 * run.step_error + 5e-16
 
 
-def test_newtons_iteration_estimates_it_too():
+def test_newton_iteration_estimates_the_error():
     system = sc.problem("kepler").system
     newton, iterations = (sc.compile_stepper(system, sc.SVI(6), solver=solver) for solver in ("newton", "auto"))
     q, p = orbit(0.6)
@@ -180,7 +180,7 @@ def test_newtons_iteration_estimates_it_too():
     assert math.isnan(sc.compile_stepper(system, sc.StoermerVerlet()).integrate(q, p, h=0.1, steps=3).step_error)
 
 
-def test_states_in_between_and_at_given_times(kepler):
+def test_dense_output_and_states_at_requested_times(kepler):
     q, p = orbit(0.6)
     run = kepler.integrate(q, p, t_end=20.0)
     times = np.linspace(0.0, 20.0, 13)
@@ -197,7 +197,7 @@ def test_states_in_between_and_at_given_times(kepler):
         assert np.abs(position - exact_position(q, p, t)).max() < 1e-12
 
 
-def test_events_are_found_and_end_a_run(kepler):
+def test_events_are_found_and_terminate_a_run(kepler):
     q, p = orbit(0.6, 0.0)
     run = kepler.integrate(q, p, t_end=20.0, events="q2")
     (crossings,) = run.events
@@ -222,7 +222,7 @@ def test_restored_adaptive_run_continues_bitwise(kepler):
         kepler.from_checkpoint(run.checkpoint())
 
 
-def test_a_collision_is_refused_where_it_is(kepler):
+def test_collision_is_rejected_where_it_occurs(kepler):
     with pytest.raises(StepFailedError, match="collision") as failure:
         kepler.integrate([1.0, 0.0], [0.0, 0.0], t_end=2.0)
     assert failure.value.t == pytest.approx(math.pi / math.sqrt(8.0), rel=1e-6)  # the time of free fall
@@ -258,7 +258,7 @@ def test_equilibria_and_free_particles_need_few_steps():
         ({"t_end": 1.0, "t_eval": [2.0]}, "outside"),
     ],
 )
-def test_a_wrong_argument_is_named(kepler, arguments, words):
+def test_invalid_argument_is_named(kepler, arguments, words):
     with pytest.raises(StateError, match=words):
         kepler.integrate([1.0, 0.0], [0.0, 1.0], **arguments)
 
@@ -322,7 +322,7 @@ def test_three_lobatto_points_estimate_errors_by_the_momentum_derivative(solver)
 
 
 @pytest.mark.parametrize("method", [sc.SVI(8), sc.SVI(6, "gauss-legendre:9")])
-def test_newtons_iteration_has_them(method):
+def test_newton_iteration_has_adaptive_steps(method):
     stepper = sc.compile_stepper(sc.problem("kepler").system, method, solver="newton")
     assert "sweep(" not in stepper.source.code
     for e in (0.2, 0.9):
@@ -367,7 +367,7 @@ def test_solve_ivp_accepts_the_tolerance_of_steps(kepler):
 
 
 @pytest.mark.parametrize("method", ["svi:5", "svi:8", "gauss:4"])
-def test_a_first_step_is_found_where_a_velocity_is_zero(method):
+def test_initial_step_size_is_found_for_zero_velocity(method):
     """A cart at rest, pushed: rounding hides what short steps make of its velocity, and they fail."""
     crane = sc.LagrangianSystem.from_text(
         name="crane",
@@ -503,7 +503,7 @@ class TestStepsOfHLeadToAnEnd:
         assert np.array_equal(self.positions(run), self.positions(same))
 
     @pytest.mark.parametrize("save_every", [1, 4])
-    def test_the_last_is_shorter_where_h_does_not_divide(self, oscillators, name, sign, save_every):
+    def test_last_step_is_shortened_if_h_does_not_divide_the_span(self, oscillators, name, sign, save_every):
         run = oscillators[name].integrate([1.0], [0.0], h=sign * 0.3, t_end=sign * 2.0, save_every=save_every, t=0.0)
         times = sign * np.array([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0] if save_every == 1 else [0.0, 1.2, 2.0])
         assert np.abs(run.t[[*range(len(times) - 1), -1]] - times).max() < 1e-15

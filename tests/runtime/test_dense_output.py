@@ -57,7 +57,7 @@ def kepler() -> Stepper:
 
 
 @each_method
-def test_states_between_steps_have_the_order_of_the_method(method):
+def test_dense_output_has_the_order_of_the_method(method):
     stepper = compile_stepper(problem("kepler").system, method, flags=FLAGS)
     counts = (40, 80) if stepper.interface.method != "euler" else (400, 800)
     between, kept = [], []
@@ -72,7 +72,7 @@ def test_states_between_steps_have_the_order_of_the_method(method):
     assert between[1] < 1.3 * kept[1]
 
 
-def test_cubics_through_positions_and_velocities_are_worse(kepler):
+def test_hermite_cubics_are_less_accurate(kepler):
     run = kepler.integrate(**START, h=2 * math.pi / 40, steps=40)
     velocities = [kepler.velocity(q, p) for q, p in zip(run.q, run.p, strict=True)]
     t = np.linspace(0, run.t[-1], 501)
@@ -115,7 +115,7 @@ def test_options_of_the_run_apply_to_dense_output(kepler):
     assert np.abs(rough.at(t)[0] - fine.at(t)[0]).max() > 1e-10
 
 
-def test_times_outside_and_lost_grids_are_refused(kepler):
+def test_times_outside_the_span_are_rejected(kepler):
     run = kepler.integrate(**START, h=0.1, steps=10)
     with pytest.raises(StateError, match=r"t = 1\.5 is outside the trajectory from t = 0 to 1"):
         run.at([0.5, 1.5])
@@ -130,7 +130,7 @@ def test_times_outside_and_lost_grids_are_refused(kepler):
 
 
 @pytest.mark.parametrize("h", [0.1, -0.1])
-def test_states_at_given_times_are_those_of_the_dense_output(kepler, h):
+def test_states_at_requested_times_equal_the_dense_output(kepler, h):
     run = kepler.integrate(**START, h=h, steps=10_000)
     times = h * np.sort(np.random.default_rng(5).uniform(0, 10_000, 300))
     times[[0, -1]] = 0.0, run.t[-1]
@@ -151,7 +151,7 @@ def test_states_at_given_times_are_those_of_the_dense_output(kepler, h):
         ({"t_eval": [0.3], "save_every": 2}, "not both"),
     ],
 )
-def test_given_times_are_checked(kepler, arguments, words):
+def test_requested_times_are_checked(kepler, arguments, words):
     for way in ({"h": 0.1, "steps": 10}, {"t_end": 1.0}):
         with pytest.raises(StateError, match=words):
             kepler.integrate(**START, **way, **arguments)
@@ -168,7 +168,7 @@ def test_states_before_a_failure_are_available():
 # The call that is like solve_ivp.
 
 
-def test_a_motion_agrees_with_solve_ivp():
+def test_solve_ivp_agrees_with_scipy():
     """The same arguments, attributes and shapes; the pendulum from rest at 2, four turning points."""
     asked = np.linspace(0, 10, 33)
     system = problem("planar-pendulum").system
@@ -213,7 +213,7 @@ def test_a_motion_agrees_with_solve_ivp():
     assert ours.y_events[0].shape == theirs.y_events[0].shape
 
 
-def test_a_motion_ends_at_a_terminal_event(kepler):
+def test_solve_ivp_ends_at_a_terminal_event(kepler):
     half = solve_ivp(kepler, (0, 100), [*START["q"], *START["p"]], h=0.1, events=Event("q2", -1, terminal=True))
     assert (half.status, half.success) == (1, True)
     assert "'q2'" in half.message
@@ -233,7 +233,7 @@ def test_a_motion_ends_at_a_terminal_event(kepler):
     assert np.array_equal(chosen.sol(half.t[-1]), half.y[:, -1])
 
 
-def test_a_motion_runs_backward_and_its_last_step_ends_the_span(kepler):
+def test_solve_ivp_runs_backward_and_ends_exactly_at_the_span(kepler):
     back = solve_ivp(kepler, (1.0, -2.0), [*START["q"], *START["p"]], h=0.07, dense_output=True)
     assert back.t[0] == 1.0
     assert back.t[-1] == pytest.approx(-2.0, abs=1e-15)
@@ -266,7 +266,7 @@ def test_solve_ivp_uses_adaptive_steps_for_a_tolerance():
         ({"h": math.inf}, "inf"),
     ],
 )
-def test_arguments_of_a_motion_are_checked(kepler, arguments, words):
+def test_arguments_of_solve_ivp_are_checked(kepler, arguments, words):
     usual = {"t_span": (0, 1), "y0": [*START["q"], *START["p"]], "h": 0.1}
     with pytest.raises(StateError, match=words):
         solve_ivp(kepler, **(usual | arguments))

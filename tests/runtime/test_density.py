@@ -49,7 +49,7 @@ def by_hand(stepper, q, p, tau, steps, rate, control):
 
 @pytest.mark.parametrize("method", [SVI(3), SCVI(2), Gauss(2), StoermerVerlet()], ids=lambda method: method.name)
 @pytest.mark.parametrize("solver", ["auto", "newton"])
-def test_steps_are_those_of_the_controller(method, solver):
+def test_steps_are_those_of_the_density_controller(method, solver):
     run = kepler(method, RADIUS, solver=solver).integrate(*START, h=0.1, t_end=3.0)
     expected = by_hand(
         compile_stepper(KEPLER, method, solver=solver, flags=QUICK_FLAGS),
@@ -196,7 +196,7 @@ def test_dense_output_events_and_continuation_with_step_density():
         assert np.array_equal(each.record().q[-1], run.q[-1])
 
 
-def test_backward_and_recorded(tmp_path):
+def test_backward_and_recorded_runs(tmp_path):
     stepper = kepler(SVI(6))
     back = stepper.integrate(START[0], -START[1], h=0.1, t_end=5.0)
     other = stepper.integrate(*START, h=0.1, t=5.0, t_end=0.0)
@@ -248,7 +248,7 @@ def test_too_long_steps_for_the_time_transformation_are_rejected():
         kepler(SVI(2)).integrate(*START, h=50.0, t_end=PERIOD)
 
 
-def test_momenta_that_velocities_do_not_give_are_no_hindrance():
+def test_momenta_not_determined_by_velocities_are_supported():
     vortices = HamiltonianSystem.from_text(
         name="q p", coordinates=["x"], momenta=["y"], hamiltonian="x**2*y**2/2 + x**2/2 + y**2/2"
     )

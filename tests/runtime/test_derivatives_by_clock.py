@@ -171,7 +171,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_gradients_are_the_transpose(way):
+def test_gradients_are_the_transpose_of_derivatives(way):
     """Of functions of states, and of states and times."""
     run = stepper("L").integrate(Q, P, **({"h": H, "t": T0} | WAYS[way]))
     forward = run.sensitivity()
@@ -188,7 +188,7 @@ def test_gradients_are_the_transpose(way):
     assert (found.h is None) == ("steps" not in WAYS[way])
 
 
-def test_a_run_that_ends_where_a_step_does_ends_at_that_time():
+def test_run_that_ends_at_a_step_ends_at_its_time():
     made = stepper("L")
     t_end = float(made.integrate(Q, P, h=H, steps=7).t[-1])
     run, before = made.integrate(Q, P, h=H, t_end=t_end), made.integrate(Q, P, h=H, t_end=t_end - 1e-9)
@@ -212,7 +212,7 @@ def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
     assert_allclose(ended, own, atol=1e-8 * np.abs(own).max())
 
 
-def test_a_rod_in_transformed_time():
+def test_derivatives_of_a_rod_in_transformed_time():
     """With a constraint: the transpose, and differences of steps."""
     rod = LagrangianSystem.from_text(
         name="rod",

@@ -291,7 +291,7 @@ def test_diverging_trajectory_is_continued_as_scalar():
     same(found, alone.chaos_indicators_ensemble(*start, **options), 1e-12)
 
 
-def test_steps_that_are_no_motion_are_refused_as_by_runs():
+def test_failed_steps_are_rejected_as_in_runs():
     """Kepler's problem, e = 0.9, by steps too long for the pericentre: another solution is found."""
     kepler = compile_stepper(problem("kepler").system, SVI(4))
     q, p = [1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5]
@@ -316,7 +316,7 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
         assert_allclose(both[0].lengths[-1, j], alone.lengths[-1], atol=1e-13)
 
 
-def test_a_run_that_an_event_ended_has_its_last_step_as_it_is(galaxy):
+def test_last_step_of_an_event_run_is_not_changed(galaxy):
     """Its length is held: the derivative is that of the state at that time, not of the crossing."""
     run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=Event("y", terminal=True, direction=1))
     assert run.ended_by is not None

@@ -88,7 +88,7 @@ class TestCluster:
             assert np.array_equal(found, expected, equal_nan=True)
         assert np.array_equal(result.energy(), here.energy(), equal_nan=True)
 
-    def test_faults_are_found_before_anything_is_sent(self, kepler: Stepper):
+    def test_invalid_arguments_are_reported_before_distribution(self, kepler: Stepper):
         q, p = states()
         for faults in ({"h": 0.0}, {"steps": -1}, {"blocks": 0}, {"parameters": {"nu": 1.0}}):
             with pytest.raises(StateError):

@@ -22,7 +22,7 @@ def start(eccentricity: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("flags", [TUNED_FLAGS, PORTABLE_FLAGS], ids=["tuned", "portable"])
 @pytest.mark.parametrize(("eccentricity", "h"), [(0.2, 0.35), (0.5, 0.1)])
-def test_the_energy_does_not_drift(eccentricity, h, flags):
+def test_energy_does_not_drift(eccentricity, h, flags):
     """Tables of 53 bits, or small terms rounded away, give 5e-13 to 7e-12 here."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(8), flags=flags)
     energy = stepper.integrate(*start(eccentricity), h=h, steps=STEPS, save_every=STEPS // 200).energy()

@@ -254,7 +254,7 @@ def test_spline_coefficients_are_not_parameters(pendulum):
         ({}, ["u", "q_dot"], "the velocity of 'q'"),
     ],
 )
-def test_names_of_inputs_are_no_others(parameters, inputs, said):
+def test_names_of_inputs_are_unique(parameters, inputs, said):
     given = {"name": "s", "parameters": parameters, "inputs": inputs}
     v, u = sympy.symbols("q_dot u")
     for build in (
@@ -266,7 +266,7 @@ def test_names_of_inputs_are_no_others(parameters, inputs, said):
             build()
 
 
-def test_names_and_runs_without_an_end(pendulum):
+def test_runs_with_inputs_have_finite_ends_and_valid_names(pendulum):
     stepper = compile_stepper(pendulum, SVI(2))
     with pytest.raises(StateError, match="t_end"):
         stepper.integrate([0.3], [0.0], inputs={"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, h=0.1)
@@ -348,7 +348,7 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
         stepper.with_events("v - 1")
 
 
-def test_inputs_stay_in_other_coordinates_and_other_forms(pendulum):
+def test_inputs_survive_changes_of_coordinates_and_formulation(pendulum):
     inputs, data = ("u", "w"), {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     expected = compile_stepper(pendulum, SVI(4)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     dual, half = hamiltonian_of(pendulum), change_coordinates(pendulum, {"q": "2*z"}, coordinates=["z"])

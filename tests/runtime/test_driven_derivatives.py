@@ -53,7 +53,7 @@ def derivative(function, x, width=1e-4):
 
 
 @pytest.mark.parametrize("options", [{}, {"save_every": 3}], ids=["all", "some"])
-def test_gradients_by_the_start_by_parameters_and_by_the_data(stepper, options):
+def test_gradients_by_initial_state_parameters_and_data(stepper, options):
     run = run_from(stepper, START, **options)
     weights = np.random.default_rng(1).normal(size=(len(run), 2))
 
@@ -100,7 +100,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
     assert product.inputs["u"].shape == (4, 4, 4)
 
 
-def test_data_have_no_directions(stepper):
+def test_tangent_vectors_of_data_are_not_supported(stepper):
     run = run_from(stepper, START)
     with pytest.raises(StateError, match="directions must be 0 for the parameters of inputs"):
         run.tangent(np.ones(stepper._input_size))

@@ -86,7 +86,7 @@ def test_other_iterations_restart_after_a_shorter_step(coupled):
     check_against_drive(stepper, starts(2), inputs, 2e-14, h=0.05, t_end=2.3)
 
 
-def test_methods_without_lanes_are_equal_to_the_bit(pendulum):
+def test_methods_without_lanes_are_bitwise_equal(pendulum):
     stepper = compile_stepper(pendulum, SCVI(2), solver="newton")
     assert stepper.ensemble is None
     inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
@@ -130,7 +130,7 @@ def test_diverging_trajectory_retains_its_previous_states():
     assert (np.diff(t) >= 0).all()
 
 
-def test_velocities_are_taken_with_the_inputs_of_the_start(coupled):
+def test_velocities_use_the_inputs_at_the_start(coupled):
     stepper = compile_stepper(coupled, SVI(3))
     q, v = starts(2)
     inputs = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], np.outer(np.arange(COUNT), [1.0, 0.0]))}
@@ -138,7 +138,7 @@ def test_velocities_are_taken_with_the_inputs_of_the_start(coupled):
     assert_allclose(runs.p[0, :, 1], v[:, 0] / 3 + 2 * (1 + np.arange(COUNT) / 5) * v[:, 1])
 
 
-def test_splines_of_scipy(pendulum):
+def test_splines_of_scipy_are_accepted(pendulum):
     stepper, (u, _) = compile_stepper(pendulum, SVI(3)), own_values()
     w, given = ([0.0, 3.0], [0.0, 0.3]), {"h": 0.05, "steps": 40}
     by_values = stepper.integrate_ensemble(*starts(1), inputs={"u": (KNOTS, u, "cubic"), "w": w}, **given)
@@ -231,7 +231,7 @@ def test_invalid_arguments_are_rejected(pendulum, change, said):
         compile_stepper(pendulum, SVI(3)).integrate_ensemble(*starts(1), **given)
 
 
-def test_no_steps_at_all_and_pickled_results(pendulum):
+def test_runs_without_steps_and_pickled_results(pendulum):
     stepper, given = (
         compile_stepper(pendulum, SVI(3)),
         {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1},

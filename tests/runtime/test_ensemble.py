@@ -100,7 +100,7 @@ class TestEqualsSingleTrajectories:
         assert np.array_equal(same.parameters, np.tile(each.parameters[0], (3, 1)))
 
     @pytest.mark.parametrize("method", [SVI(5), SCVI(3)], ids=lambda method: method.name)
-    def test_backward(self, method: Method):
+    def test_ensemble_equals_single_runs_backward(self, method: Method):
         stepper = stepper_for("driven-duffing", method)
         q, p = states("driven-duffing", 9)
         there = stepper.integrate_ensemble(q, p, h=0.02, steps=50, t=1.0)
@@ -110,7 +110,7 @@ class TestEqualsSingleTrajectories:
         if method.symmetric:
             np.testing.assert_allclose(back.q[-1], q, rtol=1e-12)
 
-    def test_options_reach_the_lanes(self):
+    def test_options_are_passed_to_the_lanes(self):
         stepper = stepper_for("double-pendulum", SVI(5))
         q, p = states("double-pendulum", 8)
         loose = stepper.integrate_ensemble(q, p, h=0.05, steps=20, options=SolverOptions(tolerance=1e-4))
@@ -118,7 +118,7 @@ class TestEqualsSingleTrajectories:
         assert loose.ok.all()
         assert 1e-14 < np.abs(loose.q - exact.q).max() < 1e-3
 
-    def test_energies_are_those_of_the_single_runs(self):
+    def test_energies_equal_those_of_single_runs(self):
         stepper = stepper_for("double-pendulum", SVI(5))
         q, p = states("double-pendulum", 9)
         result = stepper.integrate_ensemble(q, p, h=0.02, steps=50)
@@ -127,7 +127,7 @@ class TestEqualsSingleTrajectories:
         assert np.abs(energies / energies[0] - 1).max() < 1e-9
         assert energies[7, 8] == stepper.energy(result.q[7, 8], result.p[7, 8], result.t[7])
 
-    def test_few_steps_and_none(self):
+    def test_ensembles_with_few_or_no_steps(self):
         stepper = stepper_for("kepler", SVI(5))
         q, p = states("kepler", 9)
         assert stepper.integrate_ensemble(q, p, h=0.1, steps=0).q.shape == (1, 9, 2)
@@ -205,7 +205,7 @@ class TestFailures:
         assert set(result.steps) == {0}
 
     @pytest.mark.parametrize("method", [SVI(5), SCVI(3), StoermerVerlet()], ids=lambda method: method.name)
-    def test_methods_fail_one_trajectory_at_a_time(self, method: Method):
+    def test_failures_are_per_trajectory_for_every_method(self, method: Method):
         stepper = stepper_for("runaway", method)
         result = stepper.integrate_ensemble([[-1.0], [1.0], [-0.9]], [[-0.5], [1.0], [-0.4]], h=0.05, steps=60)
         assert result.ok.tolist() == [True, False, True]
@@ -216,7 +216,7 @@ class TestFailures:
 
 
 class TestThreadsAndInterruption:
-    def test_bits_do_not_depend_on_the_number_of_threads(self, kepler: Stepper):
+    def test_results_do_not_depend_on_the_number_of_threads(self, kepler: Stepper):
         q, p = states("kepler", 64)
         q[20] = 0.0
         one, two = (kepler.integrate_ensemble(q, p, h=0.05, steps=300, threads=threads) for threads in (1, 2))
@@ -248,7 +248,7 @@ class TestThreadsAndInterruption:
         assert set(result.status) == {"interrupted"}
         assert 0 < result.steps.max() < 10**9
 
-    def test_an_error_in_a_block_is_not_lost(self, kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
+    def test_error_in_a_block_is_raised(self, kepler: Stepper, monkeypatch: pytest.MonkeyPatch):
         def fail(*arguments: object) -> None:
             raise RuntimeError("out of order")
 
@@ -256,7 +256,7 @@ class TestThreadsAndInterruption:
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 
-    def test_memory_is_bounded_by_every(self, kepler: Stepper):
+    def test_memory_is_bounded_by_save_every(self, kepler: Stepper):
         q, p = states("kepler", 64)
         kepler.integrate_ensemble(q, p, h=0.05, steps=1)
         gc.collect()
@@ -299,7 +299,7 @@ class TestArguments:
             ({"parameters": {"mu": [1.0, np.nan, 1.0]}}, "the parameter mu of trajectory 1 is nan"),
         ],
     )
-    def test_faults_are_named(self, kepler: Stepper, changes: dict[str, object], message: str):
+    def test_invalid_arguments_are_named(self, kepler: Stepper, changes: dict[str, object], message: str):
         arguments: dict[str, object] = {"q": np.ones((3, 2)), "p": np.zeros((3, 2)), "h": 0.1, "steps": 5} | changes
         with pytest.raises(StateError, match=message):
             kepler.integrate_ensemble(**arguments)  # type: ignore[arg-type]
@@ -314,7 +314,7 @@ class TestFiles:
         values = {"mu": [1.0, 1e9, 1.2]}  # the second falls into the centre
         return kepler.integrate_ensemble(*states("kepler", 3), h=0.05, steps=100, save_every=10, parameters=values)
 
-    def test_npz(self, result: EnsembleTrajectory, tmp_path):
+    def test_npz_round_trip(self, result: EnsembleTrajectory, tmp_path):
         result.save(tmp_path / "runs.npz")
         with np.load(tmp_path / "runs.npz") as file:
             for name in ("t", "q", "p", "status", "steps", "h", "parameters"):
@@ -362,7 +362,7 @@ class TestEnsembleFiles:
         assert p[:, 1].tolist() == [0.9, 1.0] * 3
         assert set(p[:, 0]) == {model().velocity[0]}  # type: ignore[index]
 
-    def test_a_table_has_a_line_a_trajectory(self, tmp_path):
+    def test_table_has_one_line_per_trajectory(self, tmp_path):
         (tmp_path / "table.csv").write_text("mu, p_q1,q2\n\n1.0,0.5,0.1\n 2e0 ,-0.5,0.2\n")
         states = load_ensemble(tmp_path / "table.csv", model())
         assert states.parameters[:, 0].tolist() == [1.0, 2.0]
@@ -373,7 +373,7 @@ class TestEnsembleFiles:
             [-0.5, model().momenta(stepper)[1]],
         ]
 
-    def test_a_table_of_a_spreadsheet_begins_with_a_byte_order_mark(self, tmp_path):
+    def test_byte_order_mark_of_a_table_is_ignored(self, tmp_path):
         (tmp_path / "table.csv").write_text("q1\n0.5\n", encoding="utf-8-sig")
         assert load_ensemble(tmp_path / "table.csv", model()).q[:, 0].tolist() == [0.5]
 
@@ -384,7 +384,7 @@ class TestEnsembleFiles:
         p = states.momenta(stepper_for("planar-pendulum", SVI(4)))
         assert p[1, 0] == 3.0 * p[0, 0]
 
-    def test_velocities_over_a_model_with_momenta_and_the_reverse(self, tmp_path):
+    def test_velocities_override_momenta_of_a_model_and_vice_versa(self, tmp_path):
         stepper = stepper_for("kepler", SVI(4))
         with_momenta = model(p=(0.3, 0.7), velocity=None)
         (tmp_path / "a.csv").write_text("q1_dot\n0.1\n")
@@ -434,7 +434,7 @@ class TestEnsembleFiles:
             ("a.csv", "q1\ninf", "line 2, q1: inf is not a finite number"),
         ],
     )
-    def test_faults_are_named(self, name: str, text: str | None, message: str, tmp_path):
+    def test_invalid_entries_are_named(self, name: str, text: str | None, message: str, tmp_path):
         if text is not None:
             (tmp_path / name).write_text(text)
         with pytest.raises(ModelFileError, match=message) as error:
@@ -519,7 +519,7 @@ class TestCommandLine:
             assert file["steps"].max() > 0
 
 
-def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):
+def test_pickled_stepper_has_its_lanes(kepler: Stepper):
     q, p = states("kepler", 9)
     again = pickle.loads(pickle.dumps(kepler))
     first, second = (stepper.integrate_ensemble(q, p, h=0.05, steps=20) for stepper in (kepler, again))
@@ -527,7 +527,7 @@ def test_a_stepper_from_a_pickle_has_its_lanes(kepler: Stepper):
 
 
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
-def test_the_absolute_rule_is_that_of_single_trajectories(name):
+def test_absolute_tolerance_equals_that_of_single_trajectories(name):
     """Lanes measure changes of q, not relative ones, where the options say so: as many sweeps, the same states."""
     chosen = problem(name)
     stepper = compile_stepper(chosen.system, SVI(4))

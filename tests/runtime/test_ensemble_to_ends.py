@@ -49,7 +49,7 @@ def test_each_trajectory_equals_the_single_run(kepler, threads, save_every):
     assert np.nanmax(np.abs(runs.momentum_errors())) < 1e-12
 
 
-def test_states_at_common_times_end_where_a_trajectory_does(kepler):
+def test_states_at_common_times_end_with_each_trajectory(kepler):
     times = np.linspace(0.0, 20.0, 9)
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, t_eval=times)
     assert runs.times is None
@@ -107,12 +107,12 @@ def test_interrupt_returns_completed_states(kepler):
         ({"t_end": 1.0, "t_eval": [0.5], "save_every": 2}, "not both"),
     ],
 )
-def test_a_wrong_argument_is_named(kepler, settings, words):
+def test_invalid_argument_is_named(kepler, settings, words):
     with pytest.raises(StateError, match=words):
         kepler.integrate_ensemble(Q, P, **settings)
 
 
-def test_over_a_cluster(kepler):
+def test_ensemble_to_end_times_over_a_cluster(kepler):
     pytest.importorskip("distributed")
     from scvi_codegen.runtime.distributed import integrate_ensemble
 
@@ -137,7 +137,7 @@ def test_files_contain_individual_times(kepler, tmp_path):
     assert np.array_equal(np.isfinite(dataset.energy), np.isfinite(runs.times))
 
 
-def test_the_command_line_runs_a_grid(tmp_path, monkeypatch):
+def test_command_line_runs_a_grid(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("k.toml").write_text(
         '[system]\ncatalogue = "kepler"\n[method]\nmethod = "svi"\ndegree = 4\n[run]\ntolerance = 1e-9\nspan = 9\n'

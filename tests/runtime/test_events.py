@@ -154,7 +154,7 @@ def test_all_roots_of_polynomials_of_degree_four_are_found(polynomials, numbers,
         assert np.abs(found.t - h * np.sort(np.abs(roots[:degree]))).max() < 1e-9
 
 
-def test_hardly_any_root_of_polynomials_of_degree_eight_is_missed(polynomials):
+def test_few_roots_of_polynomials_of_degree_eight_are_missed(polynomials):
     """Eight roots within one step are more than polynomials of degree 4 can promise to see: a measured share."""
     generator = np.random.default_rng(8)
     found = 0
@@ -188,7 +188,7 @@ def test_crossings_of_other_functions_are_found(function):
     assert np.abs(found - expected).max() < 1e-5
 
 
-def test_a_graze_is_two_crossings_or_none():
+def test_tangency_gives_two_crossings_or_none():
     """The angle just below and just above its amplitude, which lies within a step."""
     system = LagrangianSystem.from_text(
         name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)", parameters={"level": 0.0}
@@ -211,7 +211,7 @@ def test_several_events_of_one_step_are_ordered_without_duplicates():
     assert [found.t.tolist() for found in run.events] == [[0.25], [0.5], [0.75], [0.5, 1.0]]
 
 
-def test_a_root_at_the_start_is_none_and_one_at_the_end_is_found():
+def test_root_at_the_start_is_ignored_and_one_at_the_end_is_found():
     stepper = compile_stepper(FREE, SVI(2), flags=FLAGS)
     run = stepper.integrate([0.0], [1.0], h=0.25, steps=8, events=["q", "q - 2", "t"])
     assert [found.t.tolist() for found in run.events] == [[], [2.0], []]
@@ -263,7 +263,7 @@ def test_run_ends_before_the_step_of_the_terminal_event(pendulum):
     assert run.record(400).t.tolist() == [first.t[-2], first.t[-1]]
 
 
-def test_a_run_from_a_crossing_does_not_find_it_again(pendulum):
+def test_run_from_a_crossing_does_not_repeat_it(pendulum):
     q, p, t, found = [0.5], [0.0], 0.0, []
     whole = pendulum.integrate(q, p, h=0.1, steps=400, events="q").events[0].t
     for _ in whole:
@@ -283,7 +283,7 @@ def test_terminal_event_before_a_failing_step_is_found():
     assert run.q[-1, 0] == pytest.approx(5, abs=1e-14)
 
 
-def test_states_are_the_same_bits_with_events_and_without(kepler):
+def test_events_do_not_change_the_states(kepler):
     start = at_perihelion(0.5) | {"h": 0.1, "steps": 10_000}
     plain, watched = kepler.integrate(**start), kepler.integrate(**start, events="q1")
     for name in ("t", "q", "p", "iterations"):
@@ -296,20 +296,20 @@ def test_states_are_the_same_bits_with_events_and_without(kepler):
         sparse[0].crossings("q1")
 
 
-def test_crossings_are_found_afterwards_up_to_the_event_that_ended_the_run(kepler):
+def test_crossings_are_found_afterwards_up_to_the_terminal_event(kepler):
     run = kepler.integrate(**at_perihelion(0.5), h=0.3, steps=100, events=["q1", Event("q2 + q1/9", terminal=3)])
     again = run.crossings(["q1", "q2 + q1/9"])
     for found, expected in zip(again, run.events, strict=True):
         assert np.abs(found.t - expected.t).max() < 1e-13
 
 
-def test_explicit_time_and_parameters(compiled):
+def test_events_with_explicit_time_and_parameters(compiled):
     duffing = compiled("driven-duffing", SVI(4))
     run = duffing.integrate([0.6], [-0.3], h=0.1, steps=100, t=3.0, events="sin(omega*t)", parameters={"omega": 2.0})
     assert np.abs(run.events[0].t - math.pi / 2 * np.arange(2, 9)).max() < 1e-13
 
 
-def test_hamiltonians_call_their_momenta_as_they_like():
+def test_momenta_of_hamiltonians_have_user_defined_names():
     system = HamiltonianSystem.from_text(
         name="pendulum", coordinates=["q"], momenta=["J"], hamiltonian="J**2/2 - cos(q)"
     )
@@ -332,7 +332,7 @@ def test_point_vortices_have_no_velocity_kernel():
     assert np.abs(rates).max() < 1e-12
 
 
-def test_sympy_expressions_in_functions_of_time():
+def test_events_from_sympy_functions_of_time():
     theta, t = dynamicsymbols("theta"), dynamicsymbols._t
     system = LagrangianSystem.from_sympy(
         name="pendulum", lagrangian=theta.diff(t) ** 2 / 2 + sympy.cos(theta), coordinates=[theta]
@@ -361,7 +361,7 @@ def test_errors_name_the_symbol_or_function(pendulum, event, error, words):
 
 
 @pytest.mark.parametrize(("arguments", "error"), [({"direction": 2}, EventError), ({"terminal": -1}, StateError)])
-def test_events_are_checked(arguments, error):
+def test_invalid_events_are_rejected(arguments, error):
     with pytest.raises(error):
         Event("q", **arguments)
 

@@ -77,7 +77,7 @@ def test_error_estimate_of_a_fallback_step_is_equal(start):
     assert errors[0][1] == errors[1][1]
 
 
-def test_newtons_iteration_is_compiled_once_it_is_needed(start, monkeypatch):
+def test_newton_iteration_is_compiled_on_demand(start, monkeypatch):
     built = []
     load = building.load
     monkeypatch.setattr(building, "load", lambda source, **flags: built.append(source.prefix) or load(source, **flags))
@@ -101,7 +101,7 @@ def test_discrete_lagrangian_comes_from_the_fallback_library(start):
     assert values[0] == values[1]
 
 
-def test_threads_may_all_be_the_first_to_need_it(start):
+def test_concurrent_threads_compile_the_fallback_once(start):
     stepper = compile_stepper(problem("double-pendulum").system, SVI(3), prefix="threads", flags=PORTABLE_FLAGS)
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda _: outcome(stepper, start, LONG), range(16)))
@@ -142,7 +142,7 @@ def test_failed_run_ends_before_the_step(start):
     assert run.checkpoint() == before
 
 
-def test_prepare_compiles_all_that_later_calls_need(tmp_path, monkeypatch):
+def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
     swing, flags = problem("planar-pendulum").system, ("-O0",)
     stepper, state = compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])

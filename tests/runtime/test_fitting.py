@@ -74,7 +74,7 @@ def test_noise_free_data_give_the_true_values():
     assert np.abs(found.residuals).max() < 1e-9
 
 
-def test_values_and_errors_are_those_of_curve_fit():
+def test_estimates_and_errors_agree_with_curve_fit():
     """Which integrates with DOP853, and takes differences for slopes."""
     measured = recorded(1)[0]
     found = fit(oscillator(), TIMES, measured, unknown=SOME, **GUESS)
@@ -218,7 +218,7 @@ def test_biased_parameters_warn_of_too_long_steps():
     assert abs(fit(coarse, times, noisy, h=0.02, **given).parameters["b"] - 1.0) < 0.02
 
 
-def test_a_guess_beyond_which_motions_fail_is_a_guess():
+def test_initial_guess_with_failing_runs_is_accepted():
     """A soft spring: on the way to the truth a trial leaves its well and goes to infinity."""
     soft = LagrangianSystem.from_text(
         name="soft", coordinates=["x"], lagrangian="x_dot**2/2 - a*x**2/2 + x**4/4", parameters={"a": 1.0}
@@ -261,7 +261,7 @@ def test_parameter_at_a_bound_has_no_standard_error():
         assert found.standard_errors[name] == pytest.approx(error, rel=1e-3)
 
 
-def test_times_ascend_and_constraints_are_not_fitted():
+def test_times_must_ascend_and_constraints_are_not_fitted():
     with pytest.raises(StateError, match="ascending"):
         fit(oscillator(), TIMES[::-1], recorded()[0], **GUESS)
     bars = compile_stepper(linkage(), SVI(1, "gauss-lobatto:2"), flags=QUICK_FLAGS)
@@ -301,7 +301,7 @@ def two_rods():
     return stepper, run, run.q + NOISE * np.random.default_rng(0).normal(size=run.q.shape)
 
 
-def test_a_chaotic_record_is_fitted_in_segments():
+def test_chaotic_record_is_fitted_in_segments():
     """Nearby motions part e^17-fold: from its start alone the motion is lost, in segments it is found."""
     stepper, run, noisy = two_rods()
     known = {"q": noisy[0], "p": [0.05, -0.05], "h": 0.02}
@@ -318,7 +318,7 @@ def test_a_chaotic_record_is_fitted_in_segments():
     assert np.abs(found.jumps).max() < 1e-9
 
 
-def test_segments_find_what_one_finds():
+def test_segments_and_single_shooting_agree():
     """Of a record that is neither long nor chaotic: the same least squares, the same errors."""
     known = GUESS | {"unknown": SOME}
     whole = fit(oscillator(), TIMES, recorded(1)[0], **known)
@@ -353,7 +353,7 @@ BOUNDS = [{"delta": (0.25, 0.5)}, {"delta": (0.0, 1.0)}, {"alpha": (-0.95, 0.0),
 
 
 @pytest.mark.parametrize("bounds", BOUNDS)
-def test_segments_with_bounds_find_what_one_with_them_finds(bounds):
+def test_segments_with_bounds_agree_with_single_shooting(bounds):
     one = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, **GUESS)
     parts = fit(oscillator(), TIMES, recorded(3)[0], bounds=bounds, unknown=SOME, segments=4, **GUESS)
     assert parts.at_bounds == one.at_bounds == tuple(name for name in bounds if bounds[name] != (0.0, 1.0))
@@ -366,7 +366,7 @@ def test_segments_with_bounds_find_what_one_with_them_finds(bounds):
     assert_allclose(np.sqrt(np.diag(parts.covariance))[free], errors, rtol=1e-2)
 
 
-def test_least_squares_with_equations_and_bounds():
+def test_least_squares_with_equality_constraints_and_bounds():
     """Beside the best of all choices of unknowns that a bound holds."""
     rng = np.random.default_rng(5)
     for _ in range(40):

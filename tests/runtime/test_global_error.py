@@ -283,7 +283,7 @@ class TestEstimatesBoundTheTrueError:
 class TestChaos:
     """Burrau's problem loses thirteen digits until t = 70, a double pendulum all of them until t = 50."""
 
-    def test_digits_are_confirmed_until_they_are_lost(self, burrau_stepper):
+    def test_digits_are_confirmed_until_chaos_destroys_them(self, burrau_stepper):
         q, p = PYTHAGOREAN
         until = {}
         for error in (1e-6, 1e-9):
@@ -299,7 +299,7 @@ class TestChaos:
         assert 5.0 < until[1e-9] < until[1e-6] < 20.0
 
     @pytest.mark.full
-    def test_confirmed_digits_are_right(self, burrau_stepper):
+    def test_confirmed_digits_are_correct(self, burrau_stepper):
         q, p = PYTHAGOREAN
         run = burrau_stepper.integrate(q, p, t_end=70.0, error=1e-6)
         kept = np.append(np.flatnonzero(run.t <= run.confirmed_until)[::10], len(run) - 1)
@@ -309,7 +309,7 @@ class TestChaos:
         assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
 
     @pytest.mark.parametrize("more", [{}, {"save_every": 7}, {"t_eval": np.linspace(0.0, 70.0, 50)}])
-    def test_a_default_run_warns(self, burrau_stepper, more):
+    def test_default_run_warns_of_chaos(self, burrau_stepper, more):
         with pytest.warns(
             sc.AccuracyWarning, match="amplifies errors: a run with the initial state perturbed by 8.9e-16"
         ):
@@ -321,11 +321,11 @@ class TestChaos:
         burrau_stepper.integrate(*PYTHAGOREAN, t_end=3.0)
 
     @pytest.mark.filterwarnings("error")
-    def test_regular_motions_are_no_reason(self, kepler_stepper):
+    def test_regular_motions_do_not_warn(self, kepler_stepper):
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, check_growth=True)
         kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=600.0, tolerance=1e-9)
 
-    def test_states_are_the_same_with_the_check_and_without(self, burrau_stepper):
+    def test_check_does_not_change_the_states(self, burrau_stepper):
         with pytest.warns(sc.AccuracyWarning):
             one = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0)
         other = burrau_stepper.integrate(*PYTHAGOREAN, t_end=70.0, check_growth=False)
@@ -371,7 +371,7 @@ class TestWhatIsRefused:
         with pytest.raises(sc.StateError, match=message):
             kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
 
-    def test_a_time_transformation(self):
+    def test_time_transformation_is_rejected(self):
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:2", monitor="frequency")
         with pytest.raises(sc.StateError, match="a time transformation has fixed steps in tau"):
             stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0, error=1e-6)
@@ -398,7 +398,7 @@ class TestOtherRuns:
         assert len(kept) == -(-kept.steps // 10) + 1
         assert kept.global_error <= 1e-9
 
-    def test_constraints_against_an_angle(self):
+    def test_constraints_agree_with_an_angle(self):
         """A pendulum held by x^2 + y^2 = 1 and one that has no other coordinate than its angle."""
         held = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
         with warnings.catch_warnings():
@@ -411,7 +411,7 @@ class TestOtherRuns:
         assert apart.max() <= run.global_error <= 1e-8
 
     @pytest.mark.parametrize("indexed", [False, True], ids=["scalar", "array"])
-    def test_inputs(self, indexed):
+    def test_confirmed_runs_with_inputs(self, indexed):
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
         table = (np.array([0.5, 2.0, 6.0]), np.array([0.75, 0.0, 0.0]))
         if indexed:
@@ -438,7 +438,7 @@ class TestOtherRuns:
         assert np.abs(q - exact).max() <= run.global_error <= 1e-9
         assert run.confirmed_until == 6.0
 
-    def test_arrays(self):
+    def test_confirmed_runs_of_arrays(self):
         system = sc.IndexedSystem.from_text(
             name="chain",
             coordinates=["q[N]"],
@@ -456,7 +456,7 @@ class TestOtherRuns:
         with pytest.raises(sc.StateError, match="observe"):
             stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
 
-    def test_arrays_that_are_chaotic_warn(self):
+    def test_chaotic_arrays_warn(self):
         system = sc.IndexedSystem.from_text(
             name="pendulums",
             coordinates=["q[N]"],
@@ -473,7 +473,7 @@ class TestOtherRuns:
 
 
 class TestSolveMotion:
-    def test_error(self, kepler_stepper):
+    def test_error_argument_of_solve_ivp(self, kepler_stepper):
         motion = sc.solve_ivp(kepler_stepper, (3.0, 23.0), [1.6, 0.0, 0.0, 0.5], error=1e-8)
         exact = on_an_ellipse([1.6, 0.0], [0.0, 0.5], motion.t)
         assert motion.success
@@ -517,7 +517,7 @@ class TestCommandLine:
         assert re.search(r"the bound 1e-09 on the global error is confirmed only until t = [\d.]+", result.output)
 
     @pytest.mark.parametrize("where", ["file", "option", "folder"])
-    def test_the_run_is_the_confirmed_one_bit_by_bit(self, tmp_path, where):
+    def test_printed_run_equals_the_confirmed_one_bitwise(self, tmp_path, where):
         """Whether a file or an option asks for it, in memory and in a folder."""
         path = self._kepler(tmp_path)
         output = tmp_path / ("orbit.run" if where == "folder" else "orbit.npz")
@@ -533,7 +533,7 @@ class TestCommandLine:
         assert np.array_equal(kept["q"], run.q)
         assert np.array_equal(kept["p"], run.p)
 
-    def test_a_recorded_run_that_is_not_confirmed_ends_with_1(self, tmp_path):
+    def test_unconfirmed_recorded_run_exits_with_1(self, tmp_path):
         words = ["run", "double-pendulum", "--span", "40", "--error", "1e-9", "-o", str(tmp_path / "d.run")]
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 1
@@ -546,7 +546,7 @@ class TestCommandLine:
         '[method]\nmethod = "svi:8"\n[run]\nspan = {span}\nerror = 1e-8\n[initial]\nq = {q}\n'
     )
 
-    def test_arrays(self, tmp_path):
+    def test_confirmed_array_runs_on_the_command_line(self, tmp_path):
         path, output = tmp_path / "arrays.toml", tmp_path / "a.npz"
         path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
         words = (["run", str(path), "-o", str(output), "--json"], ["run", str(path), "--error", "1e-8", "--json"])
@@ -572,7 +572,7 @@ class TestCommandLine:
             ("error = 1e-9", ["--monitor", "frequency"], "requires adaptive steps"),
         ],
     )
-    def test_files_that_are_refused(self, tmp_path, run, words, message):
+    def test_invalid_files_are_rejected(self, tmp_path, run, words, message):
         path = tmp_path / "kepler.toml"
         path.write_text(f'[system]\ncatalogue = "kepler"\n[run]\nspan = 20.0\n{run}\n')
         result = CliRunner().invoke(main, ["run", str(path), *words])

@@ -48,7 +48,7 @@ def square(count, seed=0):
 
 
 @pytest.mark.parametrize("save_every", [1, 12])
-def test_the_hessian_of_a_function_of_all_states(stepper, save_every):
+def test_hessian_of_a_function_of_all_states(stepper, save_every):
     """Against differences of exact gradients, of fourth order; also where steps between are taken again."""
     run = run_from(stepper, START, save_every=save_every)
     weights, bends = square(len(run))

@@ -269,7 +269,7 @@ def test_unsupported_observations_are_rejected(observe: Any, message: str) -> No
         sc.compile_indexed(each.system, "svi:2").integrate(each.q, h=0.1, steps=2, observe=observe)
 
 
-def test_velocities_are_those_of_other_masses() -> None:
+def test_velocities_depend_on_masses() -> None:
     """Of the states that are kept, and of a run; what they show of themselves is a line."""
     each = CASES["bodies"]
     stepper = sc.compile_indexed(each.system, "svi:2")
@@ -287,7 +287,7 @@ def test_velocities_are_those_of_other_masses() -> None:
     assert shown[2] == "IndexedSystem(name='case', coordinates=(r[N, 2]))"
 
 
-def test_a_table_of_one_column_may_be_a_list() -> None:
+def test_table_with_one_column_may_be_a_list() -> None:
     """What is held in place, say."""
     held = sc.IndexedSystem.from_text(
         name="held",
@@ -355,7 +355,7 @@ def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message
         sc.compile_indexed(net, "svi:2").start(q, **{"h": 0.1, **given})
 
 
-def test_failures() -> None:
+def test_failures_of_array_runs() -> None:
     """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
     each = CASES["ring"]
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
@@ -452,7 +452,7 @@ def test_forces_of_position_and_time(method: str) -> None:
 
 
 @pytest.mark.full
-def test_forces_of_momenta() -> None:
+def test_forces_depending_on_momenta() -> None:
     """Beside a Hamiltonian."""
     system = sc.IndexedSystem.from_text(
         name="waves",
@@ -467,7 +467,7 @@ def test_forces_of_momenta() -> None:
     assert run.q["q"] == pytest.approx(other.q, abs=1e-14)
 
 
-def test_friction_damps_as_it_should() -> None:
+def test_friction_damps_at_the_exact_rate() -> None:
     """A damped oscillator at every place, in closed form."""
     system = sc.IndexedSystem.from_text(
         name="damped",
@@ -483,7 +483,7 @@ def test_friction_damps_as_it_should() -> None:
     assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
 
 
-def test_a_table_of_one_axis() -> None:
+def test_table_with_one_axis() -> None:
     """Springs at some places only."""
     pinned = sc.IndexedSystem.from_text(
         name="pinned",

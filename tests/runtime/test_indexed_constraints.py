@@ -131,7 +131,7 @@ def test_compositions_have_their_order_and_satisfy_constraints():
     assert 2.0**7 < errors[0] / errors[1] < 2.0**10
 
 
-def test_a_step_back_undoes_a_step(stepper):
+def test_backward_step_is_the_inverse(stepper):
     q, data = chain(40)
     there = stepper.start(q, h=1e-3, **data)
     there.advance(30)
@@ -189,7 +189,7 @@ def test_momentum_maps_compatible_with_constraints_are_conserved():
     assert np.abs(np.ptp(run.momentum_maps(), axis=0)).max() < 1e-13
 
 
-def test_constraints_move_in_time():
+def test_time_dependent_constraints_are_satisfied():
     """A pendulum whose pivot shakes is that written out in its angle."""
     shaken = sc.IndexedSystem.from_text(
         name="shaken",
@@ -229,7 +229,7 @@ steps = 20
 """
 
 
-def test_model_files_and_the_programs_made_of_them_have_constraints(tmp_path):
+def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_indexed_model(tmp_path / "chain.toml")
     run = model.integrate()
@@ -258,7 +258,7 @@ def test_unsatisfiable_constraints_are_rejected(stepper, bonds, lengths, said):
         stepper.start(q, h=0.01, tables={"bonds": bonds, "pins": [0]}, parameters={"l": lengths}).advance(10)
 
 
-def test_parameters_of_constraints_do_not_jump(stepper):
+def test_discontinuous_constraint_parameters_are_rejected(stepper):
     q, data = chain(3)
     run = stepper.start(q, h=0.01, **data)
     with pytest.raises(StateError, match="must be continuous"):

@@ -88,7 +88,7 @@ class TestWhatACallerChangesLater:
                 array[0] = 0
 
     @pytest.mark.parametrize("table", [[[0, 1], [1]], [[0, [1]], [1, 2]], [[0, 2**70], [1, 2]], "ab"])
-    def test_a_table_that_is_no_array_is_named(self, chain: Any, table: Any) -> None:
+    def test_table_that_is_not_an_array_is_named(self, chain: Any, table: Any) -> None:
         with pytest.raises(StateError, match="the table 'bonds'"):
             start(chain, tables={"bonds": table})
 
@@ -109,7 +109,7 @@ class TestPickles:
         assert run.steps == 9
         assert other.steps == 8
 
-    def test_constraints_too(self, pendulums: Any) -> None:
+    def test_pickled_runs_with_constraints(self, pendulums: Any) -> None:
         run = start(pendulums)
         run.advance(3)
         other = copy.copy(run)
@@ -147,7 +147,7 @@ def put_together(found: dict[str, Any], *, checksum: bool = True) -> bytes:
 class TestDamage:
     """Bytes of the whole file, numbers behind a right checksum: refused, or a run that goes on within its arrays."""
 
-    def test_changed_numbers_are_found_by_the_checksum(self, chain: Any) -> None:
+    def test_changed_numbers_are_detected_by_the_checksum(self, chain: Any) -> None:
         run = start(chain)
         run.advance(2)
         for name, array in parts(run.checkpoint()).items():
@@ -160,7 +160,7 @@ class TestDamage:
 
     @pytest.mark.parametrize("value", [-1.0, 3.0, 0.5, 1e300, -1e300, np.nan, np.inf, 2.0**63, -(2.0**62)])
     @pytest.mark.parametrize("name", indexed_saving.RANGES)
-    def test_counts_of_no_run(self, chain: Any, name: str, value: float) -> None:
+    def test_invalid_counts_are_rejected(self, chain: Any, name: str, value: float) -> None:
         run = start(chain, h=None, t_end=2.0)
         run.advance(3)
         found = parts(run.checkpoint())
@@ -173,7 +173,7 @@ class TestDamage:
             chain.from_checkpoint(put_together(found), t_end=2.0)
 
     @pytest.mark.parametrize("which", ["chain", "pendulums"])
-    def test_every_array(self, which: str, request: Any) -> None:
+    def test_damage_in_every_array_is_detected(self, which: str, request: Any) -> None:
         stepper = request.getfixturevalue(which)
         run = start(stepper)
         run.advance(2)
@@ -190,7 +190,7 @@ class TestDamage:
                     refused += 1
         assert refused > 2 * len(whole)
 
-    def test_bytes_at_random(self, chain: Any) -> None:
+    def test_random_bytes_are_rejected(self, chain: Any) -> None:
         run, random = start(chain), np.random.default_rng(3)
         whole = run.checkpoint()
         for _ in range(300):
@@ -207,7 +207,7 @@ class TestDamage:
         with pytest.raises(StateError, match="must be bytes, not int"):
             chain.from_checkpoint(3)
 
-    def test_a_run_of_the_other_kind_of_steps(self, chain: Any) -> None:
+    def test_bytes_of_another_step_type_are_rejected(self, chain: Any) -> None:
         with pytest.raises(StateError, match="give t_end"):
             chain.from_checkpoint(start(chain, h=None, t_end=2.0).checkpoint())
         with pytest.raises(StateError, match="omit t_end"):

@@ -71,7 +71,7 @@ def test_slices_have_the_states_of_the_run(steppers):
 
 
 class TestControlledSteps:
-    def test_round_off_is_the_default(self, steppers):
+    def test_default_tolerance_is_round_off(self, steppers):
         own, other = (each.integrate(Q, velocity=V, t_end=10.0) for each in steppers)
         assert own.t[-1] == 10.0
         assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
@@ -79,7 +79,7 @@ class TestControlledSteps:
         assert own.energy_error() < 1e-15
 
     @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
-    def test_the_error_is_that_allowed(self, steppers, tolerance):
+    def test_error_satisfies_the_tolerance(self, steppers, tolerance):
         stepper, other = steppers
         run = stepper.integrate(Q, velocity=V, t_end=10.0, tolerance=tolerance)
         exact = other.integrate(Q, velocity=V, t_end=10.0).q[-1]
@@ -175,7 +175,7 @@ class TestEvents:
         assert abs(run.t[-1] - expected.t[-1]) < 1e-14
         assert len(run.t) == len(expected.t)
 
-    def test_the_new_sign_is_there(self, steppers):
+    def test_new_state_has_the_opposite_sign(self, steppers):
         run = steppers[0].integrate(Q, velocity=V, t_end=6.0, tolerance=1e-9, events="q[1] - q[2]")
         assert len(run.events[0]) > 1
         signs = np.sign(run.events[0].q["q"][:, 1] - run.events[0].q["q"][:, 2])
@@ -265,7 +265,7 @@ class TestInputs:
         assert driven.depends_on_time
 
 
-def test_parameters_change_the_first_kick_of_an_explicit_method():
+def test_parameters_affect_the_first_kick_of_an_explicit_method():
     """Whose force is kept from the step before, which had another."""
     spring = sc.IndexedSystem.from_text(
         name="spring", coordinates=["q[N]"], parameters={"k": 1}, lagrangian="sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2)"
@@ -280,7 +280,7 @@ def test_parameters_change_the_first_kick_of_an_explicit_method():
     assert np.abs(run.q["q"] - other.q["q"]).max() < 1e-15
 
 
-def test_the_error_of_a_step_is_not_hidden_by_a_coefficient_that_passes_through_zero() -> None:
+def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""
     system = sc.IndexedSystem.from_text(
         name="quartic", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**4/4)"

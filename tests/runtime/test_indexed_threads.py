@@ -160,7 +160,7 @@ def test_every_term_is_counted_once(name: str, threads: int) -> None:
     ("name", "method"),
     [(name, "stoermer-verlet") for name in CASES] + [(name, "svi:4") for name in ("ring", "pairs", "net")],
 )
-def test_no_bit_depends_on_the_number_of_threads(name: str, method: str) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) -> None:
     found = [
         bits(stepper_of(name, method).integrate(start_of(name), h=0.01, steps=4, threads=threads, **CASES[name].given))
         for threads in THREADS
@@ -181,7 +181,7 @@ def test_iterative_methods_agree_with_leapfrog() -> None:
         np.testing.assert_allclose(ends[0].q["q"][-1], ends[1].q["q"][-1], rtol=0, atol=1e-9)
 
 
-def test_newtons_iteration() -> None:
+def test_newton_iteration_with_threads() -> None:
     stepper = stepper_of("ring", "svi:2", "newton")
     found = [bits(stepper.integrate(start_of("ring"), h=0.2, steps=3, threads=threads)) for threads in THREADS]
     assert found[1:] == found[:1] * (len(THREADS) - 1)
@@ -195,7 +195,7 @@ def test_adaptive_steps_with_threads() -> None:
     assert found[1:] == found[:1] * (len(THREADS) - 1)
 
 
-def test_hamiltonians_and_forces_of_velocities() -> None:
+def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
     field = sc.IndexedSystem.from_text(
         name="field",
         coordinates=["q[N]"],
@@ -227,7 +227,7 @@ def test_run_continues_with_other_threads() -> None:
     assert parts.copy_with_step(0.01).threads == 2
 
 
-def test_ctrl_c_ends_a_run_between_steps() -> None:
+def test_interrupt_ends_a_run_between_steps() -> None:
     run = stepper_of("pairs", "svi:4").start(start_of("pairs"), h=0.001, threads=3)
 
     def interrupt(done: int) -> None:
@@ -253,7 +253,7 @@ def test_forked_process_has_separate_threads() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_a_step_that_fails_fails_for_all() -> None:
+def test_failed_step_fails_in_all_threads() -> None:
     stepper = stepper_of("ring", "svi:4")
     said = set()
     for threads in THREADS:
@@ -320,7 +320,7 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], l
     return found
 
 
-def test_neighbouring_blocks_are_never_done_at_a_time(windows: dict[tuple[str, int], list[list[int]]]) -> None:
+def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tuple[str, int], list[list[int]]]) -> None:
     """Of a round; and every index is in one block."""
     several = 0
     for (what, size), each in windows.items():
@@ -383,7 +383,7 @@ int main(void)
     [(name, method, "fixed-point") for name in ("ring", "pairs", "net") for method in ("svi:4", "stoermer-verlet")]
     + [("ring", "svi:4", "newton")],
 )
-def test_threads_do_not_race(name: str, method: str, solver: str, tmp_path: Path) -> None:
+def test_threads_have_no_data_races(name: str, method: str, solver: str, tmp_path: Path) -> None:
     """By the thread sanitizer, where the compiler has it."""
     needs("setarch")
     source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")

@@ -83,7 +83,7 @@ def test_each_array_has_its_circulant_preconditioner():
 
 
 @pytest.mark.parametrize(("name", "shape", "most"), COUNTS)
-def test_ends_and_amplitudes_cost_few_products(name, shape, most):
+def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
     """The diagonal alone gives all of these up."""
     assert products_of(stepper_of(name), smooth(shape), 1.0, steps=3, parameters={"k": 1e4}) <= 3 * most
 
@@ -114,7 +114,7 @@ def test_corrections_are_accurate_in_badly_scaled_systems(name):
         run.advance(1)
 
 
-def test_no_bit_depends_on_the_number_of_threads():
+def test_results_do_not_depend_on_the_number_of_threads():
     ends = []
     for threads in (1, 2, 3):
         run = stepper_of("held plane").start(smooth((64, 60)), h=0.5, parameters={"k": 1e4}, threads=threads)

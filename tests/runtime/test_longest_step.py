@@ -30,7 +30,7 @@ def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(toleranc
     assert largest_step(stepper(), *START, -20.0, tolerance) == pytest.approx(-h)
 
 
-def test_steps_of_it_are_right_to_round_off_after_many_orbits() -> None:
+def test_largest_step_is_accurate_to_round_off_after_many_orbits() -> None:
     """Beside Kepler's ellipse, which closes."""
     h = largest_step(stepper(), *START, 100.0)
     run = stepper().integrate(*START, h=h, t_end=40 * np.pi)

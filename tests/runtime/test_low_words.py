@@ -247,7 +247,7 @@ def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
             assert abs(Fraction(two) + Fraction(one) - Fraction(str(x))) <= Fraction(abs(two)) / 2**52, name
 
 
-def test_work_is_the_sum_of_what_each_step_gives() -> None:
+def test_work_is_the_sum_over_steps() -> None:
     """Beside the exact sum, over steps that are taken again between kept states."""
     system = sc.LagrangianSystem.from_text(
         name="rubbed", coordinates=["x"], lagrangian="x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"}

@@ -48,7 +48,7 @@ def test_light_cart_is_accelerated_strongly(cart, method, tolerance):
     np.testing.assert_allclose(run.q[:, 0], (np.sin(1.0) - np.sin(run.q[:, 1])) / (1 + LIGHT), atol=allowed)
 
 
-def test_a_light_cart_by_its_hamiltonian(cart):
+def test_light_cart_by_its_hamiltonian(cart):
     run = sc.compile_stepper(sc.hamiltonian_of(cart), "gauss:8").integrate([0, 1], [0, 0], t_end=SPAN)
     assert run.q[-1, 1] == pytest.approx(angle_alone(), abs=1e-9)
     assert run.rejected_steps < 100

@@ -79,7 +79,7 @@ def check_refused(run: Any) -> None:
             enter()
 
 
-def test_a_scalar_run_that_is_recorded(stepper: sc.Stepper) -> None:
+def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
     with Held(run, lambda wait: run.record(10, progress=lambda _: wait())):
         check_refused(run)
@@ -88,7 +88,7 @@ def test_a_scalar_run_that_is_recorded(stepper: sc.Stepper) -> None:
         enter()
 
 
-def test_an_array_run_that_advances(arrays: sc.IndexedStepper) -> None:
+def test_advancing_array_run_belongs_to_one_thread(arrays: sc.IndexedStepper) -> None:
     run = arrays.start([1.0, 0.5], h=0.1)
     with Held(run, lambda wait: run.advance(1, progress=lambda _: wait())):
         check_refused(run)
@@ -97,7 +97,7 @@ def test_an_array_run_that_advances(arrays: sc.IndexedStepper) -> None:
         enter()
 
 
-def test_a_run_that_is_recorded_into_a_folder(stepper: sc.Stepper, tmp_path: Any) -> None:
+def test_run_recorded_into_a_folder_belongs_to_one_thread(stepper: sc.Stepper, tmp_path: Any) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
     with Held(run, lambda wait: sc.record_run(run, tmp_path / "run", steps=10, progress=lambda _: wait())):
         check_refused(run)

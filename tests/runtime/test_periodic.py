@@ -86,7 +86,7 @@ def _monodromy(orbit):
 
 
 @pytest.mark.parametrize("error", [0.01, -0.01, 0.02, -0.02, 0.05, -0.05])
-def test_an_unstable_orbit_is_found_from_a_velocity_some_percent_off(restricted, error):
+def test_unstable_orbit_is_found_from_an_inaccurate_velocity(restricted, error):
     """A Lyapunov orbit about L1: tangent vectors grow by 1190 in a period. The reference is shooting by DOP853."""
     x, speed, period = 0.8069, *_lyapunov_orbit(0.8069)
     guess = {"velocity": [0.0, (1.0 + error) * speed, 0.0], "period": period}
@@ -135,7 +135,7 @@ def test_pendulum_period_is_the_elliptic_integral():
     assert over.period == pytest.approx(2 * 2 / 2.5 * ellipk((2 / 2.5) ** 2), rel=1e-11)
 
 
-def test_orbits_of_a_galaxy_by_energy(galaxy):
+def test_galactic_orbits_are_found_by_energy(galaxy):
     """The stable one at y = 0.3 or so, the unstable one below; and turned by a third, as the potential may be."""
     energy = 1 / 8
     stable = periodic_orbit(galaxy, [0.0, 0.28], [0.4, 0.02], period=6.2, h=0.1, energy=energy)

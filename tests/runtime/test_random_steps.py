@@ -46,7 +46,7 @@ def check(name, method, solver, steps):
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_no_step_is_wrong_by_far_more_than_its_estimate(name):
+def test_step_errors_are_bounded_by_their_estimates(name):
     found = check(name, *QUICK[name], trials(name, 150))
     assert (found.errors > 1e-12).sum() > 10  # enough of them have an error to compare
 
@@ -54,7 +54,7 @@ def test_no_step_is_wrong_by_far_more_than_its_estimate(name):
 @pytest.mark.full
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
-def test_no_step_of_any_method_is(method, solver):
+def test_step_errors_of_all_methods_are_bounded_by_their_estimates(method, solver):
     """10,000 steps of each method that estimates the error of a step."""
     for name in FAMILIES:
         try:
@@ -82,7 +82,7 @@ def adaptive_ratio(name, method, solver, q, p, t, tolerance):
 
 
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
-def test_an_adaptive_run_of_an_array_begins_with_no_spurious_step(solver):
+def test_adaptive_array_run_starts_with_a_correct_step(solver):
     """The curve of a step of three periods is smooth: its end was off by 50 times the state, at an estimate of 0.02."""
     for method, q, p, tolerance in (
         ("svi:2", [-0.39936294, 0.54643295], [-1.0628843, -0.90845495], 0.0415577830),
@@ -96,7 +96,7 @@ def test_an_adaptive_run_of_an_array_begins_with_no_spurious_step(solver):
 @pytest.mark.full
 @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
 @pytest.mark.parametrize("method", ["svi:2", "svi:3", "svi:4", "svi:6", "svi:8", "gauss:3", "gauss:4"])
-def test_no_first_step_of_an_adaptive_run_of_an_array_is(method, solver):
+def test_adaptive_array_runs_start_with_correct_steps_full_sample(method, solver):
     """At tolerances above 1e-2 the half steps of an accepted step may differ from it by the whole state."""
     for name in (each for each in FAMILIES if isinstance(FAMILIES[each].system, sc.IndexedSystem)):
         random = np.random.default_rng(5)
@@ -138,7 +138,7 @@ def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
         assert error < 1e-2 or any(issubclass(each.category, sc.AccuracyWarning) for each in heard)
 
 
-def test_a_controlled_run_begins_with_no_spurious_step():
+def test_run_with_controller_starts_with_a_correct_step():
     """With 1e-2 allowed to a step, its curve tells less than that of steps of many periods."""
     stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "scvi:3")
     exact = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(12))

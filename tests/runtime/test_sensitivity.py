@@ -80,7 +80,7 @@ def by_differences(case, q, p, h, t):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_derivatives_by_all_that_a_step_starts_from(name):
+def test_derivatives_of_a_step_by_all_arguments(name):
     case, stepper, q, p, h = given(name)
     found, exact = stepper.sensitivity(q, p, h, T, stepper.defaults), by_differences(case, q, p, h, T)
     m, tolerance = len(q), BOUND if case.system.constraints else EXACT
@@ -122,7 +122,7 @@ def second_difference(case, start, direction, weights):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_second_derivatives_by_all_that_a_step_starts_from(name):
+def test_second_derivatives_of_a_step_by_all_arguments(name):
     """Along directions in which all entries count alike; and symmetric, by which all of them are told."""
     case, stepper, q, p, h = given(name)
     rng, start = np.random.default_rng(7), np.array([*q, *p, *stepper.defaults, T, h])
@@ -139,7 +139,7 @@ def test_second_derivatives_by_all_that_a_step_starts_from(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_products_are_those_of_the_jacobian(name):
+def test_vector_products_agree_with_the_jacobian(name):
     _, stepper, q, p, h = given(name)
     at, size = (q, p, h, T, stepper.defaults), 2 * len(q)
     found, vectors = stepper.jacobian(*at), np.random.default_rng(6).normal(size=(3, size))
@@ -216,7 +216,7 @@ def test_gradients_are_the_transpose_of_sensitivities(options):
     assert one.q.shape == (1,)
 
 
-def test_checkpoints_give_what_all_states_give():
+def test_gradient_with_checkpoints_equals_that_with_all_states():
     _, whole = driven(steps=2500)
     _, some = driven(steps=2500, save_every=500)
     seeds = np.zeros((len(whole), 2))

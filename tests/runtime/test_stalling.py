@@ -37,7 +37,7 @@ def test_solve_ivp_reports_a_zero_time_transformation():
 
 
 @pytest.mark.parametrize("monitor", ["frequency", "q1**2 + q2**2"])
-def test_close_encounters_are_none(monitor):
+def test_close_encounters_do_not_stop_a_run(monitor):
     stretched = sc.compile_stepper(sc.reparametrise(KEPLER, monitor), sc.SVI(8))
     run = stretched.integrate(*NEAR, h=0.1, t_end=7.0)
     assert run.t[-1] == 7.0

@@ -35,7 +35,7 @@ def test_display_of_adaptive_steps(stepper):
     assert repr(kept).endswith(f"{len(kept.t)} states from t = 0 to 2, {kept.steps} steps of adaptive size>")
 
 
-def test_steps_of_tau():
+def test_display_of_steps_in_tau():
     moon = sc.LagrangianSystem.from_text(
         name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
     )
@@ -47,13 +47,13 @@ def test_steps_of_tau():
 @pytest.mark.parametrize(
     ("method", "solver"), [("stoermer-verlet", "explicit"), ("gauss:2", "fixed-point"), ("svi:3", "newton")]
 )
-def test_the_solver_is_named(method, solver):
+def test_display_names_the_solver(method, solver):
     chosen = {"solver": "newton"} if solver == "newton" else {}
     run = sc.compile_stepper(FREE, method, flags=QUICK_FLAGS, **chosen).start([1.0], [0.0], h=0.1)
     assert f"solver {solver}>" in repr(run)
 
 
-def test_inputs_that_are_missing():
+def test_display_names_missing_inputs():
     stepper = sc.compile_stepper(PUSHED, "svi:2", flags=QUICK_FLAGS)
     run = stepper.start([1.0], [0.0], h=0.1)
     assert repr(run).endswith("inputs not set: u>")

@@ -51,7 +51,7 @@ def kepler(compiled):
 
 
 @each_method
-def test_a_run_is_repeated_steps(sample, compiled, method):
+def test_run_equals_repeated_steps(sample, compiled, method):
     stepper, (q, p) = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
     run = stepper.integrate(q, p, h=0.05, steps=40, t=0.3)
     for k in range(40):
@@ -61,7 +61,7 @@ def test_a_run_is_repeated_steps(sample, compiled, method):
     assert np.abs(run.p[-1] - p).max() < 1e-13
 
 
-def test_a_run_rounds_less_than_repeated_steps(sample, compiled):
+def test_run_has_smaller_rounding_errors_than_repeated_steps(sample, compiled):
     """Against the oracle: a hundred small steps of leapfrog, rounded only once at the end."""
     case, h, count = sample("planar-pendulum"), 2.0**-7, 200
     stepper = compiled("planar-pendulum", StoermerVerlet())
@@ -98,14 +98,14 @@ def test_a_trajectory_begins_with_the_initial_state_and_has_float64_arrays(keple
     assert (run.iterations[1:] > 0).all()
 
 
-def test_no_steps_give_the_initial_state(kepler):
+def test_zero_steps_return_the_initial_state(kepler):
     run = kepler.integrate(*STATE, h=0.1, steps=0)
     assert np.array_equal([run.q[0], run.p[0]], STATE)
     assert len(run) == 1
 
 
 @pytest.mark.parametrize("save_every", [1, 2, 7, 300, 1000, 5000])
-def test_every_thins_the_same_run(kepler, save_every):
+def test_save_every_selects_states_of_the_same_run(kepler, save_every):
     """1000 steps are several calls into C: their seams must not show."""
     dense, thin = (kepler.integrate(*STATE, h=0.05, steps=1000, save_every=e) for e in (1, save_every))
     assert np.array_equal(thin.q, dense.q[::save_every])
@@ -135,7 +135,7 @@ def test_symmetric_method_returns_along_its_trajectory(sample, compiled, method)
 
 
 @each_method
-def test_a_restored_run_continues_bit_for_bit(sample, compiled, method):
+def test_restored_run_continues_bitwise(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
     one = stepper.start(*state, h=0.05, t=0.3)
     one.record(123)
@@ -154,7 +154,7 @@ def test_run_in_chunks_equals_one_run(kepler):
     assert np.array_equal(parts[-1].p[0], whole.p[40])
 
 
-def test_every_counts_from_the_start_of_the_run(kepler):
+def test_save_every_counts_from_the_start_of_the_run(kepler):
     run = kepler.start(*STATE, h=0.05)
     run.record(5)
     assert run.record(10, save_every=4).t == pytest.approx(0.05 * np.array([5, 8, 12]))
@@ -201,7 +201,7 @@ def test_bytes_of_wrong_length_are_rejected(kepler):
         (([1.0, 0.0], [0.0, 1.0], 0.1, 0.0, ["heavy"]), "parameters"),
     ],
 )
-def test_a_wrong_argument_is_named(kepler, arguments, words):
+def test_invalid_argument_is_named(kepler, arguments, words):
     with pytest.raises(StateError, match=words):
         kepler.step(*arguments)
     q, p, h, *rest = arguments
@@ -219,13 +219,13 @@ def test_a_wrong_argument_is_named(kepler, arguments, words):
         ({"steps": 3, "t": np.nan}, "t is nan"),
     ],
 )
-def test_wrong_counts_and_times_are_named(kepler, arguments, words):
+def test_invalid_counts_and_times_are_named(kepler, arguments, words):
     with pytest.raises(StateError, match=words):
         kepler.integrate(*STATE, h=0.1, **arguments)
 
 
 @pytest.mark.parametrize("t", [np.nan, np.inf, "late"])
-def test_a_time_that_is_no_number_is_named(kepler, t):
+def test_time_that_is_not_a_number_is_named(kepler, t):
     with pytest.raises(StateError, match=r"\bt\b"):
         kepler.step(*STATE, 0.1, t)
     with pytest.raises(StateError, match=r"\bt\b"):
@@ -243,7 +243,7 @@ def test_energies_need_one_time_or_one_for_each_state(kepler):
         kepler.energy(np.ones((3, 2)), np.ones((3, 2)), [0.0, 1.0])
 
 
-def test_impossible_options_are_refused():
+def test_invalid_options_are_rejected():
     with pytest.raises(StateError, match="max_iterations must be a whole number"):
         SolverOptions(max_iterations=2.5)
     with pytest.raises(StateError, match="tolerance must be positive"):
@@ -291,7 +291,7 @@ def falling(compiled):
     return compiled("kepler", SVI(4)), ([1.0, 0.0], [-0.5, 1e-9])
 
 
-def test_a_failing_run_gives_its_states_so_far_and_stays_before_the_failing_step(compiled):
+def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(compiled):
     stepper, state = falling(compiled)
     run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
     with pytest.raises(StepFailedError) as caught:
@@ -329,7 +329,7 @@ def test_failed_run_continues_with_other_options(compiled):
 # Convergence.
 
 
-def test_the_relative_rule_does_not_depend_on_units(compiled):
+def test_relative_tolerance_does_not_depend_on_units(compiled):
     """Lengths in units 2^30 times smaller, time unchanged: the same bits, but for the exponent."""
     stepper, scale = compiled("kepler", SVI(3)), 2.0**30
     q, p = stepper.integrate(*STATE, h=0.1, steps=20).q, stepper.integrate(*STATE, h=0.1, steps=20).p
@@ -340,14 +340,14 @@ def test_the_relative_rule_does_not_depend_on_units(compiled):
     assert np.abs(large.p / scale - p).max() < 1e-14
 
 
-def test_a_looser_tolerance_saves_iterations_and_costs_digits(kepler):
+def test_looser_tolerance_needs_fewer_iterations_and_loses_digits(kepler):
     tight = kepler.integrate(*STATE, h=0.2, steps=50)
     loose = kepler.integrate(*STATE, h=0.2, steps=50, options=SolverOptions(tolerance=1e-4))
     assert loose.iterations.sum() < tight.iterations.sum()
     assert 1e-13 < np.abs(loose.q - tight.q).max() < 1e-2
 
 
-def test_the_absolute_rule_compares_the_update_itself(kepler):
+def test_absolute_tolerance_bounds_the_update(kepler):
     """Lengths in units 2^30 times smaller make the same update 2^30 times larger, and a given bound harder to meet."""
     scale = 2.0**30
     large = {"q": np.multiply(scale, STATE[0]), "p": np.multiply(scale, STATE[1]), "parameters": {"mu": scale**3}}
@@ -369,7 +369,7 @@ def test_the_absolute_rule_compares_the_update_itself(kepler):
 
 
 @pytest.mark.parametrize("name", ["kepler", "pumped-cart-pole", "charged-particle", "relativistic-particle"])
-def test_momentum_and_velocity_are_inverse_and_the_oracles(sample, compiled, name):
+def test_momentum_and_velocity_are_inverse_and_agree_with_the_oracle(sample, compiled, name):
     case, stepper = sample(name), compiled(name, SVI(3))
     q, p = case.state
     v = stepper.velocity(q, p, 0.7)
@@ -410,7 +410,7 @@ def test_energy_is_p_v_minus_l(sample, compiled, name):
     assert isinstance(stepper.energy(q, p, 0.7), float)
 
 
-def test_energies_of_many_states_are_those_of_each(sample, compiled):
+def test_energies_of_many_states_equal_single_energies(sample, compiled):
     stepper = compiled("pumped-cart-pole", SVI(3))
     run = stepper.integrate(*sample("pumped-cart-pole").state, h=0.1, steps=9)
     each = [stepper.energy(q, p, t) for q, p, t in zip(run.q, run.p, run.t, strict=True)]
@@ -420,12 +420,12 @@ def test_energies_of_many_states_are_those_of_each(sample, compiled):
     assert stepper.energy(run.q[::2], run.p[::2], run.t[::2]) == pytest.approx(each[::2], abs=0.0)
 
 
-def test_states_of_the_wrong_shape_have_no_energy(kepler):
+def test_states_of_wrong_shape_are_rejected_by_energy(kepler):
     with pytest.raises(StateError, match=r"states must have shape \(n, 2\)"):
         kepler.energy([[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]])
 
 
-def test_an_energy_that_does_not_exist_is_an_error(compiled):
+def test_undefined_energy_is_an_error(compiled):
     with pytest.raises(StateError, match="energy of a state cannot be computed"):
         compiled("kepler", SVI(3)).energy([0.0, 0.0], [1.0, 0.0])
 
@@ -490,7 +490,7 @@ def test_the_discrete_lagrangian_approximates_the_action_of_the_trajectory(compi
 
 
 @each_action
-def test_the_two_point_form_walks_the_same_positions(sample, compiled, method):
+def test_two_point_form_gives_the_same_positions(sample, compiled, method):
     stepper, state = compiled("pumped-cart-pole", method), sample("pumped-cart-pole").state
     run = stepper.integrate(*state, h=0.1, steps=2, t=0.3)
     following = stepper.step_positions(run.q[0], run.q[1], 0.1, 0.3)
@@ -520,7 +520,7 @@ def test_the_discrete_lagrangian_of_an_explicit_step_is_the_trapezoidal_sum(syst
     assert "newton" not in stepper.source.code
 
 
-def test_an_action_that_does_not_exist_is_an_error(compiled):
+def test_undefined_action_is_an_error(compiled):
     with pytest.raises(StepFailedError):
         compiled("kepler", StoermerVerlet()).discrete_lagrangian([0.0, 0.0], [1.0, 0.0], 0.1)
 
@@ -554,7 +554,7 @@ def test_threads_with_different_parameters_are_independent(kepler):
     assert np.array_equal(found, [final(mu) for mu in values])
 
 
-def test_a_pickled_stepper_is_the_same_stepper(kepler):
+def test_pickled_stepper_is_equal(kepler):
     copy = pickle.loads(pickle.dumps(kepler))
     assert (copy.title, copy.coordinates, copy.parameters) == (kepler.title, ("q1", "q2"), ("mu",))
     assert np.array_equal(copy.step(*STATE, 0.1), kepler.step(*STATE, 0.1))
@@ -582,7 +582,7 @@ def test_fixed_point_iteration_starts_from_rest(name, method):
 @pytest.mark.parametrize(
     ("t_end", "more", "steps"), [(1.0, {}, 4), (0.9, {}, 3), (0.9, {"save_every": 2}, 3), (-1.0, {}, 4), (0.2, {}, 1)]
 )
-def test_the_shorter_last_step_of_a_run_to_t_end_is_counted_as_for_arrays(t_end, more, steps):
+def test_shortened_last_step_to_t_end_is_counted_as_for_arrays(t_end, more, steps):
     scalar = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     arrays = IndexedSystem.from_text(
         name="o", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2)"

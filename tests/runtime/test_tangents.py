@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scvi_codegen import SVI, StateError, compile_stepper, problem
 
 
-def test_runs_carry_directions():
+def test_runs_propagate_tangent_vectors():
     """A chain of steps against differences of whole runs; with steps between kept states, and of their own lengths."""
     stepper = compile_stepper(problem("double-pendulum").system, SVI(4))
     start = np.array([0.9, -0.6, 1.0, 0.5])
@@ -29,7 +29,7 @@ def test_runs_carry_directions():
     assert_allclose(free.tangent()[-1], derivative[-1], rtol=2e-4, atol=2e-4 * np.abs(derivative[-1]).max())
 
 
-def test_a_keplerian_orbit_returns_with_its_shear():
+def test_kepler_orbit_has_the_exact_shear_after_a_period():
     """After a period all multipliers are 1, and only the phase drifts with the energy: M - 1 has rank one."""
     entry = problem("kepler")
     stepper = compile_stepper(entry.system, SVI(8))

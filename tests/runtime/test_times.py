@@ -58,7 +58,7 @@ def test_runs_and_ensembles_have_the_same_times(free):
     assert np.array_equal(free.integrate_ensemble([[0.1]], [[0.0]], h=0.1, steps=500, t=0.3).t, run.t)
 
 
-def test_a_run_restored_has_the_time_it_had(free):
+def test_restored_run_has_the_same_time(free):
     run = free.start([0.1], [0.0], h=0.1, t=0.3)
     run.advance(1234)
     again = free.from_checkpoint(run.checkpoint())
@@ -76,7 +76,7 @@ def test_states_store_the_following_step_size(free):
     assert ended.step_sizes[-1] == 0.25
 
 
-def test_spans_are_made_of_equal_steps_none_of_them_longer():
+def test_spans_are_divided_into_equal_steps_below_the_maximum():
     assert steps_within([0.3, 0.30001, 1e-9, 0.1], 0.1).tolist() == [3, 4, 1, 1]
     assert steps_within([2.1, 5.4], -0.3).tolist() == [7, 18]  # the quotients are more, by rounding alone
     with pytest.raises(StateError, match=r"h = 1e-12 requires 1e\+12 steps"):

@@ -163,7 +163,7 @@ def test_products_and_transposes() -> None:
         (lambda: continuation((0, 1), 3), "degree 3 must be between 0 and 2 for 3 points"),
     ],
 )
-def test_impossible_requests_are_refused(call: object, message: str) -> None:
+def test_invalid_requests_are_rejected(call: object, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         call()
 

@@ -119,7 +119,7 @@ def test_closed_forms_are_radicals_of_the_same_value(name: str, degrees: list[in
             assert abs(mp.mpf(str(sp.N(expression, 60))) - point) < FIFTY_DIGITS
 
 
-def test_no_closed_form_where_there_is_no_short_one_or_where_the_user_made_the_nodes() -> None:
+def test_long_and_user_defined_nodes_have_no_closed_form() -> None:
     assert exact_points(chebyshev_lobatto(7)) is None
     assert exact_points(legendre_lobatto(6)) is None
     assert exact_points(legendre_gauss(5)) is None
@@ -147,14 +147,14 @@ def test_non_finite_and_non_real_numbers_are_rejected(value: object) -> None:
 
 @pytest.mark.parametrize("name", NODE_FAMILIES)
 @pytest.mark.parametrize(("degree", "message"), [(0, "at least 1, not 0"), (2.0, "not 2.0"), (True, "not True")])
-def test_a_degree_that_is_no_positive_integer_is_refused(name: str, degree: object, message: str) -> None:
+def test_nonpositive_and_noninteger_degrees_are_rejected(name: str, degree: object, message: str) -> None:
     nodes_by_name(name, 2)
     nodes_by_name(name, 1)
     with pytest.raises(MethodError, match=message):
         nodes_by_name(name, degree)  # type: ignore[arg-type]  # the wrong type is the point
 
 
-def test_an_unknown_family_names_the_closest_and_all_others() -> None:
+def test_unknown_family_suggests_the_closest_and_lists_all() -> None:
     with pytest.raises(MethodError, match=r"did you mean 'chebyshev-lobatto'.*legendre-gauss"):
         nodes_by_name("chebyshev_lobato", 3)
 
@@ -169,12 +169,12 @@ def test_an_unknown_family_names_the_closest_and_all_others() -> None:
         (0, (0,), "at least 1"),
     ],
 )
-def test_bad_points_are_refused(degree: int, points: tuple[float, ...], message: str) -> None:
+def test_invalid_points_are_rejected(degree: int, points: tuple[float, ...], message: str) -> None:
     with pytest.raises(MethodError, match=message):
         Nodes(name="mine", degree=degree, points=points)
 
 
-def test_the_users_precision_neither_matters_nor_changes() -> None:
+def test_user_precision_has_no_effect_and_is_not_changed() -> None:
     import mpmath
 
     with mpmath.workdps(5):

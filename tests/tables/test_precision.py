@@ -28,7 +28,7 @@ def test_precision_is_local_to_a_thread():
     assert mp.dps == DIGITS
 
 
-def test_the_precision_of_users_is_theirs():
+def test_user_precision_is_restored():
     with mpmath.workdps(5):
         assert mp.nstr(mp.sqrt(2), DIGITS) == ROOT
     with mp.workdps(5):

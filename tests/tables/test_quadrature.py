@@ -127,14 +127,14 @@ def test_closed_forms_have_the_value_of_the_rule(rule: Quadrature) -> None:
             assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
 
 
-def test_a_rule_of_the_users_has_no_closed_form() -> None:
+def test_user_defined_rule_has_no_closed_form() -> None:
     third = Fraction(1, 3)
     assert exact_rule(Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))) is None
     assert exact_rule(Quadrature(name="gauss-legendre:1", points=(0.5,), weights=(2,))) is None
     assert exact_rule(Quadrature(name="gauss-legendre:3", points=(0,), weights=(2,))) is None
 
 
-def test_the_order_of_a_users_rule_is_computed() -> None:
+def test_order_of_a_user_defined_rule_is_computed() -> None:
     third = Fraction(1, 3)
     simpson = Quadrature(name="Simpson", points=(-1, 0, 1), weights=(third, 4 * third, third))
     assert (simpson.order, simpson.symmetric) == (4, True)

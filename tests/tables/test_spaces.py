@@ -42,7 +42,7 @@ def final_error(system, method, start, *, h, steps, reference):
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_curves_of_the_space_are_reproduced(space, degree, curve, derivative) -> None:
+def test_functions_of_the_space_are_interpolated_exactly(space, degree, curve, derivative) -> None:
     """From its velocities at the space's points each curve follows at any other, to 50 digits."""
     with mp.workdps(60):
         points = space.points(degree, gauss_legendre(degree + 2))
@@ -97,7 +97,7 @@ def test_names_read_back(name: str) -> None:
         (lambda: SVI(3, space=7), "space must be a CurveSpace"),  # type: ignore[arg-type]
     ],
 )
-def test_refused_spaces(make, message: str) -> None:
+def test_invalid_spaces_are_rejected(make, message: str) -> None:
     with pytest.raises(MethodError, match=message):
         make()
 
@@ -133,7 +133,7 @@ ORDERS = (
 
 
 @pytest.mark.parametrize(("method", "order"), ORDERS, ids=lambda value: getattr(value, "name", value))
-def test_order(method: SVI, order: int) -> None:
+def test_order_of_methods_on_other_spaces(method: SVI, order: int) -> None:
     system, start = problem("planar-pendulum").system, ([1.0], [0.3])
     fine = stepper(system, SVI(10)).integrate(*start, h=0.25, steps=16)
     steps = (5, 10) if order == 8 else (10, 20)

@@ -117,7 +117,7 @@ def test_table_3_gauss_of_order_8_with_its_entry_34_corrected() -> None:
         (lobatto_iiia, True, True, False, False),
     ],
 )
-def test_table_4(
+def test_table_4_is_reproduced(
     family: object, s: int, a_stable: bool, symmetric: bool, symplectic: bool, superconvergent: bool
 ) -> None:
     tableau = family(s)
@@ -173,7 +173,7 @@ def test_the_order_is_that_of_the_error_of_one_step_on_a_nonlinear_equation(tabl
     assert abs(derivative - (tableau.order + 1)) < 0.05
 
 
-def test_textbook_tableaux() -> None:
+def test_textbook_tableaux_are_reproduced() -> None:
     third, r = sp.Rational(1, 3), sp.sqrt(6)
     A = [
         [(88 - 7 * r) / 360, (296 - 169 * r) / 1800, (-2 + 3 * r) / 225],
@@ -207,7 +207,7 @@ def test_closed_forms_have_the_value_of_the_tableau(tableau: Tableau) -> None:
                 assert abs(mp.mpf(str(sp.N(expression, 60))) - number) < FIFTY_DIGITS
 
 
-def test_a_tableau_of_the_users_has_no_closed_form() -> None:
+def test_user_defined_tableau_has_no_closed_form() -> None:
     assert exact_tableau(Tableau(name="gauss:1", A=((1,),), b=(1,), c=(1,))) is None
     assert exact_tableau(Tableau(name="lobatto-iiia:1", A=((1,),), b=(1,), c=(1,))) is None
     assert exact_tableau(collocation_tableau((0, HALF))) is None
@@ -308,7 +308,7 @@ def test_the_theta_method_is_a_stable_from_one_half_on(theta: Fraction) -> None:
     ),
     sign=st.sampled_from([1, -1]),
 )
-def test_nonnegativity_sees_the_multiplicity_of_roots(roots: list[tuple[int, int]], sign: int) -> None:
+def test_nonnegativity_accounts_for_multiplicity_of_roots(roots: list[tuple[int, int]], sign: int) -> None:
     polynomial = NumpyPolynomial([sign])
     for root, multiplicity in roots:
         polynomial *= NumpyPolynomial([-root, 1]) ** multiplicity
@@ -341,13 +341,13 @@ def test_radau_iia_agrees_with_the_abscissae_of_scipy(s: int) -> None:
         (lambda: collocation_tableau(range(65)), "65 abscissae are too many: use at most 64"),
     ],
 )
-def test_impossible_requests_are_refused(call: object, message: str) -> None:
+def test_invalid_requests_are_rejected(call: object, message: str) -> None:
     gauss(2)
     with pytest.raises(MethodError, match=message):
         call()
 
 
-def test_the_euler_method_has_a_name_too() -> None:
+def test_euler_method_is_a_named_tableau() -> None:
     assert tableau_by_name("explicit-euler") is explicit_euler()
 
 
@@ -361,7 +361,7 @@ def test_the_euler_method_has_a_name_too() -> None:
         ([0.1, 0.5, 0.9 + 1e-14], None, 3, False),
     ],
 )
-def test_floats_are_taken_for_the_numbers_that_they_are_roundings_of(floats, meant, order, symmetric):
+def test_floats_are_read_as_the_numbers_they_round(floats, meant, order, symmetric):
     tableau = collocation_tableau(floats)
     assert (tableau.order, tableau.is_symmetric) == (order, symmetric)
     if meant is not None:

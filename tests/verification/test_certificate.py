@@ -55,19 +55,19 @@ def caught(mutation: Mutation) -> tuple[Check, ...]:
 
 
 @pytest.mark.parametrize("mutation", [one for one in MUTATIONS if one.name in QUICK], ids=lambda one: one.name)
-def test_a_fault_is_caught(mutation: Mutation) -> None:
+def test_planted_fault_is_detected(mutation: Mutation) -> None:
     assert caught(mutation)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda one: one.name)
-def test_every_fault_is_caught(mutation: Mutation, record_property) -> None:
+def test_every_planted_fault_is_detected(mutation: Mutation, record_property) -> None:
     found = caught(mutation)
     record_property("caught by", ", ".join(check.name for check in found))
     assert found
 
 
-def test_faults_find_their_text() -> None:
+def test_planted_faults_find_their_source_lines() -> None:
     """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
     texts = [path.read_text("utf-8") for path in ROOT.glob("templates/support/*.h")]
     places = {what: inside(within, pattern) for what, _, within, pattern, _ in C_TEXT}
@@ -92,7 +92,7 @@ def test_unmodified_systems_pass(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["wire/lobatto-svi", "sleigh/lobatto-svi", pytest.param("linkage/lobatto-svi", marks=pytest.mark.full)]
 )
-def test_constrained_motions_are_certified(name: str) -> None:
+def test_constrained_systems_are_certified(name: str) -> None:
     """Against the motion that index reduction gives in 60 digits, along the constrained phase space."""
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
@@ -102,7 +102,7 @@ def test_constrained_motions_are_certified(name: str) -> None:
     assert ("symplecticity" in kept) == name.startswith("wire")
 
 
-def test_inputs_are_certified_as_what_they_are_between_breakpoints() -> None:
+def test_inputs_are_certified_between_breakpoints() -> None:
     system, stepper = pushed_pendulum(), compile_stepper(pushed_pendulum(), SVI(2), flags=QUICK_FLAGS)
     for given in ({}, {"q": [0.6], "p": [-0.3], "stepper": stepper}):
         certificate = verify(system, SVI(2), flags=QUICK_FLAGS, **given)
@@ -132,7 +132,7 @@ def test_a_certificate_is_text_json_and_a_verdict(tmp_path: Path) -> None:
     assert "all measured properties are satisfied" in certificate.to_text()
 
 
-def test_a_state_is_found_where_none_is_given() -> None:
+def test_missing_state_is_generated() -> None:
     certificate = verify(problem("planar-pendulum").system, Gauss(2), flags=QUICK_FLAGS, solver="newton")
     assert certificate.passed
     assert certificate.h > 0
@@ -148,7 +148,7 @@ def test_inputs_are_certified_at_small_values(method) -> None:
     assert len(certificate.checks) > 15
 
 
-def test_constraints_are_certified_under_inputs_that_stay_what_they_are() -> None:
+def test_constraints_are_certified_with_constant_inputs() -> None:
     """Cubics of time would push with 5000 after 50 units of it, and steps fail."""
     pushed = LagrangianSystem.from_text(
         name="pushed rod",
@@ -198,7 +198,7 @@ def violated(error: Exception) -> Finding:
 # What it measures with.
 
 
-def test_the_exact_motion_is_exact() -> None:
+def test_exact_solution_is_exact() -> None:
     oscillator = problem("harmonic-oscillator").system
     q, p = exact_motion(oscillator).flow([1.0], [0.0], 2)
     assert abs(q[0] - mp.cos(2)) < mp.mpf("1e-43")
@@ -236,7 +236,7 @@ def command(*words: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_verify_a_model_file_and_what_was_generated_from_it(tmp_path: Path) -> None:
+def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> None:
     entry = problem("planar-pendulum")
     model = Model(system=entry.system, method=SVI(2), q=(0.7,), velocity=(0.1,), h=0.2, steps=10)
     save_model(model, tmp_path / "pendulum.toml")

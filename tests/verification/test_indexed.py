@@ -81,7 +81,7 @@ def certificate(name: str, method: str) -> sc.Certificate:
     ("name", "method"),
     [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2"), ("damped", "svi:2")],
 )
-def test_sound_integrators_pass(name: str, method: str) -> None:
+def test_correct_integrators_pass(name: str, method: str) -> None:
     """Each promise is measured, but for velocities of a Hamiltonian."""
     found = certificate(name, method)
     assert found.passed, found.to_text()
@@ -122,7 +122,7 @@ QUICK = ("a ring that closes one place off",)
 
 
 @pytest.mark.parametrize(("name", "method"), sorted({fault[:2] for fault in FAULTS.values()}))
-def test_faults_find_their_text(name: str, method: str) -> None:
+def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
     """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
     system = sc.IndexedSystem.from_text(name=name, **SYSTEMS[name][0])
     code = indexed_compiler.generate_indexed(system, method)[0].amalgamated().code
@@ -133,7 +133,7 @@ def test_faults_find_their_text(name: str, method: str) -> None:
 @pytest.mark.parametrize(
     "fault", [pytest.param(name, marks=() if name in QUICK else pytest.mark.full) for name in FAULTS]
 )
-def test_faults_are_caught(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """One at a time, in the text of the loops."""
     name, method, pattern, replacement = FAULTS[fault]
     edits = 0
@@ -151,7 +151,7 @@ def test_faults_are_caught(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.violated, found.to_text()
 
 
-def test_a_model_file_is_verified(tmp_path: Path) -> None:
+def test_model_file_is_verified(tmp_path: Path) -> None:
     """Beside it lies the certificate; the exit status is 0."""
     path = tmp_path / "oscillators.toml"
     path.write_text(

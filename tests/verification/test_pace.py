@@ -46,7 +46,7 @@ def test_local_error_of_run_steps_is_measured(name: str) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", PACES)
-def test_certificates_have_it(name: str) -> None:
+def test_certificates_contain_the_local_error(name: str) -> None:
     given, promises = PACES[name]
     stepper = compile_stepper(given.system, given.method(), flags=QUICK_FLAGS, monitor=given.monitor)
     certificate = verify(
