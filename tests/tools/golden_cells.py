@@ -1,0 +1,359 @@
+"""Programs whose results are compared bit by bit with those of the C sources recorded in ``sources.json.xz``.
+
+A cell is a system, a method and a kind of run. Its recorded source and the one that the package generates now are
+compiled with the same flags on the same machine and run by the same steps, so that no recorded number depends on libm.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import re
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import samples
+from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
+
+from scvi_codegen.compiler import _Sources, generate_source
+from scvi_codegen.indexed_compiler import _IndexedSources
+from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods import as_method
+from scvi_codegen.models.problems import problem
+from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.rendering.program_source import render_ensemble
+from scvi_codegen.rendering.source import Source
+
+__all__ = ["CELLS", "FLAGS", "RECORDED", "TIMED", "Program", "build", "output", "program", "recorded"]
+
+RECORDED = Path(__file__).parents[1] / "golden" / "sources.json.xz"
+FLAGS = ("-std=gnu99", "-O0", "-ffp-contract=off", "-w", "-DSCVI_THREADS", "-pthread")
+"""Neither contraction nor other freedoms: the bits do not depend on the level of optimisation."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """C source of an integrator in one file, its header, and a main program."""
+
+    prefix: str
+    header: str
+    code: str
+    main: str
+
+    @property
+    def files(self) -> dict[str, str]:
+        return {f"{self.prefix}.h": self.header, f"{self.prefix}.c": self.code, "main.c": self.main}
+
+
+def of_source(source: Source | None, main: str) -> Program:
+    assert source is not None
+    whole = source.amalgamated()
+    return Program(whole.prefix, whole.header, whole.code, main)
+
+
+def sources_of(system: MechanicalSystem, method: str, prefix: str, solver: str, monitor: str | None) -> _Sources:
+    return _Sources(system, as_method(method, system), solver, prefix, (), monitor)
+
+
+def single(
+    name: str,
+    system: Callable[[], MechanicalSystem],
+    *,
+    method: str,
+    q: tuple[float, ...],
+    p: tuple[float, ...],
+    h: float,
+    steps: int = 1000,
+    kind: str = "fixed",
+    solver: str = "auto",
+    monitor: str | None = None,
+    tolerance: float = 0.0,
+    t_end: float = 20.0,
+) -> Program:
+    """A run of a system with named coordinates."""
+    found = system()
+    sources = sources_of(found, method, name, solver, monitor)
+    parameters = found.defaults
+    if kind == "ensemble":
+        source = sources.remembered("ensemble", lambda: render_ensemble(sources.program()))()
+        return of_source(source, ensemble_driver(f"{name}_ensemble", q, p, parameters, h, steps))
+    if kind in ("tangent", "second"):
+        second = kind == "second"
+        source = sources.remembered(kind, partial(sources.tangent, second=second))()
+        return of_source(source, tangent_driver(source.prefix, q, p, parameters, h, 4, second=second))
+    if kind == "embedded":
+        source = generate_source(found, as_method(method, found), prefix=name, embedded="double")[0]
+        return of_source(source, run_driver(name, q, p, parameters, h, steps))
+    if kind == "adaptive":
+        source = sources.remembered("controlled", sources.controlled)()
+        return of_source(source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance))
+    source = sources.remembered("fallback", sources.fallback)() or sources.remembered("plain", sources._rendered)()
+    return of_source(source, run_driver(name, q, p, parameters, h, steps))
+
+
+def arrays(
+    name: str,
+    system: Callable[[], IndexedSystem],
+    *,
+    method: str,
+    sizes: tuple[int, ...],
+    h: float,
+    steps: int = 1000,
+    solver: str = "fixed-point",
+    adaptive: bool = False,
+    threads: int = 0,
+    tolerance: float = 0.0,
+    tables: tuple[tuple[int, ...], ...] = (),
+    constrained: bool = False,
+) -> Program:
+    """A run of a system with array coordinates."""
+    found = system()
+    sources = _IndexedSources(found, as_method(method, one_coordinate(found)), name, solver)
+    main = arrays_driver(
+        name,
+        sizes,
+        tables,
+        len(found.fields),
+        found.defaults,
+        h,
+        steps,
+        threads=threads,
+        t_end=20.0 if adaptive else 0.0,
+        tolerance=tolerance,
+        constrained=constrained,
+    )
+    return of_source(sources.controlled if adaptive else sources.plain, main)
+
+
+def catalogue(name: str) -> Callable[[], MechanicalSystem]:
+    return lambda: problem(name).system
+
+
+def rods() -> LagrangianSystem:
+    return LagrangianSystem.from_text(
+        name="rods",
+        coordinates=["x1", "y1", "x2", "y2"],
+        lagrangian="2*(x1_dot**2 + y1_dot**2)/2 + (x2_dot**2 + y2_dot**2)/2 - 3*(2*y1 + y2)",
+        constraints=["x1**2 + y1**2 = 1", "(x2 - x1)**2 + (y2 - y1)**2 = 1"],
+    )
+
+
+def transformed() -> MechanicalSystem:
+    return reparametrise(problem("kepler").system, "sqrt(q1**2 + q2**2)")
+
+
+def vibration() -> HamiltonianSystem:
+    return HamiltonianSystem.from_text(
+        name="vibration",
+        coordinates=["x", "y"],
+        momenta=["u", "v"],
+        hamiltonian="(1 + x**2)*u**2/2 + v**2*(1 + u**2)/2 + x**2/2 + y**4/4 + x*y/3",
+    )
+
+
+def rubbed() -> LagrangianSystem:
+    return LagrangianSystem.from_text(
+        name="rubbed",
+        coordinates=["x", "y"],
+        lagrangian="(x_dot**2 + 2*y_dot**2)/2 - x**2 - (x - y)**4/4",
+        parameters={"c": 0.05},
+        forces={"x": "-c*x_dot*y**2 + cos(t)", "y": "-c*y_dot"},
+    )
+
+
+def ring() -> IndexedSystem:
+    return IndexedSystem.from_text(
+        name="ring",
+        coordinates=["q[N]"],
+        parameters={"beta": 0.25},
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2"
+        " + beta*(q[i+1] - q[i])**4/4)",
+    )
+
+
+def forms() -> IndexedSystem:
+    return IndexedSystem.from_text(
+        name="forms",
+        coordinates=["u[NX, NY]", "q[N]"],
+        parameters={"m[N]": 1, "k[B]": 1, "g": 0.5},
+        tables=["bonds[B, 2]"],
+        lagrangian="sum(i in NX, j in NY, u_dot[i, j]**2/2 - u[i, j]**2) + sum(i in N, m[i]*q_dot[i]**2/2 - q[i]**4)"
+        " - sum(i in NX periodic, j in NY, u[i-1, j]*u[i+2, j]*cos(g*t)/9)"
+        " - sum(i < j in N, sqrt(1 + (q[i] - q[j])**2))"
+        " - sum(b in B, k[b]*(q[bonds[b, 0]] - q[bonds[b, 1]])**2)",
+    )
+
+
+def rubbed_ring() -> IndexedSystem:
+    return IndexedSystem.from_text(
+        name="rubbed ring",
+        coordinates=["q[N]"],
+        parameters={"c": 0.01},
+        lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))",
+        forces={"q[i]": "-c*q_dot[i]*(1 + q[i]**2)", "q[0]": "cos(t)"},
+    )
+
+
+def rotors() -> IndexedSystem:
+    return IndexedSystem.from_text(
+        name="rotors",
+        coordinates=["q[N]"],
+        parameters={"m[N]": 1},
+        hamiltonian="sum(i in N, p_q[i]**2/2*(1 + q[i]**2/9) + m[i]*q[i]**2/2)"
+        " + sum(i in N periodic, (q[i+1] - q[i])**4/4)",
+    )
+
+
+def swings() -> IndexedSystem:
+    return IndexedSystem.from_text(
+        name="swings",
+        coordinates=["r[N, 2]"],
+        lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
+        constraints=["r[i, 0]**2 + (r[i, 1] - 2)**2 = 1 for i in N"],
+    )
+
+
+BONDS = (tuple(place for b in range(6) for place in (b, (3 * b + 1) % 7)),)
+KEPLER = partial(single, system=catalogue("kepler"), q=(0.4, 0.1), p=(0.0, 2.0), h=0.05)
+PENDULUM = partial(single, system=catalogue("planar-pendulum"), q=(2.0,), p=(0.1,), h=0.1)
+DOUBLE = partial(single, system=catalogue("double-pendulum"), q=(0.9, -0.6), p=(0.5, 1.2), h=0.02)
+VIBRATION = partial(single, system=vibration, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
+RUBBED = partial(single, system=rubbed, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
+CHAIN = partial(
+    single, system=catalogue("fput-chain:12"), q=tuple(0.1 * k - 0.3 for k in range(12)), p=(0.2,) * 12, h=0.1
+)
+PLANETS = problem("outer-solar-system")
+MASSES = (1.0, 9.5e-4, 2.9e-4, 4.4e-5, 5.2e-5, 7.7e-9)
+SOLAR = partial(
+    single,
+    system=catalogue("outer-solar-system"),
+    q=PLANETS.q,
+    p=tuple(MASSES[k // 3] * v for k, v in enumerate(PLANETS.velocity or ())),
+    h=100.0,
+)
+DAMPED = partial(single, system=samples.damped_pendulum, q=(0.3, -0.4), p=(0.2, 0.5), h=0.05)
+RODS = partial(single, system=rods, q=(0.6, 0.8, 1.6, 0.8), p=(-0.8, 0.6, -0.4, 0.3), h=0.01)
+RING = partial(arrays, system=ring, sizes=(11,), h=0.1)
+FORMS = partial(arrays, system=forms, sizes=(5, 3, 7, 6), tables=BONDS, h=0.05, steps=300)
+RUBBED_RING = partial(arrays, system=rubbed_ring, sizes=(9,), h=0.1)
+ROTORS = partial(arrays, system=rotors, sizes=(10,), h=0.05)
+SWINGS = partial(arrays, system=swings, sizes=(5,), h=0.01, constrained=True)
+
+CELLS: dict[str, Callable[..., Program]] = {
+    "kepler": partial(KEPLER, method="svi:8"),
+    "kepler_adaptive": partial(KEPLER, method="svi:8", kind="adaptive"),
+    "kepler_loose": partial(KEPLER, method="svi:4", kind="adaptive", tolerance=1e-6),
+    "kepler_many": partial(KEPLER, method="svi:8", kind="ensemble"),
+    "kepler_tangent": partial(KEPLER, method="svi:4", kind="tangent"),
+    "kepler_second": partial(KEPLER, method="svi:2", kind="second"),
+    "kepler_newton": partial(KEPLER, method="svi:4", solver="newton"),
+    "kepler_newton_adaptive": partial(KEPLER, method="svi:4", solver="newton", kind="adaptive", tolerance=1e-8),
+    "kepler_collocation": partial(KEPLER, method="sc:4"),
+    "kepler_shooting": partial(KEPLER, method="scvi:4"),
+    "kepler_gauss": partial(KEPLER, method="gauss:3"),
+    "kepler_monitor": partial(KEPLER, method="svi:4", kind="adaptive", monitor="q1**2 + q2**2", tolerance=0.05),
+    "kepler_embedded": partial(KEPLER, method="svi:2", kind="embedded", steps=100),
+    "kepler_fallback": partial(KEPLER, method="svi:6", h=0.45, steps=100),
+    "kepler_clock": partial(KEPLER, system=transformed, method="svi:4"),
+    "kepler_composition": partial(KEPLER, method="composition:8"),
+    "pendulum": partial(PENDULUM, method="svi:8"),
+    "pendulum_adaptive": partial(PENDULUM, method="svi:6", kind="adaptive"),
+    "pendulum_many": partial(PENDULUM, method="svi:6", kind="ensemble"),
+    "chain": partial(CHAIN, method="svi:6"),
+    "chain_adaptive": partial(CHAIN, method="svi:6", kind="adaptive"),
+    "chain_many": partial(CHAIN, method="svi:4", kind="ensemble", steps=300),
+    "double": partial(DOUBLE, method="svi:4", steps=300),
+    "double_adaptive": partial(DOUBLE, method="svi:4", kind="adaptive", steps=300, tolerance=1e-9),
+    "double_many": partial(DOUBLE, method="svi:4", kind="ensemble", steps=300),
+    "double_tangent": partial(DOUBLE, method="svi:2", kind="tangent"),
+    "vibration": partial(VIBRATION, method="svi:4"),
+    "vibration_adaptive": partial(VIBRATION, method="svi:4", kind="adaptive"),
+    "rubbed_many": partial(RUBBED, method="svi:4", kind="ensemble"),
+    "rubbed": partial(RUBBED, method="svi:4"),
+    "rubbed_adaptive": partial(RUBBED, method="svi:4", kind="adaptive", tolerance=1e-8),
+    "damped": partial(DAMPED, method="svi:4", steps=300),
+    "rods": partial(RODS, method="svi:1"),
+    "rods_newton": partial(RODS, method="svi:3", steps=100),
+    "ring": partial(RING, method="svi:8"),
+    "ring_adaptive": partial(RING, method="svi:6", adaptive=True),
+    "ring_loose": partial(RING, method="svi:4", adaptive=True, tolerance=1e-6),
+    "ring_threads": partial(RING, method="svi:4", sizes=(4099,), steps=20, threads=3),
+    "ring_newton": partial(RING, method="svi:4", solver="newton", steps=100),
+    "ring_composition": partial(RING, method="composition:8"),
+    "forms": partial(FORMS, method="svi:4"),
+    "forms_adaptive": partial(FORMS, method="gauss:3", adaptive=True),
+    "forms_newton": partial(FORMS, method="svi:4", solver="newton", steps=30),
+    "rubbed_ring": partial(RUBBED_RING, method="svi:4"),
+    "rubbed_ring_adaptive": partial(RUBBED_RING, method="svi:4", adaptive=True),
+    "rotors": partial(ROTORS, method="svi:6"),
+    "rotors_adaptive": partial(ROTORS, method="svi:4", adaptive=True, tolerance=1e-7),
+    "rotors_threads": partial(ROTORS, method="svi:4", sizes=(4099,), steps=10, threads=3),
+    "swings": partial(SWINGS, method="stoermer-verlet"),
+}
+
+
+TIMED: dict[str, Callable[..., Program]] = {
+    "fast_kepler": partial(KEPLER, method="svi:8", steps=10000),
+    "fast_kepler_adaptive": partial(KEPLER, method="svi:8", kind="adaptive", t_end=2000.0, steps=100000),
+    "fast_kepler_many": partial(KEPLER, method="svi:8", kind="ensemble", steps=3000),
+    "fast_pendulum": partial(PENDULUM, method="svi:8", steps=10000),
+    "fast_chain": partial(CHAIN, method="svi:8", steps=3000),
+    "fast_solar": partial(SOLAR, method="svi:8", steps=2000),
+    "fast_solar_many": partial(SOLAR, method="svi:6", kind="ensemble", steps=300),
+    "fast_double": partial(DOUBLE, method="svi:6", steps=3000),
+    "fast_vibration": partial(VIBRATION, method="svi:6", steps=3000),
+    "fast_rubbed": partial(RUBBED, method="svi:6", steps=3000),
+    "fast_newton": partial(KEPLER, method="svi:4", solver="newton"),
+    "fast_composition": partial(KEPLER, method="composition:8", steps=3000),
+    "fast_ring": partial(RING, method="svi:8", sizes=(1000,), steps=100),
+    "fast_ring_adaptive": partial(RING, method="svi:8", sizes=(1000,), adaptive=True, steps=100),
+    "fast_ring_100000": partial(RING, method="svi:8", sizes=(100000,), steps=4),
+    "fast_rubbed_ring": partial(RUBBED_RING, method="svi:8", sizes=(1000,), steps=100),
+    "fast_rotors": partial(ROTORS, method="svi:8", sizes=(1000,), steps=100),
+    "fast_ring_newton": partial(RING, method="svi:8", sizes=(1000,), solver="newton", steps=30),
+    "fast_ring_composition": partial(RING, method="composition:8", sizes=(1000,), steps=300),
+}
+"""Longer runs, of which times are compared (``golden_speed.py``)."""
+
+
+def program(name: str) -> Program:
+    """Generate the program of a cell."""
+    made = (CELLS | TIMED)[name](name)
+    return Program(made.prefix, *map(plain, (made.header, made.code, made.main)))
+
+
+def plain(text: str) -> str:
+    """C without comments and indentation, which do not change results."""
+    bare = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+    return "\n".join(filter(None, map(str.strip, bare.splitlines()))) + "\n"
+
+
+@cache
+def recorded() -> dict[str, Program]:
+    """Recorded programs by the names of their cells."""
+    return {name: Program(**each) for name, each in json.loads(lzma.decompress(RECORDED.read_bytes())).items()}
+
+
+def build(program: Program, folder: Path, flags: Sequence[str] = FLAGS) -> Path:
+    """Compile a program; return the executable."""
+    for name, text in program.files.items():
+        (folder / name).write_text(text)
+    target = folder / "program"
+    sources = ["main.c", f"{program.prefix}.c"]
+    command = [*find_compiler(), *flags, *sources, "-lm", "-o", str(target)]
+    subprocess.run(command, check=True, cwd=folder)
+    return target
+
+
+def output(program: Program, folder: Path) -> str:
+    """Compile and run a program; return what it prints."""
+    done = subprocess.run([build(program, folder)], check=True, capture_output=True, text=True, timeout=60)
+    return done.stdout

@@ -1,0 +1,258 @@
+"""C programs that run a generated integrator and print its results as hexadecimal numbers, without any of the package's
+Python: what they print depends on the C source alone. With an argument n a program repeats its run n times and prints
+the shortest time in nanoseconds instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+__all__ = ["arrays_driver", "ensemble_driver", "run_driver", "tangent_driver"]
+
+HEAD = """#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include "{prefix}.h"
+#define CALL(name) {prefix}_##name
+static double now(void)
+{{
+  struct timespec at;
+  clock_gettime(CLOCK_MONOTONIC, &at);
+  return 1e9 * (double)at.tv_sec + (double)at.tv_nsec;
+}}
+static uint64_t digest = 1469598103934665603u;
+static void add(const void *x, size_t size)
+{{
+  for (size_t i = 0; i < size; i++)
+    digest = (digest ^ ((const unsigned char *)x)[i]) * 1099511628211u;
+}}
+static void show(const char *name, const double *x, long long n)
+{{
+  add(x, sizeof *x * (size_t)n);
+  printf("%s %016llx", name, (unsigned long long)digest);
+  for (long long i = 0; i < n && i < 4; i++)
+    printf(" %a", x[i]);
+  printf("\\n");
+}}
+"""
+
+
+def repeated(body: str) -> str:
+    """C that runs ``body`` as often as the command line says, and then prints the shortest time."""
+    return f"""double shortest = INFINITY;
+  const int repeats = count > 1 ? atoi(arguments[1]) : 1;
+  for (int k = 0; k < repeats; k++) {{
+    double from = now();
+    {body}
+    shortest = fmin(shortest, now() - from);
+  }}
+  if (count > 1)
+    return printf("%.0f\\n", shortest) < 0;"""
+
+
+def numbers(values: Sequence[float]) -> str:
+    """An initialiser."""
+    return ", ".join(float(value).hex() for value in values) or "0"
+
+
+def run_driver(
+    prefix: str,
+    q: Sequence[float],
+    p: Sequence[float],
+    parameters: Sequence[float],
+    h: float,
+    steps: int,
+    *,
+    t_end: float = 0.0,
+    tolerance: float = 0.0,
+) -> str:
+    """One step, then a run of fixed steps; of adaptive steps to t_end where that is given."""
+    m = len(q)
+    run = (
+        f"CALL(advance_to)(&run, {t_end!r}, {tolerance!r}, {steps}, {steps}, parameters, NULL, t, q, p, counts,"
+        " &report, work)"
+        if t_end
+        else f"CALL(advance)(&run, {steps}, {max(1, steps // 3)}, parameters, NULL, t, q, p, counts, &report, work)"
+    )
+    start = 0.0 if t_end and not tolerance else h
+    return (
+        HEAD.format(prefix=prefix)
+        + f"""
+static double work[{prefix.upper()}_WORKSPACE], parameters[] = {{{numbers(parameters)}}};
+static double q[{8 * m}], p[{8 * m}], t[8];
+int main(int count, char **arguments)
+{{
+  static CALL(run) run;
+  const double q0[] = {{{numbers(q)}}}, p0[] = {{{numbers(p)}}};
+  CALL(report) report;
+  int counts[8] = {{0}}, status = CALL(step)(0.25, {h!r}, q0, p0, parameters, NULL, q, p, &report, work);
+  printf("step %d %lld\\n", status, report.iterations);
+  show("q", q, {m}), show("p", p, {m}), show("change", &report.change, 1);
+  {repeated(f"CALL(start)(&run, 0.25, {start!r}, q0, p0), status = {run};")}
+  printf("run %d %lld %lld %lld\\n", status, report.steps, report.iterations, run.step);
+  for (int k = 0; k < 4; k++)
+    show("stored q", q + k * {m}, {m}), show("stored p", p + k * {m}, {m}), printf("%d\\n", counts[k]);
+  show("q", run.q, {m}), show("p", run.p, {m}), show("carry", run.carry_q, {m}), show("carry", run.carry_p, {m});
+  show("t", &run.t, 1), show("t_low", &run.t_low, 1), show("error", &run.error, 1), show("time", &run.error_t, 1);
+  return 0;
+}}
+"""
+    )
+
+
+def ensemble_driver(
+    prefix: str, q: Sequence[float], p: Sequence[float], parameters: Sequence[float], h: float, steps: int
+) -> str:
+    """A block of trajectories from neighbouring states."""
+    m, most = len(q), 8
+    body = f"""CALL(start)(&block, 0.25, {h!r});
+    for (int k = 0; k < WIDTH; k++) {{
+      double q0[] = {{{numbers(q)}}}, p0[] = {{{numbers(p)}}};
+      for (int i = 0; i < {m}; i++)
+        q0[i] *= 1 + 0.001 * k, p0[i] *= 1 - 0.002 * k;
+      CALL(set)(&block, k, q0, p0, p0, parameters);
+    }}
+    CALL(advance)(&block, WIDTH, {steps}, {max(1, steps // 3)}, NULL, q, p, {4 * m});"""
+    return (
+        HEAD.format(prefix=prefix)
+        + f"""
+static double q[{8 * most * m}], p[{8 * most * m}], parameters[] = {{{numbers(parameters)}}};
+int main(int count, char **arguments)
+{{
+  enum {{ WIDTH = {prefix.upper()}_WIDTH }};
+  static CALL(block) block __attribute__((aligned(64)));
+  {repeated(body)}
+  printf("%lld %lld\\n", block.step, block.iterations);
+  for (int k = 0; k < WIDTH; k++)
+    show("q", q + {4 * m} * k, {4 * m}), show("p", p + {4 * m} * k, {4 * m});
+  for (int i = 0; i < {m}; i++)
+    show("carry", block.carry_q[i], WIDTH), show("carry", block.carry_p[i], WIDTH);
+  return 0;
+}}
+"""
+    )
+
+
+def tangent_driver(
+    prefix: str,
+    q: Sequence[float],
+    p: Sequence[float],
+    parameters: Sequence[float],
+    h: float,
+    steps: int,
+    *,
+    second: bool = False,
+) -> str:
+    """Tangent vectors forward over some steps, then adjoint vectors; second derivatives in addition."""
+    m = len(q)
+    more = f"""
+  for (int k = 0; k < {steps} * COUNT * N; k++)
+    changes[k] = 0.01 * (k % 7) - 0.02;
+  for (int k = 0; k < {steps + 1} * 2 * COUNT * N; k++)
+    vectors[k] = k < {steps} * 2 * COUNT * N ? 0.0 : 0.3 + 0.1 * (k % 5);
+  status = CALL(second_order)({steps}, t, h, q, p, parameters, NULL, COUNT, changes, vectors, &report, work);
+  printf("second %d %lld\\n", status, report.iterations);
+  show("vectors", vectors, {steps + 1} * 2 * COUNT * N);
+"""
+    return (
+        HEAD.format(prefix=prefix)
+        + f"""
+enum {{ N = {prefix.upper()}_STEP_INPUTS, COUNT = 3 }};
+static double work[{prefix.upper()}_LINEARISED_WORKSPACE], parameters[] = {{{numbers(parameters)}}};
+static double q[{(steps + 1) * m}] = {{{numbers(q)}}}, p[{(steps + 1) * m}] = {{{numbers(p)}}};
+static double t[{steps}], h[{steps}], changes[{steps} * COUNT * N], vectors[{steps + 1} * 2 * COUNT * N];
+int main(void)
+{{
+  CALL(report) report;
+  int status;
+  for (int k = 0; k < {steps}; k++)
+    t[k] = {h!r} * k, h[k] = {h!r};
+  for (int back = 0; back < 2; back++) {{
+    for (int k = 0; k < {steps + 1} * COUNT * N; k++)
+      vectors[k] = (back ? k < {steps} * COUNT * N : k >= COUNT * N) ? 0.0 : 1 + 0.1 * (k % 11);
+    status = CALL(linearise)({steps}, t, h, q, p, parameters, NULL, back, COUNT, vectors, q + {m}, p + {m}, &report,
+        work);
+    printf("%d %d %lld\\n", back, status, report.iterations);
+    show("vectors", vectors, {steps + 1} * COUNT * N), show("q", q, {(steps + 1) * m}), show("p", p, {(steps + 1) * m});
+  }}{more if second else ""}
+  return 0;
+}}
+"""
+    )
+
+
+def arrays_driver(
+    prefix: str,
+    sizes: Sequence[int],
+    tables: Sequence[Sequence[int]],
+    fields: int,
+    parameters: Sequence[float],
+    h: float,
+    steps: int,
+    *,
+    threads: int = 0,
+    t_end: float = 0.0,
+    tolerance: float = 0.0,
+    constrained: bool = False,
+) -> str:
+    """A run over arrays, from a wave; several threads share a step where SCVI_THREADS is defined."""
+    rows = "".join(f"static const int table_{k}[] = {{{', '.join(map(str, row))}}};\n" for k, row in enumerate(tables))
+    listed = ", ".join(f"table_{k}" for k in range(len(tables))) or "NULL"
+    run = (
+        f"CALL(advance_to)(&run, &problem, {t_end!r}, {tolerance!r}, {steps}, NULL, &report)"
+        if t_end
+        else f"CALL(advance)(&run, &problem, {steps}, NULL, &report)"
+    )
+    held = """
+  CALL(constraint_sizes)(&problem, &run);
+  run.places = calloc((size_t)(3 * (run.constraints + run.entries) + n + 3), sizeof *run.places);
+  run.pairs = CALL(constraint_pairs)(&run, &problem);
+  run.columns = calloc((size_t)run.pairs + 1, sizeof *run.columns);
+  run.held = calloc((size_t)(11 * run.constraints + 2 * run.entries + 2 * run.pairs), sizeof *run.held);
+  CALL(constraint_pairs)(&run, &problem);
+  status = CALL(project)(&run, &problem, NULL, &report);
+  printf("project %d\\n", status);
+"""
+    work = f"{prefix.upper()}_WORK"
+    body = f"""memset(x, 0, sizeof(double) * (size_t)(n * (5 + {work})));
+    run = initial;
+    run.work = x;
+    run.q = x + {work} * n, run.p = run.q + n, run.carry_q = run.p + n, run.carry_p = run.carry_q + n;
+    run.inverse_mass = run.carry_p + n;
+    status = CALL(inverse_masses)(&problem, run.inverse_mass);
+    for (long long i = 0; i < n; i++) {{
+      const double at = (double)((i * 37) % 101) / 101.0;
+      run.q[i] = {"at + (double)i / 16.0" if constrained else "at"}, run.p[i] = 0.5 - at * at;
+    }}{held if constrained else ""}
+    from = now();
+    status = {run};"""
+    return (
+        HEAD.format(prefix=prefix)
+        + f"""
+{rows}int main(int count, char **arguments)
+{{
+  CALL(problem) problem = {{
+      {{{", ".join(map(str, sizes)) or "0"}}}, {{NULL}}, {{{listed}}}, {{{numbers(parameters)}}}}};
+  const CALL(run) initial = {{.t = 0.25, .h = {0.0 if t_end and not tolerance else h!r}, .threads = {threads}}};
+  CALL(run) run = initial;
+  CALL(report) report;
+  const long long n = CALL(coordinates)(&problem);
+  double *x = aligned_alloc(64, sizeof(double) * (size_t)(8 * ((n * (5 + {prefix.upper()}_WORK)) / 8 + 8)));
+  double *fields = malloc(sizeof(double) * (size_t)n), energies[3];
+  int status;
+  for (long long i = 0; i < n; i++)
+    fields[i] = 1.0 + 0.125 * (double)(i % 3);
+  for (int k = 0; k < {fields}; k++)
+    problem.field[k] = fields;
+  {repeated(body)}
+  printf("run %d %lld %lld %lld\\n", status, report.steps, report.iterations, run.step);
+  show("q", run.q, n), show("p", run.p, n), show("carry", run.carry_q, n), show("carry", run.carry_p, n);
+  show("t", &run.t, 1), show("t_low", &run.t_low, 1), show("h", &run.h, 1), show("error", &run.error, 1);
+  CALL(energies)(&problem, run.t, run.q, run.p, run.inverse_mass, energies);
+  show("energies", energies, 3);
+  return 0;
+}}
+"""
+    )
