@@ -1,37 +1,40 @@
-"""Systems of many similar terms in two parts: unrolled terms, and term groups that are evaluated in loops.
+"""Groups of similar terms: terms that differ only in their coordinates, parameters and numbers.
 
-The potentials of lattices, nets and many bodies consist of groups of terms that differ only in their coordinates and
-constants (:mod:`scvi_codegen.mechanics.similar_terms`). A group is differentiated once, for one term.
+The potentials of lattices, nets and many bodies consist of such groups. A group is differentiated once, for one term,
+and evaluated in a loop. Terms are compared by their expression trees: arguments of sums and products are sorted by
+their structure without names and numbers, so that similar terms have equal keys.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import compress, groupby
+from itertools import compress, groupby, repeat
+from typing import TypeVar
 
 from sympy import Add, Expr, S, Symbol, factor_terms
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.mechanics.similar_terms import SimilarTerms, similar_terms
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["MIN_GROUP_SIZE", "SplitSystem", "TermGroup", "rolled"]
+__all__ = ["MAX_GROUPS", "MIN_GROUP_SIZE", "SimilarTerms", "SplitSystem", "TermGroup", "rolled", "similar_terms"]
 
 MIN_GROUP_SIZE = 300
 """Minimum number of terms of a group; smaller ones are unrolled, which is short enough and shares subexpressions."""
 MAX_GROUPS = 64
+"""Maximum number of structures of terms; systems with more are not rolled."""
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
 class TermGroup:
-    """Group of similar terms of L that depend on coordinates, parameters and time.
+    """Group of similar terms.
 
     Attributes:
-        formula: of one term, in ``slots``, ``given``, parameters and time.
+        formula: of one term, in ``slots``, ``given``, the constants common to all terms, and time.
         slots: symbols of coordinates.
         given: symbols of the constants that differ between terms.
         places: indices of the coordinates in ``slots``, for each term.
@@ -69,6 +72,53 @@ class SplitSystem:
     families: tuple[TermGroup, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class SimilarTerms:
+    """Terms of the same structure.
+
+    Attributes:
+        terms: the expressions.
+        leaves: coordinates and constants of each term, in the same order.
+    """
+
+    terms: tuple[Expr, ...]
+    leaves: tuple[_Leaves, ...]
+
+    def __len__(self) -> int:
+        return len(self.terms)
+
+    @property
+    def groups(self) -> Iterator[SimilarTerms]:
+        """Groups in which each constant is a number in all terms, or a parameter in all terms."""
+
+        def pattern(pair: tuple[Expr, _Leaves]) -> tuple[bool, ...]:
+            return tuple(constant.is_Number for constant in pair[1].constants)
+
+        pairs = zip(self.terms, self.leaves, strict=True)
+        ordered = sorted(pairs, key=lambda pair: (pattern(pair), pair[1].places))
+        for _, found in groupby(ordered, pattern):
+            yield SimilarTerms(*zip(*found, strict=True))
+
+    def group(self, slot: Callable[[str, int], Symbol], given: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
+        """Return the term group.
+
+        Args:
+            slot: symbol of a coordinate, by its array and its column in the table of indices.
+            given: symbol of a constant, by its number.
+            sign: factor of the formula.
+        """
+        first, columns = self.leaves[0], list(zip(*(each.constants for each in self.leaves), strict=True))
+        varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
+        symbols = [given(k) if k in varying else column[0] for k, column in enumerate(columns)]
+        return TermGroup(
+            formula=sign * first.substituted(self.terms[0], slot, symbols),
+            slots=tuple(slot("", k) for k in range(len(first.places))),
+            given=tuple(symbols[k] for k in varying),
+            places=tuple(tuple(each.places) for each in self.leaves),
+            values=tuple(columns[k] for k in varying),
+        )
+
+
 @lru_cache(maxsize=16)
 def rolled(system: MechanicalSystem) -> SplitSystem | None:
     """Split a system; ``None`` without large term groups, with constraints, or with a time transformation."""
@@ -78,72 +128,34 @@ def rolled(system: MechanicalSystem) -> SplitSystem | None:
     moving = {*system.velocities, *system.auxiliaries}
     known = {*system.coordinates}
     still = [term for term in terms if known & term.free_symbols and not moving & term.free_symbols]
-    places = {q: ("", k) for k, q in enumerate(system.coordinates)}
-    kinds = similar_terms(still, places, system.parameters, MAX_GROUPS)
-    large = [kind for kind in kinds if len(kind.places) >= MIN_GROUP_SIZE]
+    kinds = similar_terms(still, {q: ("", k) for k, q in enumerate(system.coordinates)}, system.parameters)
+    large = [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
     if not large:
         return None
-    gathered = {term for kind in large for term in kind.terms}
-    rest = Add(*(term for term in terms if term not in gathered))
-    families = _merged([term_group for kind in large for term_group in _term_groups(kind, system)])
-    return SplitSystem(replace(system, **{_FUNCTION[bool(system.auxiliaries)]: rest}), families)
-
-
-_FUNCTION = {False: "lagrangian", True: "hamiltonian"}
-"""Field of the defining function of a system, by whether it has momenta."""
-
-
-def _term_groups(kind: SimilarTerms, system: MechanicalSystem) -> Iterator[TermGroup]:
-    """Yield groups in which each constant is a number in all terms, or a parameter in all terms."""
-
-    def pattern(constants: Sequence[Expr]) -> tuple[bool, ...]:
-        return tuple(constant.is_Number for constant in constants)
-
-    pairs = sorted(zip(kind.constants, kind.places, strict=True), key=lambda pair: (pattern(pair[0]), pair[1]))
-    for _, found in groupby(pairs, lambda pair: pattern(pair[0])):
-        constants, places = zip(*found, strict=True)
-        yield _term_group(kind, constants, places, system)
-
-
-def _term_group(
-    kind: SimilarTerms,
-    constants: Sequence[Sequence[Expr]],
-    places: tuple[tuple[int, ...], ...],
-    system: MechanicalSystem,
-) -> TermGroup:
-    columns = list(zip(*constants, strict=True))
-    varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
     slot, given = (_stem(name, system.parameters) for name in ("slot", "given"))
-    slots = tuple(symbol(f"{slot}{k}") for k in range(len(places[0])))
-    different = {k: symbol(f"{given}{k}") for k in varying}
-    text = kind.written(
-        lambda k: slots[k].name, lambda k: different[k].name if k in different else f"({columns[k][0]})"
-    )
-    known = (*slots, *different.values(), *system.parameters, system.time)
-    formula = parse_expression(text, {each.name: each for each in known})
-    return TermGroup(
-        formula=-formula if system.auxiliaries else formula,
-        slots=slots,
-        given=tuple(different.values()),
-        places=places,
-        values=tuple(columns[k] for k in varying),
-    )
+    groups = [
+        each.group(lambda _, k: symbol(f"{slot}{k}"), lambda k: symbol(f"{given}{k}"), -1 if system.auxiliaries else 1)
+        for kind in large
+        for each in kind.groups
+    ]
+    function = "hamiltonian" if system.auxiliaries else "lagrangian"
+    gathered = {term for kind in large for term in kind.terms}
+    rest = replace(system, **{function: Add(*(term for term in terms if term not in gathered))})
+    return SplitSystem(rest, _merged(groups))
 
 
-def _merged(families: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
+def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
     """Merge groups with the same indices."""
     found: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
-    for term_group in families:
-        other = found.setdefault(term_group.places, term_group)
-        if other is not term_group:
-            count = len(other.given)
-            given = tuple(symbol(f"{each.name}_{count}") for each in term_group.given)
-            formula = term_group.formula.xreplace(dict(zip(term_group.given, given, strict=True)))
-            found[term_group.places] = replace(
+    for group in groups:
+        other = found.setdefault(group.places, group)
+        if other is not group:
+            given = tuple(symbol(f"{each.name}_{len(other.given)}") for each in group.given)
+            found[group.places] = replace(
                 other,
-                formula=other.formula + formula,
+                formula=other.formula + group.formula.xreplace(dict(zip(group.given, given, strict=True))),
                 given=(*other.given, *given),
-                values=(*other.values, *term_group.values),
+                values=(*other.values, *group.values),
             )
     return tuple(found.values())
 
@@ -154,3 +166,99 @@ def _stem(name: str, parameters: Sequence[Symbol]) -> str:
     while any(parameter.name.startswith(stem) for parameter in parameters):
         stem += "_"
     return stem
+
+
+def similar_terms(
+    terms: Iterable[Expr],
+    places: Mapping[Symbol, tuple[str, int]],
+    names: Iterable[Symbol],
+    first: Iterable[tuple[int, ...]] = repeat(()),
+) -> tuple[SimilarTerms, ...]:
+    """Return the terms by structure, in the order of their keys; nothing if there are more than ``MAX_GROUPS``.
+
+    Args:
+        terms: in canonical form.
+        places: array and index of each coordinate, velocity or momentum.
+        names: parameters.
+        first: indices that precede those of each term, such as the coordinate on which a force acts.
+    """
+    kinds: dict[str, list[tuple[Expr, _Leaves]]] = {}
+    shapes, known = dict[Expr, str](), set(names)
+    for term, begun in zip(terms, first, strict=False):
+        leaves = _Leaves(places, known, shapes, [*begun])
+        kinds.setdefault(leaves.key(term), []).append((term, leaves))
+        if len(kinds) > MAX_GROUPS:
+            return ()
+    return tuple(SimilarTerms(*zip(*found, strict=True)) for _, found in sorted(kinds.items()))
+
+
+@dataclass(slots=True)
+class _Leaves:
+    """Coordinates and constants of a term, numbered in the order in which they occur.
+
+    Attributes:
+        arrays: array and index of each coordinate and velocity.
+        names: parameters.
+        shapes: cache of the structure of formulas.
+        places: indices of the coordinates that occur, without repetitions.
+        constants: numbers and parameters that occur, without repetitions.
+    """
+
+    arrays: Mapping[Symbol, tuple[str, int]]
+    names: set[Symbol]
+    shapes: dict[Expr, str]
+    places: list[int] = field(default_factory=list)
+    constants: list[Expr] = field(default_factory=list)
+
+    def key(self, formula: Expr) -> str:
+        """Return the structure of a formula with numbered leaves."""
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.key(formula.exp)
+            return f"({self.key(formula.base)})**({exponent})"
+        if formula.is_Add or formula.is_Mul:
+            parts = [self.key(part) for part in sorted(formula.args, key=self.shape)]
+            return f"({(' + ' if formula.is_Add else '*').join(parts)})"
+        if formula.args:
+            return f"{formula.func.__name__}({', '.join(self.key(part) for part in formula.args)})"
+        if formula in self.arrays:
+            array, place = self.arrays[formula]
+            return f"{array}{{{_number(self.places, place)}}}"
+        return f"[{_number(self.constants, formula)}]" if self._is_constant(formula) else str(formula)
+
+    def shape(self, formula: Expr) -> str:
+        """Return the structure of a formula without numbered leaves."""
+        found = self.shapes.get(formula)
+        if found is None:
+            found = self.shapes[formula] = self._shape(formula)
+        return found
+
+    def _shape(self, formula: Expr) -> str:
+        if formula.is_Pow:
+            exponent = str(formula.exp) if formula.exp.is_Number else self.shape(formula.exp)
+            return f"({self.shape(formula.base)})**({exponent})"
+        if formula.args:
+            return f"{formula.func.__name__}({', '.join(sorted(map(self.shape, formula.args)))})"
+        if formula in self.arrays:
+            return self.arrays[formula][0]
+        return "c" if self._is_constant(formula) else str(formula)
+
+    def _is_constant(self, formula: Expr) -> bool:
+        return bool(formula.is_Number) or formula in self.names
+
+    def substituted(self, formula: Expr, slot: Callable[[str, int], Symbol], constants: Sequence[Expr]) -> Expr:
+        """Return the formula with symbols of slots, and with other constants."""
+        if formula.args:
+            fixed = formula.args[1:] if formula.is_Pow and formula.exp.is_Number else ()
+            parts = formula.args[: len(formula.args) - len(fixed)]
+            return formula.func(*(self.substituted(part, slot, constants) for part in parts), *fixed)
+        if formula in self.arrays:
+            array, place = self.arrays[formula]
+            return slot(array, self.places.index(place))
+        return constants[self.constants.index(formula)] if self._is_constant(formula) else formula
+
+
+def _number(known: list[Item], item: Item) -> int:
+    """Return the index of an item in a list, appending the item if necessary."""
+    if item not in known:
+        known.append(item)
+    return known.index(item)

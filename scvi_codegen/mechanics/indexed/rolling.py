@@ -7,26 +7,26 @@ q[at[b, 1]], c[b])), with an index table and arrays of numbers.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sympy import Add, Expr, Integer, Symbol
+from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.inputs import input_formulas
+from scvi_codegen.formulas.indexed import IndexedTerm, term_of
+from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, symbol
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
-from scvi_codegen.mechanics.similar_terms import SimilarTerms, similar_terms
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import checks_arguments
 
 __all__ = ["RolledSums", "roll_sums"]
-
-MAX_TERM_GROUPS = 64
-"""Maximum number of term groups; systems with more are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
 
     Raises:
         SystemDefinitionError: if the system has constraints, damping or a time transformation, has more than
-            ``MAX_TERM_GROUPS`` kinds of terms, or if a Lagrangian contains velocities other than as m*v**2/2.
+            ``MAX_GROUPS`` kinds of terms, or if a Lagrangian contains velocities other than as m*v**2/2.
 
     >>> from scvi_codegen.mechanics.lagrangian import LagrangianSystem
     >>> chain = LagrangianSystem.from_text(
@@ -65,42 +65,48 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     chain: L(q[N]) = sum(b in B0, c0_1[b]*(-q[at0[b, 0]] + q[at0[b, 1]])**2) + sum(b in B1, q_dot[at1[b, 0]]**2/2)
     """
     _check_supported(system)
-    mark = _mark({*map(str, system.constants), *system.inputs})
-    q, p, b, n = (f"{name}{mark}" for name in "qpbN")
-    places = {each: (q, k) for k, each in enumerate(system.coordinates)}
-    places |= {each: (f"{q}{DOT}", k) for k, each in enumerate(system.velocities)}
-    places |= {each: (p, k) for k, each in enumerate(system.auxiliaries)}
-    named = {formula: name for name, formula in input_formulas(system.inputs, system.time).items()}
+    mark, inputs = _mark({*map(str, system.constants), *system.inputs}), input_formulas(system.inputs, system.time)
+    q, q_dot, p = (Array(f"{name}", (Size(f"N{mark}"),)) for name in (f"q{mark}", f"q{mark}{DOT}", f"p{mark}"))
+    pairs = ((q, system.coordinates), (q_dot, system.velocities), (p, system.auxiliaries))
+    places = {each: (array.name, k) for array, symbols in pairs for k, each in enumerate(symbols)}
+    named = {formula: name for name, formula in inputs.items()}
     function, *forces = (each.xreplace(named) for each in (system.formula, *system.forces))
     acting = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
     defaults = _defaults(system, (function, *forces))
-    kinds = similar_terms(Add.make_args(function), places, defaults, MAX_TERM_GROUPS)
-    force_kinds = similar_terms(
-        (term for term, _ in acting), places, defaults, MAX_TERM_GROUPS, (target for _, target in acting)
-    )
+    kinds = similar_terms(Add.make_args(function), places, defaults)
+    force_kinds = similar_terms((term for term, _ in acting), places, defaults, (target for _, target in acting))
     if not kinds or (acting and not force_kinds):
         raise SystemDefinitionError(
-            f"the terms of '{system.name}' have more than {MAX_TERM_GROUPS} different structures: "
+            f"the terms of '{system.name}' have more than {MAX_GROUPS} different structures: "
             "systems with so few repeated terms cannot be rolled into sums"
         )
-    found = [_term_group(f"{mark}{k}", b, kind, defaults) for k, kind in enumerate((*kinds, *force_kinds))]
-    used = {name: value for each in found for name, value in each.numbers.items()}
-    fields = {f"{name}[B{mark}{k}]": 1.0 for k, each in enumerate(found) for name in each.fields}
-    written = " + ".join(f"sum({b} in B{mark}{k}, {each.text})" for k, each in enumerate(found[: len(kinds)]))
-    given = {"hamiltonian": written, "momenta": [f"{p}[{n}]"]} if system.auxiliaries else {"lagrangian": written}
-    return RolledSums(
-        IndexedSystem.from_text(
-            name=system.name,
-            coordinates=[f"{q}[{n}]"],
-            parameters={**used, **fields},
-            tables=[f"at{mark}{k}[B{mark}{k}, {each.table.shape[1]}]" for k, each in enumerate(found)],
-            forces={f"{q}[at{mark}{k}[{b}, 0]]": each.text for k, each in enumerate(found) if k >= len(kinds)},
-            inputs=system.inputs,
-            **given,
+    arrays = {"": q, **{array.name: array for array, _ in pairs}}
+    found = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
+    terms = [each.term(inputs) for each in found]
+    used = {name for each in found for name in each.group.formula.free_symbols}
+    numbers = with_inputs({each.name: value for each, value in defaults.items() if each in used}, system.inputs)
+    fields = {array: values for each in found for array, values in each.fields(defaults)}
+    rolled = IndexedSystem(
+        name=system.name,
+        coordinates=(q,),
+        momenta=(p,) if system.auxiliaries else (),
+        time=system.time,
+        parameters=tuple(map(symbol, numbers)),
+        defaults=tuple(numbers.values()),
+        fields=tuple(fields),
+        field_defaults=(1.0,) * len(fields),
+        tables=tuple(each.table for each in found),
+        terms=tuple(terms[: len(kinds)]),
+        forces=tuple(
+            IndexedForce(
+                loops=term.loops, slots=term.slots, targets=((each.accesses[each.group.slots[0]], term.formula),)
+            )
+            for each, term in zip(found[len(kinds) :], terms[len(kinds) :], strict=True)
         ),
-        {f"at{mark}{k}": each.table for k, each in enumerate(found)},
-        {name: values for each in found for name, values in each.fields.items()},
+        inputs=system.inputs,
     )
+    tables = {each.table.name: each.places for each in found}
+    return RolledSums(rolled, tables, {array.name: values for array, values in fields.items()})
 
 
 def _mark(names: set[str]) -> str:
@@ -132,32 +138,44 @@ def _defaults(system: MechanicalSystem, formulas: Sequence[Expr]) -> dict[Symbol
 
 
 @dataclass(frozen=True, slots=True)
-class _TermGroup:
-    """Group of similar terms: formula of an element, index table, arrays of numbers, and numbers common to all."""
+class _Rolled:
+    """Term group over the rows of an index table."""
 
-    text: str
-    table: NDArray[np.int32]
-    fields: dict[str, NDArray[np.float64]]
-    numbers: dict[str, float]
+    group: TermGroup
+    loop: Loop
+    table: Array
+    accesses: dict[Symbol, Access]
 
+    @classmethod
+    def of(cls, kind: SimilarTerms, name: str, index: str, arrays: Mapping[str, Array]) -> _Rolled:
+        """Return the group of similar terms; ``name`` distinguishes its arrays from those of others."""
+        rows, accesses = Size(f"B{name}"), dict[Symbol, Access]()
 
-def _term_group(name: str, index: str, kind: SimilarTerms, defaults: dict[Symbol, float]) -> _TermGroup:
-    fields: dict[str, NDArray[np.float64]] = {}
-    numbers: dict[str, float] = {}
-    constants: list[str] = []
-    for k, column in enumerate(zip(*kind.constants, strict=True)):
-        if len(set(column)) > 1:
-            fields[f"c{name}_{k}"] = np.array([float(defaults.get(each, each)) for each in column])
-            constants.append(f"c{name}_{k}[{index}]")
-        else:
-            numbers |= {column[0].name: defaults[column[0]]} if column[0] in defaults else {}
-            constants.append(str(column[0]) if _is_plain(column[0]) else f"({column[0]})")
-    text = kind.written(lambda k: f"[at{name}[{index}, {k}]]", constants.__getitem__)
-    width = max(1, *map(len, kind.places))  # terms without coordinates have one column, which is never read
-    table = np.zeros((len(kind.places), width), dtype=np.int32)
-    table[:, : len(kind.places[0])] = kind.places
-    return _TermGroup(text, table, fields, numbers)
+        def entry(array: Array, place: Place) -> Symbol:
+            access = Access(array=array, places=(place,))
+            accesses[symbol(str(access))] = access
+            return symbol(str(access))
 
+        group = kind.group(
+            lambda array, column: entry(arrays[array], Place(index=index, table=f"at{name}", column=column)),
+            lambda k: entry(Array(f"c{name}_{k}", (rows,)), Place(index=index)),
+        )
+        columns = max(1, len(group.slots))  # terms without coordinates have one column, which is never read
+        loop = Loop(index=index, first=Size(""), end=rows)
+        return cls(group, loop, Array(f"at{name}", (rows, Size("", columns))), accesses)
 
-def _is_plain(constant: Expr) -> bool:
-    return isinstance(constant, Symbol | Integer) and not str(constant).startswith("-")
+    def term(self, inputs: Mapping[Symbol, Expr]) -> IndexedTerm:
+        """Return the sum over the rows, with the formulas of inputs."""
+        return term_of((self.loop,), self.group.formula.xreplace(inputs), self.accesses)
+
+    @property
+    def places(self) -> NDArray[np.int32]:
+        """Values of the index table."""
+        found = np.zeros((len(self.group.places), self.table.axes[1].number), dtype=np.int32)
+        found[:, : len(self.group.slots)] = self.group.places
+        return found
+
+    def fields(self, defaults: Mapping[Symbol, float]) -> Iterator[tuple[Array, NDArray[np.float64]]]:
+        """Yield the arrays of constants with their values."""
+        for slot, column in zip(self.group.given, self.group.values, strict=True):
+            yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])
