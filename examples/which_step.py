@@ -25,7 +25,7 @@ method = sc.SVI(8)
 
 plain = sc.compile_stepper(kepler, method)
 stretched = sc.compile_stepper(sc.reparametrise(kepler, "frequency"), method)
-reversible = sc.compile_stepper(kepler, method, monitor="frequency")
+reversible = sc.compile_stepper(kepler, method, time_transformation="frequency")
 fixed = 2.0 * np.pi / 300
 
 ways = {

@@ -91,7 +91,7 @@ def compile_stepper(
     prefix: str | None = None,
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
-    monitor: str | Expr | None = None,
+    time_transformation: str | Expr | None = None,
 ) -> Stepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
@@ -108,7 +108,7 @@ def compile_stepper(
         symmetries: symmetries to track in addition to those that are detected
             (:func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`).
         events: zero crossings that every run of this stepper (not ensembles) records, see :meth:`Stepper.integrate`.
-        monitor: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
+        time_transformation: time-rescaling function g(q, t) > 0 (g(q, p, t) of a Hamiltonian), or a name accepted by
             :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
             by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
             Momentum maps are preserved.
@@ -117,7 +117,7 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: if the solver is not available for the method.
     """
-    sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, monitor)
+    sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, time_transformation)
     own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
     source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
     return Stepper(
@@ -144,10 +144,10 @@ class _Sources:
         solver: str,
         prefix: str | None,
         symmetries: Sequence[Symmetry],
-        monitor: str | Expr | None,
+        g: str | Expr | None,
     ) -> None:
-        self.system, self.method, self.solver, self.monitor = system, method, solver, monitor
-        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), monitor)))
+        self.system, self.method, self.solver, self.g = system, method, solver, g
+        self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g)))
         self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
         self._programs: dict[bool, Program] = {}
 
@@ -170,13 +170,13 @@ class _Sources:
             self.system,
             self.method,
             uses_fallback_library=self.uses_fallback_library,
-            monitor=self.monitor,
+            g=self.g,
         )
         return json.dumps([self._rendered().to_json(), interface.to_json()])
 
     def controlled(self) -> Source | None:
-        """Return the source with adaptive steps, or with the step-density controller of a monitor; else ``None``."""
-        control = control_of(self.program()) if self.monitor is None else density_of(self.system, self.monitor)
+        """Return the source with adaptive steps, or with the step-density controller; else ``None``."""
+        control = control_of(self.program()) if self.g is None else density_of(self.system, self.g)
         return self._rendered(control) if control else None
 
     def fallback(self) -> Source | None:
@@ -243,7 +243,7 @@ def generate_source(
     embedded: Embedded | None = None,
     amalgamate: bool = False,
     controlled: bool = False,
-    monitor: str | Expr | None = None,
+    time_transformation: str | Expr | None = None,
 ) -> tuple[Source, Interface]:
     """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
 
@@ -252,7 +252,7 @@ def generate_source(
             Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
         amalgamate: include the support headers in the source; always done for a microcontroller.
         controlled: use adaptive steps, if the method has an error estimate.
-        monitor: use constant steps in tau instead, dt = g dtau, by the reversible controller.
+        time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
 
     Raises:
         MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
@@ -262,9 +262,10 @@ def generate_source(
     functions = tuple(event.function for event in as_events(events))
     _check_embedded(embedded, solver, functions)
     program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
-    control = density_of(system, monitor) if monitor is not None else control_of(program) if controlled else None
+    g = time_transformation
+    control = density_of(system, g) if g is not None else control_of(program) if controlled else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
-    interface = describe(program, system, method, monitor=monitor)
+    interface = describe(program, system, method, g=g)
     found = with_events(source, interface, functions) if functions else source
     return (found.amalgamated() if amalgamate else found), interface
 
@@ -342,7 +343,7 @@ def describe(
     method: Method,
     *,
     uses_fallback_library: bool = False,
-    monitor: str | Expr | None = None,
+    g: str | Expr | None = None,
 ) -> Interface:
     """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
     return Interface(
@@ -362,7 +363,7 @@ def describe(
         map_exact=tuple(each.exact for each in program.momentum_maps),
         has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
-        monitor="" if monitor is None else str(monitor),
+        time_transformation="" if g is None else str(g),
         exchange_names=program.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,

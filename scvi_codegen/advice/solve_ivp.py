@@ -15,7 +15,7 @@ from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.reparametrisation import with_monitor
+from scvi_codegen.mechanics.reparametrisation import with_time_transformation
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
@@ -84,7 +84,7 @@ def solve_ivp(
     tolerance: float | None = None,
     rtol: float | None = None,
     error: float | None = None,
-    monitor: str | Expr | None = None,
+    time_transformation: str | Expr | None = None,
     controller: str | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
@@ -116,9 +116,9 @@ def solve_ivp(
         error: bound on the relative global error of the whole run with adaptive steps, as of :meth:`Stepper.integrate`;
             ``trajectory.global_error`` and ``confirmed_until`` report the estimate. ``success`` is False if the bound
             is not confirmed.
-        monitor: time-rescaling function g of :func:`reparametrise`: equal steps of tau, dt = g dtau, symplectic and
-            with variable step size in t. ``h`` is then in tau; without it :func:`largest_step` finds one for ``rtol``,
-            and ``success`` is False if the run misses that.
+        time_transformation: time-rescaling function g of :func:`reparametrise`: equal steps of tau, dt = g dtau,
+            symplectic and with variable step size in t. ``h`` is then in tau; without it :func:`largest_step` finds one
+            for ``rtol``, and ``success`` is False if the run misses that.
         controller: ``"reversible"``: the time-rescaling function of :func:`compile_stepper`, also for systems with
             explicit time or forces; ``"symplectic"`` (default): that of :func:`reparametrise`.
         t_eval: (n,) times at which to return states; by default the ends of the steps.
@@ -139,10 +139,16 @@ def solve_ivp(
     q, given = _halves(y0) if velocity is None else (y0, None)
     requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
-        others = {"h": h, "tolerance": tolerance, "rtol": rtol, "monitor": monitor, "controller": controller}
+        others = {
+            "h": h,
+            "tolerance": tolerance,
+            "rtol": rtol,
+            "time_transformation": time_transformation,
+            "controller": controller,
+        }
         checked_error(error, others)
     request = _StepRequest(h, rtol, tolerance, error)
-    stepper, uncompiled = _stepper(system, method, (monitor, controller), request)
+    stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
     p = stepper._initial_momenta(q, given, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
@@ -181,25 +187,25 @@ class _StepChoice(NamedTuple):
 def _stepper(
     system: MechanicalSystem | Stepper,
     method: Method | str | None,
-    time_transformation: tuple[str | Expr | None, str | None],
+    transformation: tuple[str | Expr | None, str | None],
     request: _StepRequest,
 ) -> tuple[Stepper, tuple[MechanicalSystem, Method] | None]:
-    """Return the stepper, and its system and method if compiled here; ``time_transformation``: g and its controller."""
+    """Return the stepper, and its system and method if compiled here; ``transformation``: g and its controller."""
     if request.tolerance is not None and (
-        request.h is not None or request.rtol is not None or time_transformation != (None, None)
+        request.h is not None or request.rtol is not None or transformation != (None, None)
     ):
         raise StateError(
             "tolerance (fixed step size for an error at the end), h (fixed step size) and rtol (adaptive step size) "
             "exclude each other: give one of them, and with a time transformation h or rtol"
         )
     if not isinstance(system, Stepper):
-        system, monitor = with_monitor(system, *time_transformation)
+        system, g = with_time_transformation(system, *transformation)
         chosen = default_method(system) if method is None else as_method(method, system)
-        return compile_stepper(system, chosen, monitor=monitor), (system, chosen)
-    if method is not None or time_transformation != (None, None) or request.tolerance is not None:
+        return compile_stepper(system, chosen, time_transformation=g), (system, chosen)
+    if method is not None or transformation != (None, None) or request.tolerance is not None:
         raise StateError(
-            "method, monitor, controller and tolerance need a system, not a compiled stepper: omit them, give h (fixed "
-            "step size) or rtol (adaptive step size)"
+            "method, time_transformation, controller and tolerance need a system, not a compiled stepper: omit them, "
+            "give h (fixed step size) or rtol (adaptive step size)"
         )
     return system, None
 
@@ -254,7 +260,7 @@ def _refuse(given: Mapping[str, float | None]) -> None:
 
 def _is_time_transformed(stepper: Stepper) -> bool:
     """Return True if the steps are of tau."""
-    return bool(stepper.interface.energy_parameter or stepper.interface.monitor)
+    return bool(stepper.interface.energy_parameter or stepper.interface.time_transformation)
 
 
 def _has_adaptive_steps(stepper: Stepper) -> bool:
@@ -273,7 +279,7 @@ def _steps(stepper: Stepper, start: float, end: float, plan: _StepChoice) -> dic
     if plan.rtol is not None or plan.h is None:
         return {"h": plan.h, "t_end": end, "tolerance": plan.rtol}
     if _is_time_transformed(stepper):
-        sign = 1.0 if stepper.interface.monitor else end - start
+        sign = 1.0 if stepper.interface.time_transformation else end - start
         return {"h": math.copysign(checked_step(plan.h), sign), "t_end": end}
     steps = max(1, math.ceil(abs((end - start) / checked_step(plan.h)) * (1.0 - 1e-12)))
     return {"h": (end - start) / steps, "steps": steps}

@@ -56,7 +56,7 @@ class ModelOptions:
     span: float | None
     steps: int | None
     save_every: int | None
-    monitor: str | None = None
+    time_transformation: str | None = None
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
     size: tuple[tuple[str, int], ...] | None = None
@@ -64,7 +64,7 @@ class ModelOptions:
     def sections(self) -> dict[str, dict[str, Any]]:
         """Return the options as sections of a model file."""
         named: dict[str, dict[str, Any]] = {
-            "system": {"monitor": self.monitor},
+            "system": {"time_transformation": self.time_transformation},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
             "method": {name: getattr(self, name) for name in METHOD_CHOICES},
             "run": {name: getattr(self, name) for name in ("step", "span", "steps", "save_every", "controller")},
@@ -222,19 +222,19 @@ STATE_OPTIONS = (
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
     _option("--velocity", metavar="V1,V2,..", callback=_numbers, help="Initial velocities, instead of momenta."),
     _option("--time", type=float, metavar="T", help="Initial time."),
-    _option("--step", type=float, metavar="H", help="Fixed step size; negative: backward; with --monitor: of tau."),
+    _option("--step", type=float, metavar="H", help="Fixed step size (of tau, if transformed); negative: backward."),
     _option("--span", type=float, metavar="T", help="Duration of the run."),
     _option("--steps", type=int, metavar="N", help="Number of steps, instead of --span."),
     _option("--save-every", type=int, metavar="N", help="Save every N-th state."),
     _option(
-        "--monitor",
+        "--time-transformation",
         metavar="G",
         help="Time transformation dt = G dtau: frequency, distance, potential, arclength or a formula.",
     ),
     _option(
         "--controller",
         type=click.Choice(CONTROLLERS),
-        help="With --monitor: symplectic (default; energy must be conserved), or reversible (any system).",
+        help="With --time-transformation: symplectic (default; energy must be conserved), or reversible (any system).",
     ),
 )
 

@@ -20,28 +20,28 @@ from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 __all__ = ["density_of"]
 
 
-def density_of(system: MechanicalSystem, monitor: str | Expr) -> Control:
+def density_of(system: MechanicalSystem, g: str | Expr) -> Control:
     """Return the step density of a time-rescaling function of the system.
 
     Args:
         system: in physical time.
-        monitor: as in :func:`~scvi_codegen.mechanics.time_rescaling.time_rescaling_function`, or of time.
+        g: as in :func:`~scvi_codegen.mechanics.time_rescaling.time_rescaling_function`, or of time.
 
     Raises:
         SystemDefinitionError: for an invalid time-rescaling function.
     """
-    g = time_rescaling_function(system, monitor, in_time=True)
+    rate = time_rescaling_function(system, g, in_time=True)
     forms = forms_of(system)
     rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
     if system.auxiliaries:
         rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
     rates[system.time] = sympy.S.One
     variables = list(rates)
-    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(g, variables).items()))
+    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(rate, variables).items()))
     kernel = system_kernel(
         system,
         "density",
-        (1 / g, -change / g),
+        (1 / rate, -change / rate),
         of=forms.legendre_arguments,
         purpose=f"1/g and -d(log g)/dt of the time rescaling g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",
     )

@@ -13,7 +13,8 @@ Sources: S. Reich, SIAM J. Numer. Anal. 36 (1999); E. Hairer, Appl. Numer. Math.
 M. Leok, SIAM J. Sci. Comput. 43 (2021), where the singular p_t direction of K = g (H + p_t) rules a Lagrangian out;
 with p_t = -E constant it does not.
 
-Alternatively g may leave the system unchanged and control the step sizes of its runs: see :func:`with_monitor`.
+Alternatively g may leave the system unchanged and control the step sizes of its runs: see
+:func:`with_time_transformation`.
 """
 
 from __future__ import annotations
@@ -33,23 +34,23 @@ from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem, TimeTransfor
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 from scvi_codegen.validation.argument_types import checks_arguments
 
-__all__ = ["CONTROLLERS", "reparametrise", "with_monitor"]
+__all__ = ["CONTROLLERS", "reparametrise", "with_time_transformation"]
 
 CONTROLLERS = ("symplectic", "reversible")
 """Uses of a time-rescaling function: transform the time of a system, or control the step sizes of its runs."""
 
 ENERGY_NAMES = ("E", "E_0", "energy", "initial_energy")
 """Candidate names of the energy parameter; the first that is unused is taken."""
-REVERSIBLE = 'the reversible controller: compile_stepper(..., monitor=...), controller = "reversible" in [run]'
+REVERSIBLE = 'the reversible controller: compile_stepper(time_transformation=...), controller = "reversible" in [run]'
 
 
 @checks_arguments(system=SYSTEM)
-def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSystem:
+def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> MechanicalSystem:
     """Return the system in a fictitious time tau with dt = g dtau; holonomic constraints are unchanged.
 
     Args:
         system: an autonomous Lagrangian or Hamiltonian system.
-        monitor: g > 0, as text or expression in the coordinates (for a Hamiltonian also in the momenta), or
+        time_transformation: g > 0, as text or expression in the coordinates (for a Hamiltonian also in the momenta), or
             ``"frequency"``, ``"distance"``, ``"potential"``, ``"arclength"``.
 
     Returns:
@@ -57,7 +58,7 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
 
     Raises:
         SystemDefinitionError: if the system depends on time, has forces, damping or nonholonomic constraints, or is
-            transformed already, and for an invalid ``monitor``.
+            transformed already, and for an invalid ``time_transformation``.
 
     >>> kepler = LagrangianSystem.from_text(
     ...     name="Kepler", coordinates=["r", "phi"], lagrangian="(r_dot**2 + r**2*phi_dot**2)/2 + 1/r")
@@ -85,7 +86,7 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
             f"does not support. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     energy_symbol = _free_symbol(system)
-    rate = time_rescaling_function(system, monitor)
+    rate = time_rescaling_function(system, time_transformation)
     named = replace(
         system,
         name=f"{system.name} in transformed time",
@@ -94,7 +95,9 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
         clock=TimeTransformation(
             rate=rate,
             energy=energy_symbol,
-            monitor=monitor if isinstance(monitor, str) else format_expression(rate),
+            time_transformation=time_transformation
+            if isinstance(time_transformation, str)
+            else format_expression(rate),
             plain=system,
         ),
     )
@@ -105,38 +108,39 @@ def reparametrise(system: MechanicalSystem, monitor: str | Expr) -> MechanicalSy
     return replace(named, lagrangian=_distributed(rate, slowed + energy_symbol))
 
 
-def with_monitor(
-    system: MechanicalSystem, monitor: str | Expr | None, controller: str | None = None
+def with_time_transformation(
+    system: MechanicalSystem, g: str | Expr | None, controller: str | None = None
 ) -> tuple[MechanicalSystem, str | Expr | None]:
-    """Return the system to integrate under a time transformation, and the ``monitor`` for its stepper.
+    """Return the system to integrate under a time transformation, and the ``time_transformation`` for its stepper.
 
     Args:
         system: the mechanical system.
-        monitor: g of dt = g dtau, or ``None`` for no time transformation.
+        g: rate of dt = g dtau, or ``None`` for no time transformation.
         controller: ``"symplectic"`` (also ``None``): the system in transformed time, :func:`reparametrise`;
-            ``"reversible"``: unchanged, for ``compile_stepper(..., monitor=...)``. Source of the names: E. Hairer,
-            Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2 and VIII.3.
+            ``"reversible"``: unchanged, for ``compile_stepper(..., time_transformation=...)``. Source of the names:
+            E. Hairer, Ch. Lubich, G. Wanner, *Geometric Numerical Integration*, VIII.2 and VIII.3.
 
     Raises:
-        SystemDefinitionError: for a controller without a monitor, an unknown controller, and as :func:`reparametrise`.
+        SystemDefinitionError: for a controller without a time transformation, an unknown controller, and as
+            :func:`reparametrise`.
     """
     if controller is not None and controller not in CONTROLLERS:
         raise SystemDefinitionError(f"controller must be {' or '.join(CONTROLLERS)}, not {controller!r}")
-    if monitor is None:
+    if g is None:
         if controller is not None:
             raise SystemDefinitionError(
-                f'the {controller} controller requires a monitor: give "frequency", or a formula'
+                f'the {controller} controller requires a time transformation: give "frequency", or a formula'
             )
         return system, None
     if controller != "reversible":
-        return reparametrise(system, monitor), None
+        return reparametrise(system, g), None
     if system.clock is not None:
         raise SystemDefinitionError(
             f"'{system.name}' has a time transformation already, which controls its steps: leave out "
             "the reversible controller, or use the system without the transformation"
         )
-    time_rescaling_function(system, monitor, in_time=True)  # validated here rather than at the first step
-    return system, monitor
+    time_rescaling_function(system, g, in_time=True)  # validated here rather than at the first step
+    return system, g
 
 
 def _distributed(factor: Expr, total: Expr) -> Expr:

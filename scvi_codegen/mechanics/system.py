@@ -51,13 +51,13 @@ class TimeTransformation:
         rate: g = dt/dtau, a function of the coordinates (for a Hamiltonian also of the momenta).
         energy: the parameter that is the energy of the initial state; the function of the system is then
             rate (energy of the state - energy), zero along trajectories.
-        monitor: the rate as requested, by name or as text; it and ``plain`` are for model files.
+        time_transformation: the rate as requested, by name or as text; it and ``plain`` are for model files.
         plain: the system in physical time.
     """
 
     rate: Expr
     energy: Symbol
-    monitor: str = field(default="", compare=False)
+    time_transformation: str = field(default="", compare=False)
     plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
 
 

@@ -35,37 +35,38 @@ MAX_SIMPLIFIED_OPERATIONS = 200
 """Maximum number of operations of a formula passed to ``simplify``, which takes about a second for so many."""
 
 
-def time_rescaling_function(system: MechanicalSystem, monitor: str | Expr, *, in_time: bool = False) -> Expr:
+def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time: bool = False) -> Expr:
     """Return the formula of a time-rescaling function, from its name, from text or from an expression.
 
     Args:
         system: the mechanical system.
-        monitor: a name among ``TIME_RESCALINGS``, or a formula.
+        g: a name among ``TIME_RESCALINGS``, or a formula.
         in_time: whether it may also depend on time and on inputs.
 
     Raises:
         SystemDefinitionError: for a formula in other symbols, and a name that is not applicable to the system.
     """
-    if isinstance(monitor, str) and monitor in TIME_RESCALINGS:
-        return TIME_RESCALINGS[monitor](system)
+    if isinstance(g, str) and g in TIME_RESCALINGS:
+        return TIME_RESCALINGS[g](system)
     driven = input_formulas(system.inputs, system.time) if in_time else {}
     time = (system.time, *driven) if in_time else ()
     known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
-    if isinstance(monitor, Expr):
-        formula = monitor.xreplace({free: known[free.name] for free in monitor.free_symbols if free.name in known})
-    elif isinstance(monitor, str):
-        formula = _read(monitor, known)
+    if isinstance(g, Expr):
+        formula = g.xreplace({free: known[free.name] for free in g.free_symbols if free.name in known})
+    elif isinstance(g, str):
+        formula = _read(g, known)
     else:
-        raise SystemDefinitionError(f"a monitor must be a name, text or a SymPy expression, not {monitor!r}")
+        raise SystemDefinitionError(f"time_transformation must be a name, text or a SymPy expression, not {g!r}")
     unknown = sorted(free.name for free in formula.free_symbols - set(known.values()))
     if unknown:
         kinds = "coordinates, momenta and parameters" if system.auxiliaries else "coordinates and parameters"
         raise SystemDefinitionError(
-            f"the monitor contains '{unknown[0]}': it may depend only on {kinds} of '{system.name}'"
+            f"the time transformation contains '{unknown[0]}': it may depend only on {kinds} of '{system.name}'"
         )
     if not formula.free_symbols & {*system.coordinates, *system.auxiliaries}:
         raise SystemDefinitionError(
-            f"the monitor {formula} is constant, so the step size would not adapt: use a formula in the coordinates"
+            f"the time transformation {formula} is constant, so the step size would not adapt: "
+            "use a formula in the coordinates"
         )
     return formula.xreplace(driven)
 
@@ -76,13 +77,13 @@ def _read(text: str, known: Mapping[str, Symbol]) -> Expr:
     except SystemDefinitionError as error:
         if text.isidentifier():
             raise SystemDefinitionError(
-                f"there is no monitor '{text}'{closest(text, list(TIME_RESCALINGS))} Use {', '.join(TIME_RESCALINGS)}, "
-                "or a formula"
+                f"there is no time transformation '{text}'{closest(text, list(TIME_RESCALINGS))} "
+                f"Use {', '.join(TIME_RESCALINGS)}, or a formula"
             ) from None
         raise error
 
 
-def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr, dict[int, Expr]]:
+def _potential_and_masses(system: MechanicalSystem, g: str) -> tuple[Expr, dict[int, Expr]]:
     """Return V(q) and the constant diagonal masses of T = sum m_i v_i^2 / 2."""
     motion = system.auxiliaries or system.velocities
     function = forms_of(system).energy
@@ -92,7 +93,7 @@ def _potential_and_masses(system: MechanicalSystem, monitor: str) -> tuple[Expr,
     constant = set(system.parameters)
     if len(diagonal) < len(derivatives) or any(not entry.free_symbols <= constant for entry in diagonal.values()):
         raise SystemDefinitionError(
-            f"the monitor '{monitor}' requires constant masses, one per coordinate, which "
+            f"the time transformation '{g}' requires constant masses, one per coordinate, which "
             f"'{system.name}' does not have: use a formula in its coordinates"
         )
     return rest, {i: 1 / entry for i, entry in diagonal.items()} if system.auxiliaries else diagonal
@@ -103,7 +104,7 @@ def _frequency(system: MechanicalSystem) -> Expr:
     entries = hessian(potential, system.coordinates)
     if not entries:
         raise SystemDefinitionError(
-            f"the forces of '{system.name}' do not depend on the position, so the monitor 'frequency' "
+            f"the forces of '{system.name}' do not depend on the position, so the time transformation 'frequency' "
             "is undefined: use a formula in its coordinates"
         )
     squares = sympy.Add(*((entry / masses[i]) ** 2 for (i, _), entry in entries.items()))
@@ -129,7 +130,7 @@ def _distance(system: MechanicalSystem) -> Expr:
     )
     if not squares:
         raise SystemDefinitionError(
-            f"the potential of '{system.name}' contains no distance in a denominator, so the monitor "
+            f"the potential of '{system.name}' contains no distance in a denominator, so the time transformation "
             "'distance' is undefined: use a formula in its coordinates"
         )
     return sympy.Add(*(square ** sympy.Rational(-3, 2) for square in squares)) ** sympy.Rational(-1, 2)
@@ -142,7 +143,9 @@ def _potential(system: MechanicalSystem) -> Expr:
 
 def _arclength(system: MechanicalSystem) -> Expr:
     if not system.auxiliaries:
-        raise SystemDefinitionError("the monitor 'arclength' contains momenta: use it with hamiltonian_of(system)")
+        raise SystemDefinitionError(
+            "the time transformation 'arclength' contains momenta: use it with hamiltonian_of(system)"
+        )
     function = forms_of(system).energy
     derivatives = gradient(function, (*system.coordinates, *system.auxiliaries)).values()
     return sympy.Add(*(derivative**2 for derivative in derivatives)) ** sympy.Rational(-1, 2)

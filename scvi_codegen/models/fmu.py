@@ -126,7 +126,8 @@ def _start(model: Model) -> ExampleRun:
     """Return the initial state, with velocities or momenta as in the model, and the step size."""
     if model.h is None or model.has_time_transformation:
         raise ModelFileError(
-            "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a monitor"
+            "an FMU requires a fixed step size in time: give a step h (--step, [run] step), without a time "
+            "transformation"
         )
     if model.h < 0:
         raise ModelFileError(f"the step size of an FMU must be positive, not {model.h:g}")

@@ -82,7 +82,7 @@ KEYS = {
 SECTIONS = ("system", "forces", "sizes", "parameters", "tables", "initial", "method", "run")
 OTHERS = {
     "": ("inputs",),
-    "system": ("inputs", "catalogue", "monitor"),
+    "system": ("inputs", "catalogue", "time_transformation"),
     "run": ("controller",),
 }
 """Keys of models without arrays, which indexed systems do not support."""

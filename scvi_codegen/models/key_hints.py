@@ -14,7 +14,7 @@ KEYS: Final = {
     "run": "step span steps tolerance every controller",
     "initial": "q q_dot p t",
     "method": "method degree quadrature",
-    "system": "lagrangian hamiltonian damping dissipation constraints monitor inputs",
+    "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",
 }
 EVENTS: Final = "events are supported in Python only, as stepper.integrate(..., events=[...])"
 LOCATIONS: Final = {

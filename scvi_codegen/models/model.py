@@ -61,7 +61,7 @@ class Model:
             ``integrate(error=)`` does, and warn if the bound is not confirmed. Requires adaptive steps.
         span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
         steps: number of fixed steps, or ``None`` if ``span`` is given.
-        monitor: time-rescaling function of the reversible controller, as text, see
+        time_transformation: time-rescaling function of the reversible controller, as text, see
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         save_every: stride of saved states, in steps.
         t: initial time.
@@ -83,7 +83,7 @@ class Model:
     error: float | None = None
     span: float | None = None
     steps: int | None = None
-    monitor: str | None = None
+    time_transformation: str | None = None
     save_every: int = 1
     t: float = 0.0
     inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
@@ -151,7 +151,7 @@ class Model:
     @property
     def has_time_transformation(self) -> bool:
         """True if there is a time transformation, so that a step size is one in tau."""
-        return self.monitor is not None or self.system.clock is not None
+        return self.time_transformation is not None or self.system.clock is not None
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -166,7 +166,7 @@ class Model:
             raise ModelFileError(
                 "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
             )
-        if self.monitor is not None:
+        if self.time_transformation is not None:
             raise ModelFileError(
                 "this requires a fixed step size, but the reversible controller varies it: leave out the controller"
             )
@@ -174,7 +174,7 @@ class Model:
 
     def first_step(self, stepper: Stepper) -> float:
         """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
-        if self.h is not None and self.monitor is None:
+        if self.h is not None and self.time_transformation is None:
             return self.h
         run = self.start(stepper)
         if self.system.clock is not None:
@@ -194,7 +194,7 @@ class Model:
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        return compile_stepper(self.system, self.method, solver=solver, monitor=self.monitor)
+        return compile_stepper(self.system, self.method, solver=solver, time_transformation=self.time_transformation)
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
@@ -264,7 +264,7 @@ class Model:
                 )
             own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
             h = largest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
-        to_end = h is None or self.monitor is not None
+        to_end = h is None or self.time_transformation is not None
         tolerance = self.tolerance if self.error is None else self.confirmed(stepper, options=options).local_tolerance
         return stepper.start(
             self.q,
@@ -292,10 +292,10 @@ class Model:
         return found
 
     def _check_length(self) -> None:
-        if self.monitor is not None and (self.system.clock is not None or self.span is None):
+        if self.time_transformation is not None and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
-                f"the reversible controller of the monitor {self.monitor} requires a time span (give "
-                "span, not steps), and a system without a time transformation"
+                f"the reversible controller of the time transformation {self.time_transformation} requires a time "
+                "span (give span, not steps), and a system without a time transformation"
             )
         if self.h is None:
             check_adaptive(self.tolerance, self.span)

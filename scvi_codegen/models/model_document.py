@@ -35,8 +35,8 @@ def document_of(model: Model) -> dict[str, Any]:
         document["system"]["damping"] = system.text_of(system.damping)
     if system.constraints:
         document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
-    if monitor := clock.monitor if clock else model.monitor:
-        document["system"]["monitor"] = monitor
+    if g := clock.time_transformation if clock else model.time_transformation:
+        document["system"]["time_transformation"] = g
     if system.inputs:
         document["system"]["inputs"] = list(system.inputs)
     if model.inputs:
@@ -57,7 +57,7 @@ def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
     length = {"steps": model.steps} if model.span is None else {"span": model.span}
     fields = {"step": model.h, "tolerance": model.tolerance, "error": model.error}
     step = {key: value for key, value in fields.items() if value is not None}
-    controller = {"controller": "reversible"} if model.monitor else {}
+    controller = {"controller": "reversible"} if model.time_transformation else {}
     run = {**step, **controller, **length, "save_every": model.save_every}
     return {"initial": {"t": model.t, **initial}, "method": method_section(model.method), "run": run}
 

@@ -4,8 +4,8 @@
     name = "planar pendulum"
     coordinates = ["q"]
     lagrangian = "m*l**2*q_dot**2/2 + m*g*l*cos(q)"     # several lines between """ and """
-    # monitor = "1/(1 + sin(q)**2)"                     # time transformation dt/dtau, or a name: the step size is then
-                                                        # in tau, the span in time; default: adaptive steps
+    # time_transformation = "1/(1 + sin(q)**2)"         # dt/dtau, or a name of one: the step size is then in tau,
+                                                        # the span in time; default: adaptive steps
 
     dissipation = "c*q_dot**2/2"                        # Rayleigh's function: forces -dD/dq_dot; default: 0
     # damping = "gamma"                                 # damping rate of all momenta, or a number; default: 0
@@ -41,7 +41,7 @@
     span = 100.0                                        # time span, or steps = 200
                                                         # or tolerance = 1e-9 for adaptive steps (without both:
                                                         # errors at round-off level); then negative spans go backward
-    # controller = "reversible"                         # of a monitor: physical time, integrated step density
+    # controller = "reversible"                         # g controls steps in physical time, by the step density
     save_every = 1                                      # stride of saved states; default: 1
 
 A Hamiltonian is given in ``[system]`` as ``hamiltonian = "p**2/2 - cos(q)"``, with ``momenta = ["p"]`` or
@@ -71,7 +71,7 @@ from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
-from scvi_codegen.mechanics.reparametrisation import with_monitor
+from scvi_codegen.mechanics.reparametrisation import with_time_transformation
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 from scvi_codegen.methods import fitted
@@ -113,7 +113,7 @@ __all__ = [
 Kind = TypeVar("Kind")
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
-SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "monitor")
+SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
 RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_every")
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
@@ -238,7 +238,7 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     entry = _read_catalogue(document.get("system", {}))
     if given.get("sizes"):
         raise ModelFileError('[sizes] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
-    if "monitor" in given.get("system", {}) and "error" in document.get("run", {}):
+    if "time_transformation" in given.get("system", {}) and "error" in document.get("run", {}):
         _check_error_bound(document["run"]["error"], given.get("run", {}))
     document, given = _without_inherited_step(document), _without_inherited_step(given)
     if entry is not None:
@@ -249,21 +249,22 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
     if entry is None:
         _check_complete(document)
         _check_used(document, given.get("parameters", {}))
-    with warnings.catch_warnings():  # a monitor, or constraints of a Hamiltonian, may use what its formula does not
+    with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         plain = _read_system(document, entry)
-    system, monitor = _read_monitor(plain, document)
-    warn_of_mistakes(system, () if monitor is None else (time_rescaling_function(system, monitor, in_time=True),))
+    system, g = _read_time_transformation(plain, document)
+    warn_of_mistakes(system, () if g is None else (time_rescaling_function(system, g, in_time=True),))
     state = _read_state(document["initial"], system)
     method = read_method(fitted(document["method"], system))
     inputs = _read_inputs(document.get("inputs", {}), folder)
-    return Model(system=system, method=method, monitor=monitor, inputs=inputs, **state, **read_run(document["run"]))
+    run = read_run(document["run"])
+    return Model(system=system, method=method, time_transformation=g, inputs=inputs, **state, **run)
 
 
 def _without_inherited_step(layer: Document) -> Document:
     """Drop an inherited step size, one in t, if a time transformation is added without a step size in tau."""
     run = layer.get("run", {})
-    if "monitor" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
+    if "time_transformation" not in layer.get("system", {}) or {"step", "tolerance", "error"} & run.keys():
         return layer
     return {**layer, "run": {**run, "tolerance": None}}
 
@@ -272,8 +273,8 @@ def _check_error_bound(error: Any, run: Section) -> None:
     """Raise an error for a time transformation added to a model with ``error``, unless that is replaced."""
     if not {"step", "tolerance"} & run.keys():
         raise ModelFileError(
-            f"[run] error = {error} requires adaptive steps, but a monitor has fixed steps in tau: "
-            "give --tolerance or --step with --monitor"
+            f"[run] error = {error} requires adaptive steps, but a time transformation has fixed steps in tau: "
+            "give --tolerance or --step with --time-transformation"
         )
 
 
@@ -297,7 +298,7 @@ def _check_complete(document: Document) -> None:
 def _check_used(document: Document, parameters: Section) -> None:
     """Raise an error for an added parameter that no formula contains."""
     section = document["system"]
-    formulas = [section.get(key, "") for key in (*FORMULAS, "monitor")]
+    formulas = [section.get(key, "") for key in (*FORMULAS, "time_transformation")]
     formula = " ".join(map(str, (*formulas, *document.get("forces", {}).values())))
     for name in parameters:
         if name not in re.findall(r"\w+", formula):
@@ -307,7 +308,7 @@ def _check_used(document: Document, parameters: Section) -> None:
 def _read_catalogue(section: Section) -> Problem | None:
     if "catalogue" not in section:
         return None
-    check_keys(section, ("catalogue", "monitor"), "key", "[system] beside catalogue")
+    check_keys(section, ("catalogue", "time_transformation"), "key", "[system] beside catalogue")
     name = text_of(section, "catalogue", "[system]")
     return in_section("[system]", lambda: problem(name))
 
@@ -347,9 +348,9 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     return in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 
-def _read_monitor(system: MechanicalSystem, document: Document) -> tuple[MechanicalSystem, Any]:
-    monitor, controller = document["system"].get("monitor"), document["run"].get("controller")
-    return in_section("[system] monitor", lambda: with_monitor(system, monitor, controller))
+def _read_time_transformation(system: MechanicalSystem, document: Document) -> tuple[MechanicalSystem, Any]:
+    g, controller = document["system"].get("time_transformation"), document["run"].get("controller")
+    return in_section("[system] time_transformation", lambda: with_time_transformation(system, g, controller))
 
 
 def _read_state(section: Section, system: MechanicalSystem) -> dict[str, Any]:

@@ -188,7 +188,7 @@ def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *,
         prefix=prefix,
         embedded=embedded,
         controlled=not embedded or model.h is None,
-        monitor=model.monitor,
+        time_transformation=model.time_transformation,
     )
     if single_file:
         source = source.amalgamated()
@@ -211,7 +211,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     from scvi_codegen.rendering.program_source import ExampleRun
 
     clock = model.system.clock
-    if model.h is None and (clock or model.monitor is not None):
+    if model.h is None and (clock or model.time_transformation is not None):
         raise ModelFileError(
             "a step size in tau cannot be found for a tolerance without compiling: give one (--step, [run] step)"
         )
@@ -226,14 +226,14 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
     else:
-        steps = OUTPUTS if model.h is None or model.monitor is not None else max(1, model.step_count)
+        steps = OUTPUTS if model.h is None or model.time_transformation is not None else max(1, model.step_count)
     save_every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,
         p=momenta,
         parameters=parameters,
         t=model.t,
-        h=model.h if model.monitor is None else None,
+        h=model.h if model.time_transformation is None else None,
         span=model.covered,
         tolerance=_chosen_by(model),
         controlled=controlled,
@@ -247,7 +247,7 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
 
 def _chosen_by(model: Model) -> float:
     """Return the tolerance of adaptive steps, or the step size in tau."""
-    if model.monitor is not None and model.h is not None:
+    if model.time_transformation is not None and model.h is not None:
         return abs(model.h)
     return COMPARED if model.h is not None else model.tolerance or 0.0
 
@@ -283,16 +283,14 @@ def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> A
     try:
         rate = evaluate(system.clock.rate, dict(zip(symbols, map(mp.mpf, numbers), strict=True)))
     except ArithmeticError as error:
-        raise StateError(f"the time transformation (monitor) has no value at the initial state: {error}") from error
+        raise StateError(f"the time transformation has no value at the initial state: {error}") from error
     if not rate > 0:
-        raise StateError(
-            f"the time transformation (monitor) is {float(rate):g} at the initial state: it must be positive"
-        )
+        raise StateError(f"the time transformation is {float(rate):g} at the initial state: it must be positive")
     return rate
 
 
 CLOCK = """
-Time is transformed: steps `h` are of tau, dt = g dtau with the monitor g, and `t` is carried along. The parameter
+Time is transformed: steps `h` are of tau, dt = g dtau and `t` is integrated along. The parameter
 `${energy}` is the energy of the initial state; `main.c` shows how it is set.
 """
 
@@ -318,7 +316,7 @@ int status = ${prefix}_advance_to(&run, t_end, tolerance, most_steps, most_steps
 """
 
 
-DENSITY = """By steps of `tau` in a time with dt = g dtau, g = ${monitor}, the same forward and backward, to `t_end`:
+DENSITY = """By steps of `tau` in a time with dt = g dtau, g = ${g}, the same forward and backward, to `t_end`:
 
 ```c
 static ${prefix}_run run;
@@ -342,13 +340,13 @@ for (long long steps; (steps = ${prefix}_next_steps(&run, t_end, h, inputs, para
 def _further(text: str, interface: Interface) -> str:
     """Return an optional part of the README."""
     inputs = ", ".join(f"`{name}`" for name in interface.inputs)
-    return Template(text).substitute(prefix=interface.prefix, inputs=inputs, monitor=interface.monitor)
+    return Template(text).substitute(prefix=interface.prefix, inputs=inputs, g=interface.time_transformation)
 
 
 def _readme(interface: Interface, *, with_model: bool, embedded: Embedded | None, controlled: bool) -> str:
     defaults = zip(interface.parameters, interface.defaults, strict=True)
     listed = ", ".join(f"`{name}` ({value!r})" for name, value in defaults)
-    advance, to_end = (DENSITY, "h=tau, t_end=t_end") if interface.monitor else (CONTROL, "t_end=t_end")
+    advance, to_end = (DENSITY, "h=tau, t_end=t_end") if interface.time_transformation else (CONTROL, "t_end=t_end")
     return (
         Template(_template("README_embedded.md" if embedded else "README.md"))
         .substitute(

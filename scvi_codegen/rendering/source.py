@@ -183,7 +183,7 @@ class Interface:
         constraints: formulas g of the constraints g = 0.
         inputs: names of tabulated inputs, each of which has five parameters.
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
-        monitor: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
+        time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
         conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
         solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
             version 0.1.
@@ -206,7 +206,7 @@ class Interface:
     momentum_names: tuple[str, ...] = ()
     has_fallback: bool = False
     energy_parameter: str = ""
-    monitor: str = ""
+    time_transformation: str = ""
     exchange_names: tuple[str, ...] = ()
     constraints: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()

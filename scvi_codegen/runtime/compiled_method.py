@@ -173,8 +173,8 @@ class CompiledMethod:
                 "if stepper.second_derivatives was used before pickling"
             )
         return (
-            ": in transformed time only first derivatives are available. Compile the original system with monitor=..., "
-            "or integrate it with t_end=..."
+            ": in transformed time only first derivatives are available. Compile the original system with "
+            "time_transformation=..., or integrate it with t_end=..."
         )
 
     def _load_fallback(self) -> building.Library:

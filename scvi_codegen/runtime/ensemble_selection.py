@@ -47,7 +47,7 @@ def ensemble_work(
     """Return an ensemble; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
-        StateError: if a shape, name or number is invalid, or the stepper has a monitor.
+        StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
     """
     if inputs is not None:
         if t_eval is not None:
@@ -56,7 +56,7 @@ def ensemble_work(
         return _work_with_inputs(
             stepper, q, p, inputs=inputs, velocity=velocity, t=t, parameters=parameters, **interval, **others
         )
-    _check_no_monitor(stepper)
+    _check_no_time_transformation(stepper)
     p = momenta_of_each(stepper, q, p, velocity, t, parameters)
     common = {"t": t, "parameters": parameters, **others}
     if h is None and steps is None and t_end is not None:
@@ -93,7 +93,8 @@ def _work_with_inputs(
     """Return an ensemble with inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
-        StateError: as :func:`~scvi_codegen.runtime.runs_with_inputs.checked_inputs`, and if the stepper has a monitor.
+        StateError: as :func:`~scvi_codegen.runtime.runs_with_inputs.checked_inputs`, and if the stepper has a time
+            transformation.
     """
     make: partial[EnsembleWithInputs] | partial[AdaptiveEnsembleWithInputs]
     if h is not None:
@@ -124,9 +125,10 @@ def _start_with_inputs(
     """Return inputs, momenta and (k, number of parameters) initial parameters; ``interval``: (start, final time).
 
     Raises:
-        StateError: as :func:`~scvi_codegen.runtime.runs_with_inputs.checked_inputs`, and if the stepper has a monitor.
+        StateError: as :func:`~scvi_codegen.runtime.runs_with_inputs.checked_inputs`, and if the stepper has a time
+            transformation.
     """
-    _check_no_monitor(stepper)
+    _check_no_time_transformation(stepper)
     count = len(checked_ensemble(stepper, q, q)[0])
     data = checked_inputs(stepper.interface, inputs, count)
     check_left_to_inputs(stepper.interface, parameters)
@@ -135,6 +137,6 @@ def _start_with_inputs(
     return data, momenta_of_each(stepper, q, p, velocity, interval[0], start), start
 
 
-def _check_no_monitor(stepper: Integrator) -> None:
-    if stepper.interface.monitor:
-        raise StateError("ensembles do not support monitor: compile the stepper without it")
+def _check_no_time_transformation(stepper: Integrator) -> None:
+    if stepper.interface.time_transformation:
+        raise StateError("ensembles do not support time_transformation: compile the stepper without it")

@@ -125,7 +125,7 @@ class Ensembles(ConstrainedStates):
             :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
 
         Raises:
-            MethodError: if time is transformed, or the stepper has a monitor.
+            MethodError: if time is transformed.
             StateError: if a shape, name or number is invalid.
         """
         p = momenta_of_each(self, q, p, velocity, t, parameters)

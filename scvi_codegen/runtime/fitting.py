@@ -153,7 +153,7 @@ def fit(
 
     Raises:
         FitError: if the measurements do not determine an unknown, or least squares do not converge.
-        MethodError: if the system has constraints or a monitor, or its time is transformed.
+        MethodError: if the system has constraints, or time is transformed.
         StateError: if a shape, name or number is invalid.
         StepFailedError: if a step of the initial guess fails.
     """

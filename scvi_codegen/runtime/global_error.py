@@ -111,7 +111,7 @@ class Confirmed:
         return math.nan if self.confirmation is None else self.confirmation.confirmed_until
 
 
-def checked_error(error: Any, others: Mapping[str, Any], *, monitored: bool = False) -> float:
+def checked_error(error: Any, others: Mapping[str, Any], *, has_tau: bool = False) -> float:
     """Return the requested global error as a number; raise StateError if combined with another step-size option."""
     wanted = checked_number(error, "the global error")
     if not 0.0 < wanted < 1.0:
@@ -122,7 +122,7 @@ def checked_error(error: Any, others: Mapping[str, Any], *, monitored: bool = Fa
                 f"error={wanted:g} and {name}={value!r} both determine the step size: error= requires adaptive steps; "
                 f"omit {name} and give t_end"
             )
-    if monitored:
+    if has_tau:
         raise StateError(
             f"error={wanted:g} requires adaptive steps, but a time transformation has fixed steps in tau: omit error "
             "and compare with a run of half the step size"

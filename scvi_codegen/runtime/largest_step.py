@@ -1,7 +1,7 @@
 """Largest step of tau that meets a tolerance, determined by short pilot runs.
 
-With a suitable monitor all steps of tau have similar errors, so a few hundred steps suffice. Later violations appear in
-``step_error`` of the run, the largest error of all its steps.
+With a suitable time transformation all steps of tau have similar errors, so a few hundred steps suffice. Later
+violations appear in ``step_error`` of the run, the largest error of all its steps.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ def largest_step(
     """Return the largest step of tau, to a fifth, whose estimated errors in a pilot run do not exceed the tolerance.
 
     Args:
-        stepper: stepper of a system in transformed time, or with a monitor.
+        stepper: stepper of a system in transformed time, or compiled with ``time_transformation``.
         q, p: (m,) initial state.
         span: duration of the run, negative for a run backward; pilot runs do not exceed it.
         tolerance: relative error of a step, 0 for round-off.
         t, parameters, options: as of :meth:`Stepper.integrate`.
 
     Returns:
-        The step, with the sign of the span in transformed time, positive with a monitor.
+        The step, with the sign of the span in transformed time, positive with the reversible controller.
 
     Raises:
         StateError: if a number is out of range, an input is not set, or no step is small enough.
@@ -64,9 +64,9 @@ def largest_step(
     if length == 0.0 or not 0.0 <= wanted < 1.0:
         raise StateError(f"span = {length:g} must not be 0, and tolerance = {wanted:g} must be in [0, 1)")
     check_inputs_given(stepper.interface, parameters)
-    monitored, end = bool(stepper.interface.monitor), t + length
-    start = partial(stepper.start, q, p, t=t, t_end=end if monitored else None, options=options)
-    first = abs(length) if monitored else length
+    reversible, end = bool(stepper.interface.time_transformation), t + length
+    start = partial(stepper.start, q, p, t=t, t_end=end if reversible else None, options=options)
+    first = abs(length) if reversible else length
     known = start(h=first, parameters=parameters).parameters
     rate = float(stepper.rates(q, p, known)[0])
 
@@ -97,7 +97,9 @@ def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> floa
         else:
             h, found = h / 2.0, pilot(h / 2.0)
     else:
-        raise StateError(f"no step of tau has an error below {allowed:.1e}: use another monitor or a larger tolerance")
+        raise StateError(
+            f"no step of tau has an error below {allowed:.1e}: use another time transformation or a larger tolerance"
+        )
     between = (h * 2.0 ** (k / REFINEMENTS) for k in range(REFINEMENTS - 1, 0, -1))
     return next((longest for longest in between if pilot(longest).error <= allowed), h)
 
@@ -125,5 +127,5 @@ def accuracy_message(step_error: float, t: float, tolerance: float) -> str | Non
         return None
     return (
         f"the step from t = {t:g} has a relative error of about {step_error:.1e}, but {allowed:.1e} was requested: "
-        "give a smaller step of tau, or use another monitor"
+        "give a smaller step of tau, or use another time transformation"
     )

@@ -121,8 +121,8 @@ class LinearisedMethod(CompiledMethod):
 
     def _check_fixed_steps(self, what: str) -> None:
         """Raise :class:`MethodError` for steppers whose step size is not the fixed h."""
-        if self.interface.monitor:
-            raise MethodError(f"{what} requires fixed steps h: compile the stepper without monitor")
+        if self.interface.time_transformation:
+            raise MethodError(f"{what} requires fixed steps h: compile the stepper without time_transformation")
         self._check_physical_time(what)
 
     def _check_physical_time(self, what: str) -> None:
@@ -130,7 +130,7 @@ class LinearisedMethod(CompiledMethod):
         if self.interface.energy_parameter:
             raise MethodError(
                 f"{what} is unavailable in transformed time: compile the original system, with fixed steps h, or with "
-                "monitor=... or t_end=..."
+                "time_transformation=... or t_end=..."
             )
 
     def _energy_gradient(self, q: Array, p: Array, parameters: Array) -> Array:

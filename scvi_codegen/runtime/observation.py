@@ -18,7 +18,7 @@ from scvi_codegen.runtime.dense_output import states_and_steps_at, step_sizes_at
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.run_loop import CALL_SECONDS, record, trajectory_of
-from scvi_codegen.runtime.singular_time import ProgressMonitor
+from scvi_codegen.runtime.singular_time import ProgressWatch
 from scvi_codegen.runtime.time_transformation import part_of_step
 from scvi_codegen.runtime.times import WHOLE
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -76,7 +76,7 @@ class Observation:
         self._keep(record(self.run, 0), first=True)
         most = max(1, CHUNK_NUMBERS // self.run.stepper.dimension)
         chunk_size, done = min(FIRST_STEPS, most), 0
-        watch = ProgressMonitor(self.run.stepper, self.end if plan is None else plan.t_end if plan.tau else None)
+        watch = ProgressWatch(self.run.stepper, self.end if plan is None else plan.t_end if plan.tau else None)
         while done < most_steps and not self.run.arrived and not stop():
             size, began = int(min(chunk_size, most_steps - done)), time.perf_counter()
             before = self.run.t, self.run.steps

@@ -91,7 +91,7 @@ def periodic_orbit(
     Raises:
         OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
             system is not periodic in time with this period.
-        MethodError: if time is transformed, the stepper has a monitor or constraints, an energy is prescribed with
+        MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
             forces, or the period of a time-dependent system is free.
         StateError: if a shape, name or number is invalid, or an input is not set.
         StepFailedError: if a step from the initial guess fails.

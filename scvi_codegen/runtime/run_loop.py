@@ -14,7 +14,7 @@ from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.memory import Memory, fill
-from scvi_codegen.runtime.singular_time import ProgressMonitor, lost_energy_surface
+from scvi_codegen.runtime.singular_time import ProgressWatch, lost_energy_surface
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
@@ -100,7 +100,7 @@ def record_until(
     save_every = checked_count(save_every, "save_every", least=1)
     pieces = [_Piece.of(memory)]
     done, chunk_size = 0, 256 * save_every
-    watch = ProgressMonitor(memory.stepper, memory.plan.t_end if memory.plan and memory.plan.tau else None)
+    watch = ProgressWatch(memory.stepper, memory.plan.t_end if memory.plan and memory.plan.tau else None)
     while not memory.arrived and (steps is None or done < steps):
         size, began, before = (
             chunk_size if steps is None else min(chunk_size, steps - done),

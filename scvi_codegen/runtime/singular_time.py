@@ -14,7 +14,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["ProgressMonitor", "lost_energy_surface"]
+__all__ = ["ProgressWatch", "lost_energy_surface"]
 
 MOST_STEPS: Final = 1e9
 """Number of remaining steps at the present rate above which slow progress counts."""
@@ -28,8 +28,8 @@ ENERGY_ERROR: Final = 1e-3
 """Relative energy error that shows that g (H - E) is below rounding."""
 
 
-class ProgressMonitor:
-    """Progress in t of runs with a monitor function; ``end`` is the target time, ``None`` for other runs."""
+class ProgressWatch:
+    """Progress in t of runs with a time transformation; ``end`` is the target time, ``None`` for other runs."""
 
     def __init__(self, stepper: Integrator, end: float | None) -> None:
         self.stepper, self.end, self.best, self.slow = stepper, end, 0.0, 0
@@ -77,8 +77,8 @@ def lost_energy_surface(states: Trajectory, longest: float) -> StepFailedError |
 
 def _singular_time_error(stepper: Integrator, t: float, number: int, evidence: str) -> StepFailedError:
     return StepFailedError(
-        f"step {number} at t = {t:.17g} failed: the time transformation dt = g dtau is singular there: its monitor g "
-        f"reaches 0 ({evidence}). A monitor must be positive all along the motion: use another, or adaptive steps",
+        f"step {number} at t = {t:.17g} failed: the time transformation dt = g dtau is singular there: g "
+        f"reaches 0 ({evidence}). g must be positive along the whole motion: use another, or adaptive steps",
         status="stalled",
         step=number,
         t=t,

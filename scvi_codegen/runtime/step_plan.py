@@ -18,7 +18,7 @@ class StepPlan:
     Attributes:
         t_end: target time.
         tolerance: largest relative error of a step; 0 for round-off.
-        tau: instead of a tolerance, the constant step of fictitious time of a monitor; 0 otherwise.
+        tau: instead of a tolerance, the constant step of fictitious time of a time transformation; 0 otherwise.
     """
 
     t_end: float
@@ -35,13 +35,14 @@ class StepPlan:
         return cls(t_end=checked_number(t_end, "t_end"), tolerance=allowed)
 
     @classmethod
-    def monitored(cls, monitor: str, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
-        """Construct the step plan of a stepper with a monitor from user arguments."""
+    def in_tau(cls, g: str, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan:
+        """Construct the step plan of a stepper with a time transformation from user arguments."""
         if h is None or t_end is None or tolerance is not None:
             raise StateError(
-                f"a stepper with the monitor {monitor} requires h (constant step in tau) and t_end, and no tolerance"
+                f"a stepper with the time transformation {g} requires h (constant step in tau) and t_end, and no "
+                "tolerance"
             )
         tau = checked_step(h)
         if tau < 0.0:
-            raise StateError(f"h = {h:g} must be positive with a monitor: t_end determines the direction")
+            raise StateError(f"h = {h:g} must be positive with a time transformation: t_end determines the direction")
         return cls(t_end=checked_number(t_end, "t_end"), tau=tau)

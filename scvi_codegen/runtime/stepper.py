@@ -115,8 +115,8 @@ class Stepper(Ensembles):
                 (:func:`~scvi_codegen.reparametrise`).
             steps: number of steps.
             t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly. With
-                h (also in transformed time and with a monitor, :func:`~scvi_codegen.compile_stepper`) the last step is
-                shorter unless t_end - t is a multiple of h (within 1e-9).
+                h (also in transformed time and with ``time_transformation``, :func:`~scvi_codegen.compile_stepper`) the
+                last step is shorter unless t_end - t is a multiple of h (within 1e-9).
             tolerance: relative local error of an adaptive step; by default round-off.
             save_every: steps between saved states; the state at t_end is also saved.
             t: initial time.
@@ -155,7 +155,7 @@ class Stepper(Ensembles):
         common: dict[str, Any] = {"t": t, "options": options}
         if error is not None:
             return confirmed_run(
-                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, monitored=self._has_tau),
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, has_tau=self._has_tau),
                 partial(stepper.integrate, inputs=inputs),
                 partial(stepper.with_events(()).integrate, inputs=inputs),
                 (q, p, velocity),
@@ -163,14 +163,14 @@ class Stepper(Ensembles):
                 {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
         start = partial(stepper.start, q, p, velocity=velocity, h=h, tolerance=tolerance, **common)
-        to_end = h is None or bool(self.interface.monitor)
+        to_end = h is None or bool(self.interface.time_transformation)
         if data is None:
             run = start(t_end=t_end if to_end else None, parameters=parameters)
             check = GrowthCheck(run, check_growth)
             found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
             check.warn(found)
             return found
-        end = final_time(t, None if self.interface.monitor else h, steps, t_end)
+        end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         run = start(t_end=end if to_end else None, parameters=values(first_inner_time(t, end)))
         check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
@@ -181,8 +181,8 @@ class Stepper(Ensembles):
 
     @property
     def _has_tau(self) -> bool:
-        """Return whether steps are steps of tau, by a time transformation or a monitor."""
-        return bool(self.interface.energy_parameter or self.interface.monitor)
+        """Return whether steps are steps of tau, by a transformed system or the reversible controller."""
+        return bool(self.interface.energy_parameter or self.interface.time_transformation)
 
     @checks_arguments(StateError)
     def start(
@@ -202,8 +202,8 @@ class Stepper(Ensembles):
         p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
-        if self.interface.monitor:
-            plan = StepPlan.monitored(self.interface.monitor, h, t_end, tolerance)
+        if self.interface.time_transformation:
+            plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
             return Run.started(self._adaptive(), q, p, h=plan, t=t, parameters=parameters, options=options)
         if h is None and self.interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
@@ -231,10 +231,10 @@ class Stepper(Ensembles):
     ) -> Run:
         """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
-        ``h`` is required with a monitor and not allowed otherwise.
+        ``h`` is required with a time transformation and not allowed otherwise.
         """
-        if self.interface.monitor:
-            plan = StepPlan.monitored(self.interface.monitor, h, t_end, tolerance)
+        if self.interface.time_transformation:
+            plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
             return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
         if h is not None:
             raise StateError("omit h: the saved run contains its step size")
@@ -257,7 +257,7 @@ def _recorded(
     """Return the states of a run without inputs; arguments as of :meth:`Stepper.integrate`."""
     interface = run.stepper.interface
     clocked = bool(interface.energy_parameter)
-    if h is not None and t_end is not None and not interface.monitor:
+    if h is not None and t_end is not None and not interface.time_transformation:
         whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
         if whole is None or whole % checked_count(save_every, "save_every", least=1):
             return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress))

@@ -96,7 +96,7 @@ def verify(
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
     given = _given(system, stepper, q, p, h, t)
     steps, single = stepper, at_fixed_energy(system, stepper.energy(given.q, given.p, given.t))
-    if single is not system or stepper.interface.monitor:
+    if single is not system or stepper.interface.time_transformation:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), given)
     paced = steps is not stepper or tolerance is not None

@@ -135,7 +135,7 @@ def _time_transformation_checks(runs_tested: VariableSteps) -> Iterator[tuple[st
 
 def _adaptive_checks(runs_tested: VariableSteps) -> Iterator[tuple[str, str, Any]]:
     yield "adaptive steps", "each equals a single step of the same size", _equal_single_steps
-    if runs_tested.stepper.interface.monitor:
+    if runs_tested.stepper.interface.time_transformation:
         yield (
             "step density",
             "halving tau reduces the deviation from dt = g dtau at least 2.5-fold",
@@ -214,7 +214,7 @@ def _there_and_back(runs_tested: VariableSteps) -> Finding:
 def _adaptive_run(runs_tested: VariableSteps, part: float = 1.0) -> Trajectory:
     first = runs_tested.tested.states[0]
     end = first.t + SPAN * first.h
-    if runs_tested.stepper.interface.monitor:
+    if runs_tested.stepper.interface.time_transformation:
         return runs_tested.run(h=part * runs_tested.tau, t_end=end)
     return runs_tested.run(t_end=end, tolerance=runs_tested.tolerance or None)
 
@@ -246,10 +246,10 @@ def _follow_step_density(runs_tested: VariableSteps) -> Finding:
 def _density_deviation(runs_tested: VariableSteps, run: Trajectory, tau: float) -> float:
     """Return the largest relative deviation of the steps from tau (g_k + g_{k+1}) / 2."""
     system = runs_tested.motion.system
-    monitor = time_rescaling_function(system, runs_tested.stepper.interface.monitor, in_time=True)
+    rate = time_rescaling_function(system, runs_tested.stepper.interface.time_transformation, in_time=True)
     symbols = (*system.coordinates, *system.auxiliaries, system.time, *system.parameters)
     parameters = [mp.mpf(value) for value in system.defaults]
-    tape, g = Tape([monitor], symbols), []
+    tape, g = Tape([rate], symbols), []
     for q, p, t in zip(run.q, run.p, run.t, strict=True):
         g += tape([*numbers(q), *numbers(p if system.auxiliaries else ()), mp.mpf(float(t)), *parameters])
     wanted = tau * (np.array(g[1:-1], dtype=float) + np.array(g[:-2], dtype=float)) / 2

@@ -253,18 +253,27 @@ class TestChoices:
             ("relativistic-particle --velocity 2", "q = "),
             ("kepler --tolerance 1e-6 --advise 1e-6", "--tolerance and --advise exclude each other"),
             ("kepler --advise 1e-6 --step 0.1", "--advise determines the step size: omit --step"),
-            ("kepler --advise 1e-6 --monitor distance --step 0.1", "--advise determines the step size: omit --step"),
-            ("kepler --advise 1e-6 --monitor distance", "--advise is not available with a time transformation"),
+            (
+                "kepler --advise 1e-6 --time-transformation distance --step 0.1",
+                "--advise determines the step size: omit --step",
+            ),
+            (
+                "kepler --advise 1e-6 --time-transformation distance",
+                "--advise is not available with a time transformation",
+            ),
             ("kepler --checkpoint 5", "--checkpoint requires a run recorded in a folder (-o NAME.run)"),
             ("kepler -o orbit.npz --checkpoint-steps 5", "--checkpoint-steps requires a run recorded in a folder"),
             (
-                "kepler --monitor distance --step 0.1 --span 1 -o orbit.run",
+                "kepler --time-transformation distance --step 0.1 --span 1 -o orbit.run",
                 "a recorded run in transformed time needs a number of steps",
             ),
             ("kepler -o orbit.run --plot orbit.png", "--plot is not available for a run recorded in a folder"),
             ("kepler --ensemble states.csv --plot orbit.png", "--plot is not available with --ensemble"),
             ("kepler --ensemble states.csv --advise 1e-6", "--advise is not available with --ensemble"),
-            ("kepler --ensemble states.csv --monitor distance --step 0.1", "each trajectory has its own times"),
+            (
+                "kepler --ensemble states.csv --time-transformation distance --step 0.1",
+                "each trajectory has its own times",
+            ),
         ],
     )
     def test_mistakes_are_usage_errors(self, words, message):

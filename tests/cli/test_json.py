@@ -111,8 +111,19 @@ def test_failed_run_reports_how_far_it_got():
     found = document("run", "kepler", "--q", "1,0", "--velocity", "0,0", "--tolerance", "1e-9", "--span", "3", status=1)
     assert "step" in found["failure"]
     assert 1.0 < found["final"]["t"] < math.pi / 8**0.5
-    far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
-    assert "use another monitor" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
+    far = (
+        "--q",
+        "1.97,0",
+        "--velocity",
+        "0,0.1234",
+        "--span",
+        "6",
+        "--time-transformation",
+        "1e-3*(1 + (q1**2 + q2**2)/1000)",
+    )
+    assert (
+        "use another time transformation" in document("run", "kepler", *far, "--tolerance", "1e-10", status=1)["missed"]
+    )
     assert invoke("run", "keplr", "--json", status=2).stdout == ""
 
 

@@ -109,7 +109,7 @@ def test_options_of_array_systems(ring: str) -> None:
     ("words", "message"),
     [
         (("run", "--advise", "1e-9"), "--advise is not available for indexed models"),
-        (("run", "--monitor", "frequency"), "monitor is not supported for indexed systems"),
+        (("run", "--time-transformation", "frequency"), "time_transformation is not supported for indexed systems"),
         (("run", "-o", "ring.csv"), "use .npz"),
         (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),

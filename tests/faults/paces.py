@@ -65,7 +65,7 @@ PACES = (
         within="take_step",
     ),
     text(
-        "time that runs ahead of the steps of a monitor",
+        "time that runs ahead of the steps of a time transformation",
         REVERSIBLE,
         r"now->step.h\);",
         "now->step.h * (1 + 1e-10));",

@@ -41,7 +41,7 @@ class Case:
     p: tuple[float, ...]
     h: float
     tolerance: float | None = None
-    monitor: str | None = None
+    time_transformation: str | None = None
 
 
 class Sabotage:
@@ -106,7 +106,9 @@ def certified(case: Case, apply: Callable[[Sabotage], None] | None = None, *, ed
     """The certificate of a case with a fault in force, or without one."""
     flags = QUICK_FLAGS if apply is None else (*QUICK_FLAGS, f"-DFAULT_{next(_numbers)}")
     with _sabotaged(apply) as sabotage:
-        stepper = compiler.compile_stepper(case.system, case.method(), flags=flags, monitor=case.monitor)
+        stepper = compiler.compile_stepper(
+            case.system, case.method(), flags=flags, time_transformation=case.time_transformation
+        )
         certificate = verify(
             case.system, case.method(), case.q, case.p, h=case.h, stepper=stepper, tolerance=case.tolerance
         )

@@ -166,8 +166,8 @@ def test_unsupported_functions_are_rejected():
         casadi_flow("kepler", steps=3)
     with pytest.raises(StateError, match="steps must be at least 1, not 0"):
         casadi_flow(kepler(), steps=0)
-    with pytest.raises(MethodError, match="monitor"):
-        casadi_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
+    with pytest.raises(MethodError, match="time_transformation"):
+        casadi_flow(compile_stepper(problem("kepler").system, SVI(2), time_transformation="q1**2 + q2**2"), steps=3)
     flow = casadi_flow(kepler(), steps=3)
     given = symbols(flow)
     with pytest.raises(RuntimeError, match="Derivatives cannot be calculated"):

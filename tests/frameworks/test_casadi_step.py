@@ -113,6 +113,6 @@ def test_unsupported_methods_are_reported():
     with pytest.raises(MethodError, match="no quadrature along its curve"):
         casadi_step(TOWED, RadauIIA(2), along=["u**2"])
     with pytest.raises(MethodError, match="transformed time"):
-        casadi_step(reparametrise(KEPLER, monitor="q1**2 + q2**2"), SVI(2))
+        casadi_step(reparametrise(KEPLER, time_transformation="q1**2 + q2**2"), SVI(2))
     with pytest.raises(ExpressionError, match="'z'"):
         casadi_step(TOWED, SVI(2), along=["z"])

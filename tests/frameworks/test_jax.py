@@ -243,8 +243,8 @@ def test_unsupported_functions_are_rejected():
         flow(q, p, h=H, parameters={"Mu": 1.0})
     with pytest.raises(StateError, match="must be a multiple of save_every = 3"):
         jax_flow(kepler(), steps=10, save_every=3)
-    with pytest.raises(MethodError, match="monitor"):
-        jax_flow(compile_stepper(problem("kepler").system, SVI(2), monitor="q1**2 + q2**2"), steps=3)
+    with pytest.raises(MethodError, match="time_transformation"):
+        jax_flow(compile_stepper(problem("kepler").system, SVI(2), time_transformation="q1**2 + q2**2"), steps=3)
     clocked = compile_stepper(reparametrise(problem("kepler").system, "q1**2 + q2**2"), SVI(2))
     with pytest.raises(MethodError, match="a flow is unavailable in transformed time"):
         jax_flow(clocked, steps=3)(q, p, h=H)

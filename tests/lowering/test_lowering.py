@@ -198,7 +198,8 @@ def test_gradient_of_kepler_has_no_division():
 
 
 def test_odd_quarter_powers_share_a_root_of_a_root():
-    """r^(3/2) of the squared distance, and its gradient: what the monitor "frequency" makes of Kepler's problem."""
+    """r^(3/2) of the squared distance, and its gradient: as in the time transformation "frequency" of Kepler's
+    problem."""
     r2 = x**2 + y**2
     quarters = [r2 ** sympy.Rational(n, 4) for n in (-7, -3, -1)]
     counts = kernel_of(*quarters).operation_counts()

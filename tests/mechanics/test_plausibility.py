@@ -128,8 +128,12 @@ span = 1.0
 
 
 @pytest.mark.parametrize(
-    ("monitor", "controller", "count"),
-    [("", "", 1), ('monitor = "1 + k*x**2"', "", 0), ('monitor = "1 + k*x**2"', 'controller = "reversible"', 0)],
+    ("time_transformation", "controller", "count"),
+    [
+        ("", "", 1),
+        ('time_transformation = "1 + k*x**2"', "", 0),
+        ('time_transformation = "1 + k*x**2"', 'controller = "reversible"', 0),
+    ],
 )
-def test_a_model_file_is_examined_with_its_time_transformation(monitor, controller, count):
-    assert len(messages(parse_model, FILE.format(monitor, controller))) == count
+def test_a_model_file_is_examined_with_its_time_transformation(time_transformation, controller, count):
+    assert len(messages(parse_model, FILE.format(time_transformation, controller))) == count

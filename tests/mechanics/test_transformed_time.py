@@ -1,4 +1,4 @@
-"""Transformed time: L^ = g (L(q, q'/g) + E) and K = g (H - E), monitors, and other coordinates, in formulas."""
+"""Transformed time: L^ = g (L(q, q'/g) + E) and K = g (H - E), formulas of g, other coordinates."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ THREE_BODIES = sc.LagrangianSystem.from_text(
     lagrangian="""(a_dot**2 + 2*b_dot**2 + 3*c_dot**2)/2
         + 2/sqrt((a - b)**2 + 1) + 3/sqrt((a - c)**2 + 1) + 6/sqrt((b - c)**2 + 1)""",
 )
-MONITORS = (
+TIME_RESCALINGS = (
     (KEPLER, "frequency"),
     (KEPLER, "distance"),
     (KEPLER, "potential"),
     (KEPLER, "m*sqrt(x**2 + y**2)"),
     (CHARGED, "1/(1 + x**2 + y**2)"),
 )
-CASES = [pytest.param(system, monitor, id=f"{system.name}: {monitor}") for system, monitor in MONITORS]
+CASES = [pytest.param(system, g, id=f"{system.name}: {g}") for system, g in TIME_RESCALINGS]
 
 
 @cache
-def transformed(system: sc.LagrangianSystem, monitor: str) -> sc.LagrangianSystem:
-    found = sc.reparametrise(system, monitor)
+def transformed(system: sc.LagrangianSystem, g: str) -> sc.LagrangianSystem:
+    found = sc.reparametrise(system, g)
     assert isinstance(found, sc.LagrangianSystem)
     return found
 
 
-@pytest.mark.parametrize(("system", "monitor"), CASES)
-def test_lagrangian_is_rate_times_lagrangian_and_energy(system: sc.LagrangianSystem, monitor: str) -> None:
-    hat = transformed(system, monitor)
+@pytest.mark.parametrize(("system", "g"), CASES)
+def test_lagrangian_is_rate_times_lagrangian_and_energy(system: sc.LagrangianSystem, g: str) -> None:
+    hat = transformed(system, g)
     assert hat.clock is not None
     for point in sample_points(system.velocities, system.coordinates, system.constants):
         energy = mp.mpf("-0.3125")
@@ -62,12 +62,10 @@ def test_lagrangian_is_rate_times_lagrangian_and_energy(system: sc.LagrangianSys
         assert abs(value - expected) <= mp.mpf(10) ** -50 * (1 + abs(expected))
 
 
-@pytest.mark.parametrize(("system", "monitor"), CASES)
-def test_velocities_and_forces_are_those_of_the_system_times_the_rate(
-    system: sc.LagrangianSystem, monitor: str
-) -> None:
+@pytest.mark.parametrize(("system", "g"), CASES)
+def test_velocities_and_forces_are_those_of_the_system_times_the_rate(system: sc.LagrangianSystem, g: str) -> None:
     """Hamilton's equations on the level of the energy, so that the orbits are the same; to 45 digits."""
-    hat, own = transformed(system, monitor), ExactMotion(system)
+    hat, own = transformed(system, g), ExactMotion(system)
     for q, p in ((("0.75", "0.5"), ("-0.25", "0.5")), (("-1.5", "0.125"), ("2", "-1"))):
         state = numbers(q), numbers(p), mp.zero
         moved = ExactMotion(hat, [*map(mp.mpf, system.defaults), own.energy(*state)])
@@ -78,9 +76,9 @@ def test_velocities_and_forces_are_those_of_the_system_times_the_rate(
         assert abs(moved.energy(*state)) < mp.mpf(10) ** -40
 
 
-@pytest.mark.parametrize(("system", "monitor"), CASES)
-def test_hamiltonian_and_lagrangian_transformations_are_equivalent(system: sc.LagrangianSystem, monitor: str) -> None:
-    hat = sc.hamiltonian_of(transformed(system, monitor))
+@pytest.mark.parametrize(("system", "g"), CASES)
+def test_hamiltonian_and_lagrangian_transformations_are_equivalent(system: sc.LagrangianSystem, g: str) -> None:
+    hat = sc.hamiltonian_of(transformed(system, g))
     given = sc.reparametrise(sc.hamiltonian_of(system), hat.clock.rate)
     assert isinstance(given, sc.HamiltonianSystem)
     assert given.clock == hat.clock
@@ -145,7 +143,7 @@ REFUSED = {
     "constant": (KEPLER, "m*mu", "constant"),
     "velocity": (KEPLER, "1/sqrt(1 + x_dot**2)", "x_dot"),
     "unknown": (KEPLER, "sqrt(x**2 + z**2)", "z"),
-    "misspelt": (KEPLER, "frequenzy", "no monitor 'frequenzy'.*'frequency'"),
+    "misspelt": (KEPLER, "frequenzy", "no time transformation 'frequenzy'.*'frequency'"),
     "no text": (KEPLER, 3, "not 3"),
     "masses": (CHARGED, "frequency", "requires constant masses, one per coordinate"),
     "uniform": (FREE, "frequency", "forces of 'free' do not depend on the position"),
@@ -156,9 +154,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_systems_without_a_time_transformation_are_rejected(name: str) -> None:
-    system, monitor, message = REFUSED[name]
+    system, g, message = REFUSED[name]
     with pytest.raises(SystemDefinitionError, match=message):
-        sc.reparametrise(system, monitor)
+        sc.reparametrise(system, g)
 
 
 @pytest.mark.parametrize(

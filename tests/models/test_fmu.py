@@ -349,13 +349,16 @@ def test_unsuitable_models_and_names_are_rejected(tmp_path):
     for wrong, words in (
         (replace(model, h=None, tolerance=1e-6), "fixed step size"),
         (replace(model, h=-0.1), "must be positive"),
-        (replace(Model.from_problem(problem("kepler"), SVI(4)), monitor="distance"), "monitor"),
+        (
+            replace(Model.from_problem(problem("kepler"), SVI(4)), time_transformation="distance"),
+            "without a time transformation",
+        ),
     ):
         with pytest.raises(ModelFileError, match=words):
             generate_fmu(wrong, tmp_path / "push.fmu")
     clocked = reparametrise(problem("kepler").system, "distance")
     entry = problem("kepler")
-    with pytest.raises(ModelFileError, match="monitor"):
+    with pytest.raises(ModelFileError, match="time transformation"):
         generate_fmu(replace(model, system=clocked, q=entry.q, velocity=entry.velocity, t=0.0), tmp_path / "push.fmu")
     for name in ("pendulum", "Pendulum.fmu", "while.fmu"):
         with pytest.raises(PackageError):

@@ -16,7 +16,7 @@ from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_mo
 from scvi_codegen.models.package import generate_package, load_package
 
 STRICT = "-O2 -std=c99 -Wall -Wextra -Werror -Wno-psabi -ffp-contract=off"
-BY_CLOCK = {"system": {"monitor": "frequency"}, "run": {"step": 0.2, "span": 20.0}}
+BY_CLOCK = {"system": {"time_transformation": "frequency"}, "run": {"step": 0.2, "span": 20.0}}
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +30,13 @@ def invoke(*words: str, status: int = 0) -> str:
     return result.output
 
 
-@pytest.mark.parametrize("monitor", ["frequency", "(q1**2 + q2**2)**(3/4)"])
-def test_files_contain_the_time_transformation(monitor: str) -> None:
-    found = catalogue_model("kepler", {"system": {"monitor": monitor}, "parameters": {"mu": 1.5}})
+@pytest.mark.parametrize("time_transformation", ["frequency", "(q1**2 + q2**2)**(3/4)"])
+def test_files_contain_the_time_transformation(time_transformation: str) -> None:
+    found = catalogue_model(
+        "kepler", {"system": {"time_transformation": time_transformation}, "parameters": {"mu": 1.5}}
+    )
     text = dump_model(found)
-    assert f'monitor = "{monitor}"' in text
+    assert f'time_transformation = "{time_transformation}"' in text
     assert "E =" not in text
     again = parse_model(text)
     assert again == found
@@ -44,16 +46,16 @@ def test_files_contain_the_time_transformation(monitor: str) -> None:
 
 def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
     text = dump_model(sc.Model.from_problem(sc.problem("kepler")))
-    assert parse_model(text, {"system": {"monitor": "frequency"}}).h is None
+    assert parse_model(text, {"system": {"time_transformation": "frequency"}}).h is None
     assert parse_model(text, BY_CLOCK) == model
     with_a = text.replace("[parameters]", "[parameters]\na = 1.0")
-    layer = {"system": {"monitor": "1/(a + q1**2)"}, "parameters": {"a": 2.0}}
+    layer = {"system": {"time_transformation": "1/(a + q1**2)"}, "parameters": {"a": 2.0}}
     assert parse_model(with_a, layer).parameters["a"] == 2.0
     assert parse_model(dump_model(model)).h == 0.2
     with pytest.raises(ModelFileError, match="not known in advance"):
         _ = model.step_count
-    with pytest.raises(ModelFileError, match="no monitor 'frequencies'"):
-        catalogue_model("kepler", {"system": {"monitor": "frequencies"}})
+    with pytest.raises(ModelFileError, match="no time transformation 'frequencies'"):
+        catalogue_model("kepler", {"system": {"time_transformation": "frequencies"}})
     changed = sc.change_coordinates(
         sc.reparametrise(sc.problem("kepler").system, "frequency"),
         {"q1": "u**2 - w**2", "q2": "2*u*w"},
@@ -65,7 +67,9 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
 
 def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> None:
     orbit = tmp_path / "orbit.npz"
-    said = invoke("run", "kepler", "--monitor", "frequency", "--step", "0.2", "--span", "20", "-o", str(orbit))
+    said = invoke(
+        "run", "kepler", "--time-transformation", "frequency", "--step", "0.2", "--span", "20", "-o", str(orbit)
+    )
     assert "of 0.2 in tau from t = 0 to t = 20;" in said
     stepper = sc.compile_stepper(model.system, model.method)
     run = stepper.integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
@@ -73,20 +77,29 @@ def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> Non
         assert np.array_equal(file["t"], run.t)
         assert np.array_equal(file["q"], run.q)
     assert f"{run.q[-1, 0]:.17g}" in said
-    back = invoke("run", "kepler", "--monitor", "frequency", "--step", "-0.2", "--span", "5")
+    back = invoke("run", "kepler", "--time-transformation", "frequency", "--step", "-0.2", "--span", "5")
     assert "to t = -5;" in back
 
 
 def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
-    said = invoke("run", "kepler", "--monitor", "frequency", "--span", "50", "--tolerance", "1e-8")
+    said = invoke("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
     error = float(said.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
-    far = ("--q", "1.9999,0", "--velocity", "0,0.00707", "--span", "6", "--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)")
+    far = (
+        "--q",
+        "1.9999,0",
+        "--velocity",
+        "0,0.00707",
+        "--span",
+        "6",
+        "--time-transformation",
+        "1e-3*(1 + (q1**2 + q2**2)/1000)",
+    )
     assert "Error" in invoke("run", "kepler", *far, "--tolerance", "1e-10", status=1)
 
 
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
-@pytest.mark.parametrize("system", [{}, {"monitor": "frequency"}], ids=["t", "tau"])
+@pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])
 def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
     """As certificates do: of tau in transformed time."""
     model = catalogue_model("kepler", {"run": run, "system": system})
@@ -103,7 +116,7 @@ def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, floa
 
 
 def test_folders_contain_a_number_of_steps(tmp_path: Path) -> None:
-    folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--monitor", "frequency")
+    folder, by_clock = str(tmp_path / "orbit.run"), ("run", "kepler", "--time-transformation", "frequency")
     assert "give --step and --steps" in invoke(*by_clock, "--step", "0.2", "--span", "9", "-o", folder, status=2)
     assert "50 steps in tau (all)" in invoke(*by_clock, "--step", "0.2", "--steps", "50", "-o", folder)
     assert "not --span" in invoke("run", "--resume", folder, "--span", "9", status=2)
@@ -127,4 +140,4 @@ def test_generated_folders_carry_time_and_energy(model: sc.Model, tmp_path: Path
     assert "`E` is the energy of the initial state" in (folder / "README.md").read_text()
     assert parse_model((folder / "model.toml").read_text()) == model
     with pytest.raises(ModelFileError, match="give one"):
-        generate_package(catalogue_model("kepler", {"system": {"monitor": "frequency"}}), tmp_path / "none")
+        generate_package(catalogue_model("kepler", {"system": {"time_transformation": "frequency"}}), tmp_path / "none")

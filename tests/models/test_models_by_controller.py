@@ -24,7 +24,7 @@ SHAKEN = """
 name = "shaken comet"
 coordinates = ["x", "y"]
 lagrangian = "(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2) + x*cos(t)/100"
-monitor = "(x**2 + y**2)**(3/4)"
+time_transformation = "(x**2 + y**2)**(3/4)"
 
 [forces]
 x = "-x_dot/1000"
@@ -63,7 +63,7 @@ def plain(model: sc.Model) -> sc.Stepper:
 def test_files_contain_the_controller_and_its_time_transformation(shaken: Path, tmp_path: Path) -> None:
     model = sc.load_model(shaken)
     assert model.system.clock is None
-    assert (model.monitor, model.h, model.covered) == ("(x**2 + y**2)**(3/4)", 0.1, 12.0)
+    assert (model.time_transformation, model.h, model.covered) == ("(x**2 + y**2)**(3/4)", 0.1, 12.0)
     sc.save_model(model, tmp_path / "again.toml")
     assert sc.load_model(tmp_path / "again.toml") == model
     assert 'controller = "reversible"' in (tmp_path / "again.toml").read_text()
@@ -71,7 +71,10 @@ def test_files_contain_the_controller_and_its_time_transformation(shaken: Path, 
 
 
 def test_controller_of_a_time_transformation_can_be_replaced() -> None:
-    both = {"system": {"monitor": "frequency"}, "run": {"controller": "reversible", "step": 0.2, "span": 5.0}}
+    both = {
+        "system": {"time_transformation": "frequency"},
+        "run": {"controller": "reversible", "step": 0.2, "span": 5.0},
+    }
     reversible = catalogue_model("kepler", both)
     symplectic = parse_model(dump_model(reversible), {"run": {"controller": "symplectic"}})
     assert symplectic == catalogue_model("kepler", {**both, "run": {"step": 0.2, "span": 5.0}})
@@ -82,7 +85,7 @@ def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path
     model, orbit = sc.load_model(shaken), tmp_path / "orbit.npz"
     said = invoke("run", str(shaken), "-o", str(orbit))
     assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in said
-    stepper = sc.compile_stepper(model.system, model.method, monitor=model.monitor)
+    stepper = sc.compile_stepper(model.system, model.method, time_transformation=model.time_transformation)
     run = stepper.integrate(model.q, model.p, h=0.1, t_end=12.0)
     with np.load(orbit) as file:
         assert np.array_equal(file["t"], run.t)
@@ -100,9 +103,16 @@ def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
     said = invoke("run", str(shaken), "--tolerance", "1e-8")
     error = float(said.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
-    words = ("--monitor", "1e-3*(1 + (q1**2 + q2**2)/1000)", "--controller", "reversible", "--tolerance", "1e-10")
+    words = (
+        "--time-transformation",
+        "1e-3*(1 + (q1**2 + q2**2)/1000)",
+        "--controller",
+        "reversible",
+        "--tolerance",
+        "1e-10",
+    )
     far = ("--q", "1.97,0", "--velocity", "0,0.1234", "--span", "6")
-    assert "use another monitor" in invoke("run", "kepler", *far, *words, status=1)
+    assert "use another time transformation" in invoke("run", "kepler", *far, *words, status=1)
 
 
 def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
@@ -118,7 +128,7 @@ def test_run_continues_from_a_folder(shaken: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("tolerance", [0.0, 1e-8])
 def test_largest_step_satisfies_the_tolerance_and_a_larger_one_does_not(unit: float, tolerance: float) -> None:
     kepler, start = sc.problem("kepler").system, ([1.9, 0.0], [0.0, (0.1 / 1.9) ** 0.5])
-    stepper = sc.compile_stepper(kepler, sc.SVI(8), monitor=f"{unit}*(q1**2 + q2**2)**(3/4)")
+    stepper = sc.compile_stepper(kepler, sc.SVI(8), time_transformation=f"{unit}*(q1**2 + q2**2)**(3/4)")
     h = largest_step(stepper, *start, 20.0, tolerance)
     errors = [stepper.integrate(*start, h=x, t_end=20.0).step_error for x in (h, h * 2 ** (1 / REFINEMENTS))]
     assert errors[0] <= (tolerance or 2.0**-53) < errors[1]
@@ -131,13 +141,15 @@ def test_integrate_uses_the_controller(shaken: Path) -> None:
     exact = plain(model).integrate(model.q, model.p, t_end=12.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of pilot runs, too
-        found = sc.solve_ivp(model.system, (0.0, 12.0), state, monitor=model.monitor, controller="reversible")
+        found = sc.solve_ivp(
+            model.system, (0.0, 12.0), state, time_transformation=model.time_transformation, controller="reversible"
+        )
     assert found.success
     assert np.abs(found.y[:2, -1] - exact.q[-1]).max() < 1e-11
     compiled = sc.solve_ivp(model.stepper(), (0.0, -3.0), state, h=0.1, t_eval=[0.0, -1.5, -3.0])
     earlier = plain(model).integrate(model.q, model.p, t_eval=[-1.5, -3.0], t_end=-3.0)
     assert np.abs(compiled.y[:2, 1:].T - earlier.q).max() < 1e-9
-    for wrong in ({"controller": "reversible"}, {"monitor": "frequency", "controller": "pi"}):
+    for wrong in ({"controller": "reversible"}, {"time_transformation": "frequency", "controller": "pi"}):
         with pytest.raises(SystemDefinitionError, match="controller"):
             sc.solve_ivp(model.system, (0.0, 1.0), state, **wrong)
     with pytest.raises(StateError, match="need a system, not a compiled stepper"):
@@ -150,7 +162,13 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
     )
     pushes = {"u": ((0.0, 1.0, 2.5, 6.0), (0.3, -1.0, 0.5, 0.5), "constant")}
     exact = sc.compile_stepper(system, sc.SVI(8)).integrate([1.0], [0.0], inputs=pushes, t_end=6.0).q[-1]
-    common: dict[str, Any] = {"system": system, "q": (1.0,), "p": (0.0,), "monitor": "1/(1 + x**2)", "inputs": pushes}
+    common: dict[str, Any] = {
+        "system": system,
+        "q": (1.0,),
+        "p": (0.0,),
+        "time_transformation": "1/(1 + x**2)",
+        "inputs": pushes,
+    }
     errors = []
     for tau in (0.4, 0.2):
         model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
@@ -169,9 +187,9 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("run kepler --controller reversible", "the reversible controller requires a monitor"),
+        ("run kepler --controller reversible", "the reversible controller requires a time transformation"),
         ("run kepler --controller pid", "'symplectic', 'reversible'"),
-        ("run kepler --monitor z --controller reversible", "no monitor 'z'"),
+        ("run kepler --time-transformation z --controller reversible", "no time transformation 'z'"),
         ("run FILE --steps 10", "give span, not steps"),
         ("run FILE --advise 1e-9", "--advise is not available with a time transformation"),
         ("run FILE --ensemble grid.toml", "--ensemble is not available with a time transformation"),
@@ -190,7 +208,9 @@ def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> 
         generate_package(replace(model, h=None, tolerance=1e-9), tmp_path / "none")
     stretched = sc.reparametrise(sc.problem("kepler").system, "frequency")
     with pytest.raises(ModelFileError, match="without a time transformation"):
-        sc.Model(system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, monitor="frequency")
+        sc.Model(
+            system=stretched, method=sc.SVI(4), q=(1, 0), p=(0, 1), h=0.1, span=3.0, time_transformation="frequency"
+        )
     with pytest.raises(ModelFileError, match="controller must be symplectic or reversible"):
         parse_model(SHAKEN.replace('"reversible"', '"pid"'))
 

@@ -114,7 +114,7 @@ WHOLE = """
     slowed/svi-3 pushed/svi damped/svi pushed/scvi swing/sc swing/gauss swing/verlet field/verlet
 """
 CONTROLLED = replace(case("kepler/svi-3"), tolerance=0.0)
-REVERSIBLE = replace(case("kepler/svi-3"), monitor="frequency")
+REVERSIBLE = replace(case("kepler/svi-3"), time_transformation="frequency")
 CASES = {
     **{name: case(name) for name in WHOLE.split()},
     "kepler/svi-3, controlled": CONTROLLED,

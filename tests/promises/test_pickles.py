@@ -29,7 +29,7 @@ STEPPERS: dict[str, dict[str, Any]] = {
     "prefix": {"prefix": "chosen"},
     "symmetries": {"symmetries": [sc.check_symmetry(KEPLER, ["q2 + 0*q1", "-q1"])]},
     "events": {"events": ["q1 - 0.25", sc.Event("q2 - 0.7", direction=-1)]},
-    "monitor": {"monitor": "distance"},
+    "time_transformation": {"time_transformation": "distance"},
 }
 """By the option that it is not the default of."""
 
@@ -60,11 +60,11 @@ def test_pickled_stepper_is_equal(option: str) -> None:
         kept = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
         assert [name for name in kept if getattr(copy, name) != getattr(own, name)] == []
         assert {"changes": copy._variational_source(2), "second_derivatives": copy.second_derivatives} == made
-        plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "monitor" else {"h": H, "steps": STEPS}
+        plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "time_transformation" else {"h": H, "steps": STEPS}
         runs = [each.integrate(Q, P, **plan) for each in (own, copy)]
         assert_same(*runs)
         assert [len(each) for each in runs[0].events] == [len(each) for each in runs[1].events]
-        if option != "monitor":
+        if option != "time_transformation":
             assert_same(*(each.integrate(Q, P, t_end=0.5) for each in (own, copy)))
             assert_same(*(each.integrate_ensemble([Q], [P], h=H, steps=STEPS) for each in (own, copy)))
 
@@ -107,7 +107,7 @@ def test_pickled_run_continues_identically(argument: str, steps: int) -> None:
 
 
 def test_pickled_run_with_time_transformation_continues_identically() -> None:
-    run = stepper("monitor").start(Q, P, h=0.2, t_end=0.9)
+    run = stepper("time_transformation").start(Q, P, h=0.2, t_end=0.9)
     run.record(2)
     check_same_run(run, copied(run), Run.record)
 

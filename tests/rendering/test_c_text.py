@@ -163,8 +163,10 @@ def test_sources_for_this_machine_compile_without_warnings(name, solver, compile
     """A fallback borrowed and lent, and steps of a density of their own."""
     system = systems()[name]
     q = system.coordinates[0].name
-    monitor = f"1/(1 + {q}**2)"
-    stepper = compile_stepper(system, SVI(3), solver=solver, monitor=monitor, prefix="own", flags=QUICK_FLAGS)
+    time_transformation = f"1/(1 + {q}**2)"
+    stepper = compile_stepper(
+        system, SVI(3), solver=solver, time_transformation=time_transformation, prefix="own", flags=QUICK_FLAGS
+    )
     texts = [stepper.source, stepper._adaptive().source, *([stepper.fallback] if stepper.fallback else [])]
     assert len(texts) == (3 if solver == "auto" else 2)
     for number, text in enumerate(texts):

@@ -88,7 +88,15 @@ def keys(change: dict, **options) -> tuple[str, ...]:
     }
     system = sc.LagrangianSystem.from_text(**{**given, **change})
     found = compiler._Sources(
-        system, **{"method": sc.SVI(2), "solver": "auto", "prefix": None, "symmetries": (), "monitor": None, **options}
+        system,
+        **{
+            "method": sc.SVI(2),
+            "solver": "auto",
+            "prefix": None,
+            "symmetries": (),
+            "g": None,
+            **options,
+        },
     )
     return found.key
 
@@ -118,8 +126,8 @@ def test_cache_key_contains_everything_the_source_depends_on():
         {"symmetries": (turning,)},
         {"symmetries": (replace(turning, name="spinning"),)},
         {"symmetries": (replace(turning, gauge=turning.gauge + 1),)},
-        {"monitor": "frequency"},
-        {"monitor": "distance"},
+        {"g": "frequency"},
+        {"g": "distance"},
     ]
     found = [keys({}), *map(keys, changes), *(keys({}, **option) for option in options)]
     assert len(set(found)) == len(found)
@@ -257,7 +265,7 @@ def test_keys_distinguish_values_that_are_equal_or_print_equally():
     with pytest.raises(TypeError, match="cannot be made from a object"):
         key_of(object())
     assert keys({}, prefix="None") != keys({})
-    assert keys({}, monitor="None") != keys({})
+    assert keys({}, g="None") != keys({})
 
 
 def test_library_name_depends_on_compiler_flags_and_commands(monkeypatch):

@@ -65,7 +65,7 @@ def test_run_with_time_transformation_stops_at_its_target_time():
     kepler = LagrangianSystem.from_text(
         name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
     )
-    stepper = compile_stepper(kepler, SVI(3), monitor="frequency")
+    stepper = compile_stepper(kepler, SVI(3), time_transformation="frequency")
     kept = stepper.integrate([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
     run = stepper.start([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
     run.advance(10**6)

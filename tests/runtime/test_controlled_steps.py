@@ -439,9 +439,9 @@ def far_away():
     summed = sc.IndexedSystem.from_text(
         name="oscillators", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
     )
-    adaptive, monitored, clocked, driven, indexed = (
+    adaptive, reversible, clocked, driven, indexed = (
         sc.compile_stepper(system, "gauss:4"),
-        sc.compile_stepper(system, "svi:3", monitor="1/(1 + q**2)"),
+        sc.compile_stepper(system, "svi:3", time_transformation="1/(1 + q**2)"),
         sc.compile_stepper(sc.reparametrise(system, "1/(1 + q**2)"), "svi:3"),
         sc.compile_stepper(pushed, "svi:3"),
         sc.compile_indexed(summed, "svi:3"),
@@ -452,7 +452,7 @@ def far_away():
 
     return {
         "adaptive": lambda t, end: adaptive.integrate([1.0], [0.0], t=t, t_end=end),
-        "monitored": lambda t, end: monitored.integrate([1.0], [0.0], t=t, t_end=end, h=0.02),
+        "reversible": lambda t, end: reversible.integrate([1.0], [0.0], t=t, t_end=end, h=0.02),
         "clocked": lambda t, end: clocked.integrate([1.0], [0.0], t=t, t_end=end, h=np.copysign(0.02, end - t)),
         "driven": lambda t, end: driven.integrate(
             [1.0], [0.0], inputs=inputs(t), t=t, t_end=end, h=np.copysign(0.07, end - t)
@@ -462,7 +462,7 @@ def far_away():
     }
 
 
-WAYS = ["adaptive", "monitored", "clocked", "driven", "driven, adaptive", "indexed"]
+WAYS = ["adaptive", "reversible", "clocked", "driven", "driven, adaptive", "indexed"]
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -1,4 +1,4 @@
-"""Steps whose density a monitor carries along: the reversible controller of Hairer and Soederlind."""
+"""Step density of a time transformation: the reversible controller of Hairer and Soederlind."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ DRIVEN = LagrangianSystem.from_text(
 )
 
 
-def kepler(method, monitor="frequency", **more):
-    return compile_stepper(KEPLER, method, monitor=monitor, flags=QUICK_FLAGS, **more)
+def kepler(method, time_transformation="frequency", **more):
+    return compile_stepper(KEPLER, method, time_transformation=time_transformation, flags=QUICK_FLAGS, **more)
 
 
 def by_hand(stepper, q, p, tau, steps, rate, control):
@@ -66,7 +66,7 @@ def test_steps_are_those_of_the_density_controller(method, solver):
 
 
 def test_step_density_may_depend_on_time_for_nonautonomous_systems():
-    stepper = compile_stepper(DRIVEN, SVI(3), monitor="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
+    stepper = compile_stepper(DRIVEN, SVI(3), time_transformation="1/(1 + x**2 + cos(t)/2)", flags=QUICK_FLAGS)
     run = stepper.integrate([1.0], [0.7], h=0.2, t_end=8.0)
 
     def control(t, q, p):
@@ -86,7 +86,9 @@ def test_step_density_may_depend_on_time_for_nonautonomous_systems():
 
 def test_hamiltonian_has_step_densities_of_its_momenta():
     system = hamiltonian_of(KEPLER)
-    stepper = compile_stepper(system, SVI(4), monitor="1/(p_q1**2 + p_q2**2 + 1/(q1**2 + q2**2))", flags=QUICK_FLAGS)
+    stepper = compile_stepper(
+        system, SVI(4), time_transformation="1/(p_q1**2 + p_q2**2 + 1/(q1**2 + q2**2))", flags=QUICK_FLAGS
+    )
     run = stepper.integrate(*START, h=0.3, t_end=20 * PERIOD)
     assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-7
     lengths = run.step_sizes[:-2]
@@ -96,7 +98,7 @@ def test_hamiltonian_has_step_densities_of_its_momenta():
 
 def test_forces_enter_the_step_density_of_momenta():
     system = hamiltonian_of(DRIVEN, momenta=["p"])
-    run = compile_stepper(system, SVI(3), monitor="1/(1 + p**2)", flags=QUICK_FLAGS).integrate(
+    run = compile_stepper(system, SVI(3), time_transformation="1/(1 + p**2)", flags=QUICK_FLAGS).integrate(
         [1.0], [0.7], h=0.2, t_end=8.0
     )
     expected = by_hand(
@@ -113,7 +115,7 @@ def test_forces_enter_the_step_density_of_momenta():
 
 @pytest.mark.parametrize("system", [KEPLER, hamiltonian_of(KEPLER)], ids=["lagrangian", "hamiltonian"])
 def test_reversed_run_returns_on_its_own_steps(system):
-    stepper = compile_stepper(system, SVI(4), monitor="frequency", flags=QUICK_FLAGS)
+    stepper = compile_stepper(system, SVI(4), time_transformation="frequency", flags=QUICK_FLAGS)
     run = stepper.start(*START, h=0.1, t_end=100.0)
     there = run.record(300)
     run.plan = StepPlan(t_end=-100.0, tau=0.1)
@@ -122,7 +124,7 @@ def test_reversed_run_returns_on_its_own_steps(system):
     assert np.abs(back.q[::-1] - there.q).max() < 1e-11
 
 
-def off_the_monitor(run):
+def off_the_time_transformation(run):
     """How far lengths of whole steps are from h = tau g in their middle, of Kepler's orbit, tau = 0.1."""
     t, lengths = run.t[:-2], run.step_sizes[:-2]
     return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
@@ -137,23 +139,23 @@ def test_steps_that_end_at_a_time_advance_the_density_partially():
         forces={"x": "u"},
         inputs=["u"],
     )
-    stepper = compile_stepper(pushed, SVI(6), monitor="x**2 + y**2", flags=QUICK_FLAGS)
+    stepper = compile_stepper(pushed, SVI(6), time_transformation="x**2 + y**2", flags=QUICK_FLAGS)
     start = {"q": [0.4, 0.0], "velocity": [0.0, 2.0], "h": 0.1}
     for breakpoints in (2, 101, 401):
         times = np.linspace(0.0, 40.0, breakpoints)
         run = stepper.integrate(**start, inputs={"u": (times, 0.0 * times)}, t_end=40.0)
-        assert max(map(off_the_monitor, run.pieces)) < 2e-3
+        assert max(map(off_the_time_transformation, run.pieces)) < 2e-3
     run = stepper.start(**start, t_end=3.0, parameters={"u_0": 0.0})
     for t_end in (3.0, -3.0) * 20:
         run.plan = StepPlan(t_end=t_end, tau=0.1)
         piece = run.record()
-    assert off_the_monitor(piece) < 2e-3
+    assert off_the_time_transformation(piece) < 2e-3
 
 
 def test_time_transformations_of_runs_with_inputs():
     """Both of them by positive steps of tau, which have no number."""
     system = LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
-    stepper = compile_stepper(system, SVI(2), monitor="1 + x**2", flags=QUICK_FLAGS)
+    stepper = compile_stepper(system, SVI(2), time_transformation="1 + x**2", flags=QUICK_FLAGS)
     given = {"inputs": {"u": ([0.0, 1.0, 2.0], [1.0, 2.0, 2.0], "constant")}, "h": 0.1}
     there = stepper.integrate([0.0], [0.0], **given, t_end=2.0)
     assert there.q[-1, 0] == pytest.approx(2.5, abs=1e-14)
@@ -176,7 +178,7 @@ def test_invariants_are_conserved_over_long_times():
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_order_is_that_of_the_method(degree):
     exact = compile_stepper(DRIVEN, SVI(8), flags=QUICK_FLAGS).integrate([1.0], [0.0], t_end=4.0).q[-1]
-    stepper = compile_stepper(DRIVEN, SVI(degree), monitor="1/(1 + x**2)", flags=QUICK_FLAGS)
+    stepper = compile_stepper(DRIVEN, SVI(degree), time_transformation="1/(1 + x**2)", flags=QUICK_FLAGS)
     errors = [abs(stepper.integrate([1.0], [0.0], h=tau, t_end=4.0).q[-1] - exact)[0] for tau in (0.2, 0.1)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.35)
 
@@ -210,7 +212,7 @@ def test_fallback_library_is_used_with_step_density():
     pendulum = problem("double-pendulum")
     start = np.array(pendulum.q), 0.3 * np.array(pendulum.q)
     runs = [
-        compile_stepper(pendulum.system, SVI(4), monitor="1/(1 + theta1**2/100)", solver=solver).start(
+        compile_stepper(pendulum.system, SVI(4), time_transformation="1/(1 + theta1**2/100)", solver=solver).start(
             *start, h=0.15, t_end=9.0
         )
         for solver in ("auto", "newton")
@@ -227,7 +229,10 @@ def test_fallback_library_is_used_with_step_density():
         (lambda s: s.integrate(*START, h=0.1, t_end=1.0, tolerance=1e-9), "and t_end"),
         (lambda s: s.integrate(*START, h=-0.1, t_end=1.0), "positive"),
         (lambda s: s.integrate(*START, h=0.1, steps=10, t_end=1.0), "omit steps"),
-        (lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0), "ensembles do not support monitor"),
+        (
+            lambda s: s.integrate_ensemble([START[0]], [START[1]], h=0.1, t_end=1.0),
+            "ensembles do not support time_transformation",
+        ),
         (lambda s: s.from_checkpoint(b"", t_end=1.0), "and t_end"),
     ],
 )
@@ -252,7 +257,7 @@ def test_momenta_not_determined_by_velocities_are_supported():
     vortices = HamiltonianSystem.from_text(
         name="q p", coordinates=["x"], momenta=["y"], hamiltonian="x**2*y**2/2 + x**2/2 + y**2/2"
     )
-    run = compile_stepper(vortices, SVI(3), monitor="1/(1 + x**2 + y**2)", flags=QUICK_FLAGS).integrate(
+    run = compile_stepper(vortices, SVI(3), time_transformation="1/(1 + x**2 + y**2)", flags=QUICK_FLAGS).integrate(
         [1.0], [1.0], h=0.1, t_end=10.0
     )
     assert np.abs(run.energy() / run.energy()[0] - 1.0).max() < 1e-6

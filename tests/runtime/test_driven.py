@@ -310,7 +310,7 @@ def test_missing_input_is_not_zero(pendulum):
         lambda: stepper.integrate(*state, t_end=1.0, parameters={"w_0": 1.0}),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], h=0.1, steps=2),
         lambda: periodic_orbit(stepper, *state, period=6.0, steps=20),
-        lambda: largest_step(compile_stepper(pendulum, SVI(2), monitor="1 + q**2"), *state, 1.0),
+        lambda: largest_step(compile_stepper(pendulum, SVI(2), time_transformation="1 + q**2"), *state, 1.0),
         lambda: stepper.integrate_ensemble([[0.3]], [[0.0]], t_end=1.0),
     ):
         with pytest.raises(StateError, match=r"the input '[uw]' is not set"):
@@ -337,7 +337,7 @@ def test_events_and_time_transformations_use_inputs_by_name(pendulum):
     assert_allclose(np.interp(torque.t, KNOTS, VALUES), 0.5, rtol=1e-13)
     assert_allclose(line.q[:, 0], 0.1 * line.t + 1 / 3, rtol=1e-12)
     assert len(line.t)
-    slowed = compile_stepper(pendulum, SVI(4), monitor="1/(2 + q**2 + w)")
+    slowed = compile_stepper(pendulum, SVI(4), time_transformation="1/(2 + q**2 + w)")
     same = slowed.integrate([0.3], [0.1], inputs=inputs, h=0.1, t_end=2.3)
     assert_allclose(same.q[-1], run.q[-1], atol=1e-8)
     by_hand = 1 / (2 + same.q[:, 0] ** 2 + 0.1 * same.t)

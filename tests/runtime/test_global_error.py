@@ -372,7 +372,7 @@ class TestWhatIsRefused:
             kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], **{"error": 1e-6, **given})
 
     def test_time_transformation_is_rejected(self):
-        stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:2", monitor="frequency")
+        stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:2", time_transformation="frequency")
         with pytest.raises(sc.StateError, match="a time transformation has fixed steps in tau"):
             stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0, error=1e-6)
 
@@ -569,7 +569,7 @@ class TestCommandLine:
             ("error = 1e-9\ntolerance = 1e-9", [], "has both tolerance and error"),
             ("error = 1e-9\nstep = 0.1", [], "has both step and error"),
             ("error = 2.0", [], "between 0 and 1"),
-            ("error = 1e-9", ["--monitor", "frequency"], "requires adaptive steps"),
+            ("error = 1e-9", ["--time-transformation", "frequency"], "requires adaptive steps"),
         ],
     )
     def test_invalid_files_are_rejected(self, tmp_path, run, words, message):

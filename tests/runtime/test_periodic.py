@@ -228,7 +228,7 @@ def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
     )
     with pytest.raises(StateError, match="the input 'u' is not set"):
         periodic_orbit(compile_stepper(pushed, SVI(2)), [1.0], [0.0], period=6.28, steps=20)
-    watched = compile_stepper(problem("kepler").system, SVI(2), monitor="frequency")
+    watched = compile_stepper(problem("kepler").system, SVI(2), time_transformation="frequency")
     with pytest.raises(MethodError, match="requires fixed steps h"):
         periodic_orbit(watched, [1.0, 0.0], [0.0, 1.0], period=6.28, steps=20)
     with pytest.raises(MethodError, match="requires fixed steps h"):

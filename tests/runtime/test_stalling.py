@@ -1,4 +1,4 @@
-"""Monitors that come to 0: refused in bounded work, and never gone round."""
+"""Time transformations that come to 0: refused in bounded work, and never gone round."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ KEPLER = sc.problem("kepler").system
 NEAR = [1.99999, 0.0], [0.0, (1e-5 / 1.99999) ** 0.5]
 
 
-@pytest.mark.parametrize("monitor", ["x", "x**2"])
-def test_run_stops_where_the_time_transformation_is_zero(monitor):
-    stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, monitor), sc.SVI(4))
+@pytest.mark.parametrize("time_transformation", ["x", "x**2"])
+def test_run_stops_where_the_time_transformation_is_zero(time_transformation):
+    stretched = sc.compile_stepper(sc.reparametrise(OSCILLATOR, time_transformation), sc.SVI(4))
     with pytest.raises(StepFailedError, match="reaches 0") as failure:
         stretched.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
@@ -24,20 +24,20 @@ def test_run_stops_where_the_time_transformation_is_zero(monitor):
 
 @pytest.mark.parametrize("events", [None, ["x - 2"]], ids=["alone", "with events"])
 def test_reversible_controller_stops_where_the_time_transformation_is_zero(events):
-    controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), monitor="x**2", events=events)
+    controlled = sc.compile_stepper(OSCILLATOR, sc.SVI(4), time_transformation="x**2", events=events)
     with pytest.raises(StepFailedError, match="reaches 0") as failure:
         controlled.integrate([1.0], [0.0], h=0.1, t_end=4.0)
     assert failure.value.status == "stalled"
 
 
 def test_solve_ivp_reports_a_zero_time_transformation():
-    motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], monitor="x**2", method="svi:4")
+    motion = sc.solve_ivp(OSCILLATOR, (0.0, 4.0), [1.0, 0.0], time_transformation="x**2", method="svi:4")
     assert not motion.success
     assert "reaches 0" in motion.message
 
 
-@pytest.mark.parametrize("monitor", ["frequency", "q1**2 + q2**2"])
-def test_close_encounters_do_not_stop_a_run(monitor):
-    stretched = sc.compile_stepper(sc.reparametrise(KEPLER, monitor), sc.SVI(8))
+@pytest.mark.parametrize("time_transformation", ["frequency", "q1**2 + q2**2"])
+def test_close_encounters_do_not_stop_a_run(time_transformation):
+    stretched = sc.compile_stepper(sc.reparametrise(KEPLER, time_transformation), sc.SVI(8))
     run = stretched.integrate(*NEAR, h=0.1, t_end=7.0)
     assert run.t[-1] == 7.0

@@ -43,7 +43,7 @@ def test_kepler_orbit_has_the_exact_shear_after_a_period():
 def test_derivatives_at_fixed_transformed_steps():
     """The product of the derivatives of steps of these lengths."""
     kepler = problem("kepler")
-    chosen = compile_stepper(kepler.system, SVI(4), monitor="frequency")
+    chosen = compile_stepper(kepler.system, SVI(4), time_transformation="frequency")
     run = chosen.integrate([0.5, 0.0], [0.0, np.sqrt(3.0)], h=0.05, t_end=3.0)
     assert np.ptp(run.step_sizes[:-2]) > 0.01
     plain, product = compile_stepper(kepler.system, SVI(4)), np.eye(4)

@@ -48,8 +48,8 @@ def _stepper(problem: Problem, method: int) -> Any:
     made = sc.methods.method_from_specification(name) if isinstance(name, dict) else name
     if problem.kind == "array":
         return sc.compile_indexed(problem.system(), made, solver=solver, flags=QUICK_FLAGS)
-    monitor = {"monitor": problem.monitor} if problem.kind == "monitored" else {}
-    return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS, **monitor)
+    time_transformation = {"time_transformation": problem.time_transformation} if problem.kind == "reversible" else {}
+    return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS, **time_transformation)
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Case:
 
     @property
     def h(self) -> float:
-        backward = self.given.back and self.kind != "monitored"
+        backward = self.given.back and self.kind != "reversible"
         return -self.problem.h if backward else self.problem.h
 
     @property
@@ -133,9 +133,9 @@ class Case:
         q = np.array(self.problem.q if q is None else q)
         if "t_eval" in more:
             del given["save_every"]
-        if "t_end" not in more and self.kind == "monitored":
+        if "t_end" not in more and self.kind == "reversible":
             given["t_end"] = self.given.t + self.span
-        if "h" not in more and ("t_end" not in more or self.kind in ("monitored", "slowed")):
+        if "h" not in more and ("t_end" not in more or self.kind in ("reversible", "slowed")):
             given["h"] = self.h
         if "t_end" not in given:
             given.setdefault("steps", STEPS)
@@ -152,7 +152,7 @@ class Case:
 
     def start(self, **more: Any) -> Any:
         """A run to be advanced."""
-        plan = {"t_end": self.given.t + self.span} if self.kind == "monitored" else {}
+        plan = {"t_end": self.given.t + self.span} if self.kind == "reversible" else {}
         return self.stepper.start(np.array(self.problem.q), **self.moving(), **self.common(h=self.h, **plan, **more))
 
     def from_checkpoint(self, run: Any, saved: bytes) -> Any:
@@ -160,7 +160,7 @@ class Case:
         stepper = pickle.loads(pickle.dumps(self.stepper))
         if self.kind == "array":
             return stepper.from_checkpoint(saved, options=self.options)
-        plan = {"t_end": self.given.t + self.span, "h": self.h} if self.kind == "monitored" else {}
+        plan = {"t_end": self.given.t + self.span, "h": self.h} if self.kind == "reversible" else {}
         return stepper.from_checkpoint(saved, parameters=run.parameters, options=self.options, **plan)
 
 
@@ -254,7 +254,7 @@ def between(case: Case) -> None:
     if case.kind in ("array", "driven"):
         return
     times = np.sort(times)[:: -1 if case.given.back else 1]
-    plan = {"t_end": float(run.t[-1])} if case.kind in ("slowed", "monitored") else {}
+    plan = {"t_end": float(run.t[-1])} if case.kind in ("slowed", "reversible") else {}
     kept = case.integrate(t_eval=times, **plan)
     assert kept.t.tolist() == times.tolist()
     near(kept.q, case.truth.q(times), case.error)
@@ -272,7 +272,7 @@ def events(case: Case) -> None:
     """Times and states of crossings; a terminal event, and where a run stands behind it."""
     far = 3 if case.given.back else 10  # back in time friction makes motions grow
     steps, end = far * STEPS, case.given.t + far * case.span
-    plan = {"t_end": end} if case.kind == "monitored" else {"steps": steps, "h": case.h}
+    plan = {"t_end": end} if case.kind == "reversible" else {"steps": steps, "h": case.h}
     motion = truth_of(case.problem).motion(case.given.t, end, case.problem.q, case.problem.x, case.values)
     grid = np.linspace(case.given.t, end, (16 if case.problem.falls_back else 4) * steps)
     g = motion.event(grid)
@@ -366,7 +366,7 @@ def recording(case: Case) -> None:
     whole = case.integrate()
     with tempfile.TemporaryDirectory() as folder:
         looks = iter([False, True])
-        steps = {} if case.kind == "monitored" else {"steps": STEPS}
+        steps = {} if case.kind == "reversible" else {"steps": STEPS}
         begun = record_run(
             case.start(),
             f"{folder}/a",
@@ -586,15 +586,15 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "work_and_impulses": (
         work_and_impulses,
         lambda case: (
-            case.problem.work and _keeps_account(case) and (case.kind != "monitored" or case.given.save_every == 1)
+            case.problem.work and _keeps_account(case) and (case.kind != "reversible" or case.given.save_every == 1)
         ),
     ),
     "between": (between, lambda case: True),
     "events": (events, lambda case: case.kind != "slowed"),
     "failure": (failure, lambda case: STOP in case.problem.text["parameters"] and not case.given.back),
-    "ensembles": (ensembles, lambda case: case.kind not in ("array", "monitored")),
+    "ensembles": (ensembles, lambda case: case.kind not in ("array", "reversible")),
     "recording": (recording, lambda case: case.kind not in ("array", "driven")),
-    "restarts": (restarts, lambda case: case.kind not in ("driven", "monitored", "slowed")),
+    "restarts": (restarts, lambda case: case.kind not in ("driven", "reversible", "slowed")),
     "changes": (changes, lambda case: case.kind in ("plain", "array") and not case.problem.text.get("constraints")),
     "controlled": (
         controlled,

@@ -51,7 +51,7 @@ class Problem:
     work: bool = False
     h: float = 0.04
     kind: str = "plain"
-    monitor: str = ""
+    time_transformation: str = ""
     inputs: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     falls_back: bool = False
     array: Mapping[str, Any] | None = None
@@ -63,7 +63,7 @@ class Problem:
             return sc.IndexedSystem.from_text(name=self.name, **self.array)
         made = sc.HamiltonianSystem if "hamiltonian" in self.text else sc.LagrangianSystem
         system = made.from_text(name=self.name, **self.text)
-        return sc.reparametrise(system, self.monitor) if self.kind == "slowed" else system
+        return sc.reparametrise(system, self.time_transformation) if self.kind == "slowed" else system
 
     @property
     def coordinates(self) -> list[str]:
@@ -344,10 +344,10 @@ PROBLEMS: tuple[Problem, ...] = (
         },
         maps=("m*(x*y_dot - y*x_dot)",),
         kind="slowed",
-        monitor="sqrt(x**2 + y**2)",
+        time_transformation="sqrt(x**2 + y**2)",
     ),
     Problem(
-        name="monitored",
+        name="reversible",
         q=(0.8, 0.1),
         x=(0.1, 1.1),
         own={"m": 1.6, "u": 1.3, "c": 0.1, "a": 0.2},
@@ -361,8 +361,8 @@ PROBLEMS: tuple[Problem, ...] = (
         },
         impulses=(("-y", "x"),),
         work=True,
-        kind="monitored",
-        monitor="distance",
+        kind="reversible",
+        time_transformation="distance",
     ),
     Problem(
         name="rods",

@@ -28,7 +28,9 @@ PACES = {
 def checks_of(given: Case) -> Iterator[Check]:
     """Without those of single steps, which ``test_certificate.py`` has."""
     own = given.system.clock.plain if given.system.clock else given.system
-    runs = compile_stepper(given.system, given.method(), flags=QUICK_FLAGS, monitor=given.monitor)
+    runs = compile_stepper(
+        given.system, given.method(), flags=QUICK_FLAGS, time_transformation=given.time_transformation
+    )
     q, p = np.array(given.q), np.array(given.p)
     steps = at_fixed_energy(given.system, runs.energy(q, p))
     single = compile_stepper(steps, given.method(), flags=QUICK_FLAGS)
@@ -48,7 +50,9 @@ def test_local_error_of_run_steps_is_measured(name: str) -> None:
 @pytest.mark.parametrize("name", PACES)
 def test_certificates_contain_the_local_error(name: str) -> None:
     given, promises = PACES[name]
-    stepper = compile_stepper(given.system, given.method(), flags=QUICK_FLAGS, monitor=given.monitor)
+    stepper = compile_stepper(
+        given.system, given.method(), flags=QUICK_FLAGS, time_transformation=given.time_transformation
+    )
     certificate = verify(
         given.system, given.method(), given.q, given.p, h=given.h, stepper=stepper, tolerance=given.tolerance
     )

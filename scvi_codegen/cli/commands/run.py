@@ -40,10 +40,10 @@ only in part, the exit status is 1 and the time until which they do is printed. 
 for an error at the end, by short pilot runs; the recommendation is printed, and if the run does not meet it, the exit
 status is 1.
 
---monitor makes the step constant in a transformed time tau, dt = G dtau (smaller steps where the motion is fast); the
-map remains symplectic. --step is then the step of tau; without it one is chosen for --tolerance or round-off. --span
-and all times are of t. For systems with explicit time or forces use --controller reversible, a time-reversible
-step-size controller.
+--time-transformation makes the step constant in a transformed time tau, dt = G dtau (smaller steps where the motion is
+fast); the map remains symplectic. --step is then the step of tau; without it one is chosen for --tolerance or
+round-off. --span and all times are of t. For systems with explicit time or forces use --controller reversible, a
+time-reversible step-size controller.
 
 An indexed model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its trajectory is an .npz
 file, its plot an image over index and time.
@@ -74,8 +74,8 @@ Examples:
   scvi-codegen run kepler --tolerance 1e-12
   scvi-codegen run kepler --error 1e-9
   scvi-codegen run kepler --advise 1e-9
-  scvi-codegen run kepler --monitor frequency --span 1000
-  scvi-codegen run kepler --monitor frequency --controller reversible --step 0.2
+  scvi-codegen run kepler --time-transformation frequency --span 1000
+  scvi-codegen run kepler --time-transformation frequency --controller reversible --step 0.2
   scvi-codegen run kepler --json > kepler.json
   scvi-codegen run ring.toml --size N=10000 --plot ring.png
 """
@@ -107,8 +107,8 @@ Examples:
     "--tolerance",
     type=float,
     metavar="X",
-    help="Adaptive step size with this relative local error (1e-16: round-off). With --monitor: a fixed step of tau is "
-    "chosen for it.",
+    help="Adaptive step size with this relative local error (1e-16: round-off). With --time-transformation: a fixed "
+    "step of tau is chosen for it.",
 )
 @click.option(
     "--error",

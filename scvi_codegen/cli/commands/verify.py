@@ -45,7 +45,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     \b
     Examples:
       scvi-codegen verify kepler --method scvi:3
-      scvi-codegen verify kepler --monitor distance
+      scvi-codegen verify kepler --time-transformation distance
       scvi-codegen verify mine.toml
       scvi-codegen generate mine.toml -o mine_svi
       scvi-codegen verify mine_svi
