@@ -4,39 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.indices import Access, Array, Loop
+from scvi_codegen.indices import Array
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.numbers import Number
 
-__all__ = ["ConstrainedSteps", "IndexedProgram", "LoopedKernel"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopedKernel:
-    """A kernel in loops over indices.
-
-    Attributes:
-        text: the formula.
-        loops: outermost first.
-        slots: the coordinates (for forces, velocities too) that are the kernel's arguments u.
-        targets: entries that each value is added to; for a potential the slots.
-        given: the entries of arrays that are its last parameters, after the scalar ones.
-        kernel: of a potential or a force: one value per target, added to the force there (of a momentum: to the
-            velocity); of a mass: one value, added to the mass of the only target.
-        scalar: of a potential: L itself.
-        along: number of slots, the last ones, that belong to a direction instead of the state.
-    """
-
-    text: str
-    loops: tuple[Loop, ...]
-    slots: tuple[Access, ...]
-    targets: tuple[Access, ...]
-    given: tuple[Access, ...]
-    kernel: Kernel
-    scalar: Kernel | None = None
-    along: int = 0
+__all__ = ["ConstrainedSteps", "IndexedProgram"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

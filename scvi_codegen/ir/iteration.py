@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import ClassVar
 
-from scvi_codegen.ir.kernel import IndexedSum, Kernel
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = ["FixedPointIteration", "IterationTable", "PredictorTables", "StoredValues", "transposed"]
@@ -102,7 +102,7 @@ class FixedPointIteration(ABC):
     def memory(self, dimension: int) -> int:
         """Return the number of doubles kept from step to step."""
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> FixedPointIteration | None:
+    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> FixedPointIteration | None:
         """Return the iteration with further forces L_q of positions; ``None`` if these also enter otherwise."""
         return None
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from scvi_codegen.ir.iteration import FixedPointIteration, IterationTable, PredictorTables, StoredValues, transposed
-from scvi_codegen.ir.kernel import IndexedSum, Kernel
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
 __all__ = [
@@ -109,7 +109,7 @@ class SeparableIteration(FixedPointIteration):
         """Return the number of forces at the points in the last two steps."""
         return 2 * dimension * self.lanes
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> SeparableIteration:
+    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> SeparableIteration:
         """Return the iteration with further forces; see :meth:`FixedPointIteration.with_forces`."""
         return replace(self, force=self.force.with_sums(forces))
 
@@ -177,7 +177,7 @@ class PointIteration(FixedPointIteration):
         """True if time occurs in a kernel on lanes."""
         return any(kernel.uses_time for kernel in self.kernels)
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
+    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> Self | None:
         """Return the iteration with further forces; see :meth:`FixedPointIteration.with_forces`."""
         return replace(self, force=self.force.with_sums(forces))
 
@@ -215,7 +215,7 @@ class CoupledIteration(PointIteration):
         """Return the number of velocities z of the last two steps."""
         return 2 * dimension * self.lanes
 
-    def with_forces(self, forces: tuple[IndexedSum, ...]) -> Self | None:
+    def with_forces(self, forces: tuple[LoopedKernel, ...]) -> Self | None:
         """Return the iteration with further forces in both kernels; ``None`` if forces are linearised."""
         if self.followed:
             return None

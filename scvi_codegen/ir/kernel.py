@@ -1,9 +1,10 @@
-"""Kernels: straight-line arithmetic of arguments, time and parameters, and loops that add to their values.
+"""Kernels: straight-line arithmetic of arguments, time and parameters, and loops around kernels.
 
 ``u[i]`` are its arguments, ``t`` the time and ``parameters[i]`` the parameters: temporaries, each used more than once,
 then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary functions on
-numbers of the target's scalar type; there are no branches. Terms that differ only in the elements of ``u`` that they
-read may be a loop over a table of indices (:class:`IndexedSum`).
+numbers of the target's scalar type; there are no branches. Terms that differ only in the entries that they read are a
+loop around a kernel (:class:`LoopedKernel`): of a system of arrays over its indices, of a system of named coordinates
+over a constant table of indices, within the kernel of the other terms.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.ir.numbers import Number
 
 if TYPE_CHECKING:
     import sympy
 
-__all__ = ["Constant", "Expression", "IndexedSum", "Kernel", "Load", "Operation", "loads", "operations"]
+__all__ = ["Constant", "Expression", "Kernel", "Load", "LoopedKernel", "Operation", "loads", "operations"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ class Kernel:
         symbols: of the elements of ``u``, as in the formulas.
         formulas: the results as expressions.
         purpose: one sentence on what it computes.
-        sums: loops that add to the values once all results are stored, in order.
+        sums: loops over constant tables that add to the values once all results are stored, in order.
     """
 
     name: str
@@ -69,21 +71,17 @@ class Kernel:
     symbols: tuple[sympy.Symbol, ...] = field(default=(), repr=False, compare=False)
     formulas: tuple[sympy.Expr, ...] = field(default=(), repr=False, compare=False)
     purpose: str = field(default="", repr=False, compare=False)
-    sums: tuple[IndexedSum, ...] = ()
+    sums: tuple[LoopedKernel, ...] = ()
 
-    def __post_init__(self) -> None:
-        for each in self.sums:
-            each.check(self)
-
-    def with_sums(self, sums: tuple[IndexedSum, ...]) -> Kernel:
-        """Return the kernel with further loops, whose terms are called after it."""
-        named = (replace(each, term=replace(each.term, name=f"{self.name}_{each.term.name}")) for each in sums)
+    def with_sums(self, sums: tuple[LoopedKernel, ...]) -> Kernel:
+        """Return the kernel with further loops, whose kernels are called after it."""
+        named = (replace(each, kernel=replace(each.kernel, name=f"{self.name}_{each.kernel.name}")) for each in sums)
         return replace(self, sums=(*self.sums, *named))
 
     @property
     def functions(self) -> tuple[Kernel, ...]:
-        """The kernel and the terms of its loops."""
-        return (self, *(each.term for each in self.sums))
+        """The kernel and those of its loops."""
+        return (self, *(each.kernel for each in self.sums))
 
     @property
     def uses_arguments(self) -> bool:
@@ -106,7 +104,7 @@ class Kernel:
             return True
         if array == "derivative":
             return len(self.results) > self.values
-        if any(each.term.uses(array) for each in self.sums):
+        if any(each.kernel.uses(array) for each in self.sums):
             return True
         return any(load.source == array for each in (*self.temporaries, *self.results) for load in loads(each))
 
@@ -116,9 +114,9 @@ class Kernel:
         for expression in (*self.temporaries, *self.results):
             _count(expression, counts)
         for each in self.sums:
-            added = {"+": each.term.values}
-            for operator, count in (*each.term.operation_counts().items(), *added.items()):
-                counts[operator] = counts.get(operator, 0) + count * len(each.table)
+            added = {"+": each.kernel.values}
+            for operator, count in (*each.kernel.operation_counts().items(), *added.items()):
+                counts[operator] = counts.get(operator, 0) + count * each.rows
         return dict(sorted(counts.items()))
 
     def statements(self) -> Iterator[tuple[str, int, Expression]]:
@@ -140,53 +138,83 @@ class Kernel:
             target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
             lines.append(f"  {target} = {_text(expression)}")
         lines += [f"  {each}" for each in self.sums]
-        return "\n".join([*lines, *(str(each.term) for each in self.sums)])
+        return "\n".join([*lines, *(str(each.kernel) for each in self.sums)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedSum:
-    """A kernel in a loop over an index table: for every row e, value[targets[e][a]] += term_a(u[table[e][..]], ...).
+class LoopedKernel:
+    """A kernel in loops over indices, whose values are added to entries of arrays.
 
-    Rows and the targets a of a row are processed in order, so that a loop and its unrolled form
-    (:func:`scvi_codegen.ir.unrolled.unrolled`) round alike. An index may occur in a row twice. The length of the code
-    depends on the term, not on the number of rows; time and parameters are those of the kernel.
+    Elements, and the targets of an element, are processed in order, so that loops and their unrolled form round alike.
+    The length of the code depends on the kernel, not on the number of elements.
 
     Attributes:
-        term: a kernel with as many arguments as slots and constants, as many values as targets, no derivatives and no
-            loops.
-        table: (rows, slots) indices of ``u``.
-        given: (constants, rows) values of the arguments after the slots: numbers, or parameters.
-        targets: (rows, values) indices of the values; by default those of ``u``.
+        kernel: of a potential or a force: one value per target, added to the force there (of a momentum: to the
+            velocity); of a mass: one value, added to the mass of the only target.
+        loops: outermost first.
+        slots: entries (coordinates; for forces, velocities too) that are the kernel's arguments u.
+        targets: entries that each value is added to; for a potential the slots.
+        given: other entries: the last parameters of the kernel or, if they are constants, its last arguments.
+        text: the formula.
+        scalar: of a potential: L itself.
+        along: number of slots, the last ones, that belong to a direction instead of the state.
+        tables, columns: constant tables of indices, and constant arrays of numbers or parameters, by name.
     """
 
-    term: Kernel
-    table: tuple[tuple[int, ...], ...]
-    given: tuple[tuple[Constant | Load, ...], ...] = ()
-    targets: tuple[tuple[int, ...], ...] = ()
+    kernel: Kernel
+    loops: tuple[Loop, ...]
+    slots: tuple[Access, ...]
+    targets: tuple[Access, ...]
+    given: tuple[Access, ...]
+    text: str = ""
+    scalar: Kernel | None = None
+    along: int = 0
+    tables: tuple[tuple[str, tuple[tuple[int, ...], ...]], ...] = ()
+    columns: tuple[tuple[str, tuple[Constant | Load, ...]], ...] = ()
+
+    @classmethod
+    def over_rows(
+        cls,
+        kernel: Kernel,
+        table: tuple[tuple[int, ...], ...],
+        given: tuple[tuple[Constant | Load, ...], ...] = (),
+        targets: tuple[tuple[int, ...], ...] = (),
+    ) -> LoopedKernel:
+        """Return the loop over constant rows e: value[targets[e][a]] += kernel_a(u[table[e][..]], given[..][e]).
+
+        Args:
+            kernel: a function of as many arguments as indices and constants in a row.
+            table: (rows, slots) indices of arguments of the kernel that contains the loop.
+            given: (constants, rows) numbers or parameters.
+            targets: (rows, values) indices of its values; by default the table.
+        """
+        end = Size("", len(table))
+        written = "targets" if targets else "places"
+
+        def entries(array: str, table: str, count: int) -> tuple[Access, ...]:
+            places = (Place(index="e", table=table, column=k) for k in range(count))
+            return tuple(Access(array=Array(array, (Size(""),)), places=(place,)) for place in places)
+
+        columns = {f"given_{k}": column for k, column in enumerate(given)}
+        return cls(
+            kernel=kernel,
+            loops=(Loop(index="e", first=Size(""), end=end),),
+            slots=entries("u", "places", len(table[0])),
+            targets=entries("value", written, kernel.values),
+            given=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
+            tables=(("places", table), *((("targets", targets),) if targets else ())),
+            columns=tuple(columns.items()),
+        )
 
     @property
-    def aims(self) -> tuple[tuple[int, ...], ...]:
-        """The targets, also if they are those of the table."""
-        return self.targets or self.table
-
-    def check(self, kernel: Kernel) -> None:
-        """Raise ``ValueError`` for a term or tables that do not fit a kernel."""
-        term, slots = self.term, self.term.arguments - len(self.given)
-        if term.sums or term.values != len(term.results) or not (self.targets or slots == term.values):
-            raise ValueError(f"the term '{term.name}' must have one value per target, no derivatives and no loops")
-        for rows, width, most in ((self.table, slots, kernel.arguments), (self.aims, term.values, kernel.values)):
-            for row in rows:
-                if len(row) != width or not all(0 <= place < most for place in row):
-                    raise ValueError(
-                        f"a row of '{term.name}' must have {width} indices from 0 to {most - 1}; got {row}"
-                    )
-        if len({len(self.table), len(self.aims), *map(len, self.given)}) > 1:
-            raise ValueError(f"the tables of '{term.name}' must have the same number of rows")
+    def rows(self) -> int:
+        """Number of rows of constant tables."""
+        return self.loops[0].end.number
 
     def __str__(self) -> str:
         """Return the loop as one line."""
-        given, aims = ", given[..][e]" * bool(self.given), "targets" if self.targets else "table"
-        return f"value[{aims}[e][a]] += {self.term.name}(u[table[e]]{given})[a], e < {len(self.table)}"
+        slots, targets = (", ".join(map(str, each)) for each in ((*self.slots, *self.given), self.targets))
+        return f"{targets} += {self.kernel.name}({slots}) for {', '.join(map(str, self.loops))}"
 
 
 def loads(expression: Expression) -> Iterator[Load]:

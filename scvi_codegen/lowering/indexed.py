@@ -15,8 +15,9 @@ from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.formulas.indexed_forces import IndexedForce
-from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
+from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.lowering.indexed_constraints import constrained_steps
 from scvi_codegen.lowering.indexed_kernels import constants_of, kernel_of
 from scvi_codegen.lowering.lattices import reach_of

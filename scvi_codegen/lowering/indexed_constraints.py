@@ -22,7 +22,8 @@ from dataclasses import replace
 from sympy import Symbol
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.ir.indexed import ConstrainedSteps, LoopedKernel
+from scvi_codegen.ir.indexed import ConstrainedSteps
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.numbers import lower_vector
 from scvi_codegen.lowering.indexed_kernels import constants_of, kernel_of
 from scvi_codegen.lowering.program import comment_text

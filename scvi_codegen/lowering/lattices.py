@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from scvi_codegen.indices import Access, Array
-from scvi_codegen.ir.indexed import LoopedKernel
+from scvi_codegen.ir.kernel import LoopedKernel
 
 __all__ = ["reach_of"]
 

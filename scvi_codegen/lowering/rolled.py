@@ -8,7 +8,7 @@ from dataclasses import replace
 from sympy import Expr
 
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Constant, IndexedSum, Load
+from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel
 from scvi_codegen.ir.numbers import exact_number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
@@ -34,18 +34,18 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
     )
 
 
-def _forces(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:
+def _forces(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
     return _summed(of, f"pull_{number}", family, family.partials, ())
 
 
-def _energy(of: SplitSystem, family: TermGroup, number: int) -> IndexedSum:
+def _energy(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
     value = -family.formula if of.rest.auxiliaries else family.formula
     return _summed(of, f"term_{number}", family, (value,), ((0,),) * len(family.places))
 
 
 def _summed(
     of: SplitSystem, name: str, family: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
-) -> IndexedSum:
+) -> LoopedKernel:
     system = of.rest
     places = {parameter: k for k, parameter in enumerate(system.parameters)}
 
@@ -61,4 +61,4 @@ def _summed(
         constants=len(family.given),
     )
     given = tuple(tuple(map(constant, column)) for column in family.values)
-    return IndexedSum(term=term, table=family.places, given=given, targets=targets)
+    return LoopedKernel.over_rows(term, family.places, given, targets)

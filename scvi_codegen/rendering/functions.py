@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.kernel import Constant, IndexedSum, Kernel, Load
+from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel
 from scvi_codegen.ir.kernel_parts import Part, parts
 from scvi_codegen.rendering.lanes import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
@@ -30,7 +30,7 @@ def kernel_text(kernel: Kernel, target: Target, *, partials: bool = False) -> st
     declared |= {"u": f"const {real} *u", "t": f"{real} t", "parameters": f"const {real} *parameters"}
     declared["kept"] = f"{real} *restrict kept"
     texts = [_function(PART, part, _used(part, declared), print_statements(part, target)) for part in _parts(kernel)]
-    texts += [text for each in kernel.sums for text in (kernel_text(each.term, target), *_tables(each, target))]
+    texts += [text for each in kernel.sums for text in (kernel_text(each.kernel, target), *_tables(each, target))]
     arguments = _arguments(kernel, declared, partials=partials)
     statements = [*print_statements(kernel, target), *_loops(kernel, real)]
     return "\n\n".join([*texts, _whole("static", kernel, arguments, statements)])
@@ -49,7 +49,7 @@ def lane_kernel_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: La
     texts += [
         text
         for each in kernel.sums
-        for text in (lane_kernel_text(each.term, fixed_point, lanes), *_tables(each, DOUBLE))
+        for text in (lane_kernel_text(each.kernel, fixed_point, lanes), *_tables(each, DOUBLE))
     ]
     statements = [*print_lane_statements(kernel, fixed_point, sources), *_loops(kernel, "lanes", sources)]
     return "\n\n".join([*texts, _whole("static inline", kernel, _arguments(kernel, declared), statements)])
@@ -60,51 +60,45 @@ def lane_mass_text(kernel: Kernel, fixed_point: FixedPointIteration, lanes: Lane
     return kernel_text(kernel, target) if lanes.are_points else lane_kernel_text(kernel, fixed_point, lanes)
 
 
-def _table_name(each: IndexedSum, what: str) -> str:
-    return f"{each.term.name}_{what}".upper()
-
-
-def _tables(each: IndexedSum, target: Target) -> Iterator[str]:
-    """Yield the index tables of a loop, and the constants of its rows."""
-    yield _rows(_table_name(each, "places"), each.table)
-    if each.targets:
-        yield _rows(_table_name(each, "targets"), each.targets)
-    for k, column in enumerate(each.given):
+def _tables(each: LoopedKernel, target: Target) -> Iterator[str]:
+    """Yield the constant tables of a loop, and the constants of its rows."""
+    for name, rows in each.tables:
+        lines = [list(map(str, row)) for row in rows]
+        yield table(f"static const int {_named(each, name)}[{len(rows)}][{len(rows[0])}]", lines)
+    for name, column in each.columns:
         numbers = [target.number(one.value) for one in column if isinstance(one, Constant)]
         places = [str(one.index) for one in column if isinstance(one, Load)]
-        kind, name = target.scalar if numbers else "int", _table_name(each, f"given_{k}")
-        yield table(f"static const {kind} {name}[{len(column)}]", numbers or places)
+        kind = target.scalar if numbers else "int"
+        yield table(f"static const {kind} {_named(each, name)}[{len(column)}]", numbers or places)
 
 
-def _rows(name: str, rows: Sequence[Sequence[int]]) -> str:
-    return table(f"static const int {name}[{len(rows)}][{len(rows[0])}]", [list(map(str, row)) for row in rows])
+def _named(each: LoopedKernel, name: str) -> str:
+    return f"{each.kernel.name}_{name}".upper()
 
 
 def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
-    """Return the statements of loops: gather slots, evaluate the term, add its values."""
+    """Return the statements of loops: gather slots, evaluate the kernel, add its values."""
     lines = []
     for each in kernel.sums:
-        slots, values = len(each.table[0]), each.term.values
-        targets_table = _table_name(each, "targets" if each.targets else "places")
-        given = [_constant(each, k, real, sources) for k in range(len(each.given))]
+        at, to = (_named(each, entries[0].places[0].table) for entries in (each.slots, each.targets))
+        reads = [f"u[at[{slot.places[0].column}]]" for slot in each.slots]
+        reads += [_constant(_named(each, name), column[0], real, sources) for name, column in each.columns]
         lines += [
-            f"for (int e = 0; e < {len(each.table)}; e++) {{",
-            f"  const int *at = {_table_name(each, 'places')}[e], *to = {targets_table}[e];",
-            f"  {real} slot[{each.term.arguments}], term[{values}];",
-            *(f"  slot[{a}] = u[at[{a}]];" for a in range(slots)),
-            *(f"  slot[{slots + k}] = {text};" for k, text in enumerate(given)),
-            f"  {each.term.name}(slot, t, parameters, term);",
-            *(f"  value[to[{a}]] += term[{a}];" for a in range(values)),
+            f"for (int e = 0; e < {each.rows}; e++) {{",
+            f"  const int *at = {at}[e], *to = {to}[e];",
+            f"  {real} slot[{each.kernel.arguments}], term[{each.kernel.values}];",
+            *(f"  slot[{k}] = {text};" for k, text in enumerate(reads)),
+            f"  {each.kernel.name}(slot, t, parameters, term);",
+            *(f"  value[to[{target.places[0].column}]] += term[{k}];" for k, target in enumerate(each.targets)),
             "}",
         ]
     return lines
 
 
-def _constant(each: IndexedSum, k: int, real: str, sources: Sequence[str]) -> str:
-    """Return the C expression of the k-th constant of a row."""
-    entry = f"{_table_name(each, f'given_{k}')}[e]"
-    is_number = isinstance(each.given[k][0], Constant)
-    text = entry if is_number else f"parameters[{entry}]"
+def _constant(name: str, first: Constant | Load, real: str, sources: Sequence[str]) -> str:
+    """Return the C expression of a constant of a row."""
+    is_number = isinstance(first, Constant)
+    text = f"{name}[e]" if is_number else f"parameters[{name}[e]]"
     alike = real == "lanes" and (is_number or "parameters" not in sources)
     return f"lanes_of({text})" if alike else text
 

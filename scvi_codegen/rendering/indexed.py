@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.kernel_parts import is_divided
 from scvi_codegen.rendering.control import predictor_text
 from scvi_codegen.rendering.convergence import MAX_ITERATIONS

@@ -7,7 +7,8 @@ from dataclasses import replace
 from itertools import accumulate
 from typing import Any
 
-from scvi_codegen.ir.indexed import ConstrainedSteps, IndexedProgram, LoopedKernel
+from scvi_codegen.ir.indexed import ConstrainedSteps, IndexedProgram
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
 from scvi_codegen.rendering.sizes import count_text, sizes_text
 

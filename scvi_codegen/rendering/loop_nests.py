@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Loop, Place
-from scvi_codegen.ir.indexed import IndexedProgram, LoopedKernel
+from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
 from scvi_codegen.rendering.thread_sharing import Sharing

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from enum import Enum, auto
 
 from scvi_codegen.indices import Access
-from scvi_codegen.ir.indexed import LoopedKernel
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.rendering.sizes import count_text, size_text
 
 __all__ = ["MOST_THREADS", "Sharing", "sharing_of", "sharing_text"]

@@ -109,9 +109,9 @@ def test_the_number_of_operations_in_the_text_does_not_grow_with_the_number_of_t
     for count in (5, 15):
         program = program_of(bodies(f"in_loops_{count}", count), as_method("svi:2"), fallback=False)
         (force,) = program.fixed_point.kernels
-        sizes.append([len(each.term.temporaries) for each in force.sums])
+        sizes.append([len(each.kernel.temporaries) for each in force.sums])
         assert all(not str(result).startswith("Operation") for result in force.results)
-        assert sum(len(each.table) for each in force.sums) == count * (count - 1) // 2
+        assert sum(each.rows for each in force.sums) == count * (count - 1) // 2
     assert sizes[0] == sizes[1]
 
 
