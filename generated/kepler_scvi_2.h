@@ -26,8 +26,8 @@ enum {
   KEPLER_SCVI_2_NOT_CONVERGED = 1, /* max_iterations reached */
   KEPLER_SCVI_2_SINGULAR = 2, /* the Newton matrix is singular */
   KEPLER_SCVI_2_NOT_FINITE = 3, /* a value is infinite or NaN */
-  KEPLER_SCVI_2_VANISHED = 4, /* step size underflow of adaptive steps */
-  KEPLER_SCVI_2_STRAYED = 5 /* converged to a spurious solution of the stage equations */
+  KEPLER_SCVI_2_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  KEPLER_SCVI_2_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and

@@ -26,8 +26,8 @@ enum {
   KEPLER_SVI_4_NOT_CONVERGED = 1, /* max_iterations reached */
   KEPLER_SVI_4_SINGULAR = 2, /* the Newton matrix is singular */
   KEPLER_SVI_4_NOT_FINITE = 3, /* a value is infinite or NaN */
-  KEPLER_SVI_4_VANISHED = 4, /* step size underflow of adaptive steps */
-  KEPLER_SVI_4_STRAYED = 5 /* converged to a spurious solution of the stage equations */
+  KEPLER_SVI_4_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  KEPLER_SVI_4_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and

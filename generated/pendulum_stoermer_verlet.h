@@ -27,8 +27,8 @@ enum {
   PENDULUM_STOERMER_VERLET_NOT_CONVERGED = 1, /* max_iterations reached */
   PENDULUM_STOERMER_VERLET_SINGULAR = 2, /* the Newton matrix is singular */
   PENDULUM_STOERMER_VERLET_NOT_FINITE = 3, /* a value is infinite or NaN */
-  PENDULUM_STOERMER_VERLET_VANISHED = 4, /* step size underflow of adaptive steps */
-  PENDULUM_STOERMER_VERLET_STRAYED = 5 /* converged to a spurious solution of the stage equations */
+  PENDULUM_STOERMER_VERLET_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  PENDULUM_STOERMER_VERLET_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and

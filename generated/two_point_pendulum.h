@@ -27,8 +27,8 @@ enum {
   TWO_POINT_PENDULUM_NOT_CONVERGED = 1, /* max_iterations reached */
   TWO_POINT_PENDULUM_SINGULAR = 2, /* the Newton matrix is singular */
   TWO_POINT_PENDULUM_NOT_FINITE = 3, /* a value is infinite or NaN */
-  TWO_POINT_PENDULUM_VANISHED = 4, /* step size underflow of adaptive steps */
-  TWO_POINT_PENDULUM_STRAYED = 5 /* converged to a spurious solution of the stage equations */
+  TWO_POINT_PENDULUM_STEP_SIZE_UNDERFLOW = 4, /* an adaptive step size fell below machine precision */
+  TWO_POINT_PENDULUM_SPURIOUS_SOLUTION = 5 /* converged to a spurious solution of the stage equations */
 };
 
 /* Convergence criterion of the stage equations. With absolute = 0 the update of the stages, relative to |q| + h|v|, and

@@ -66,9 +66,9 @@ static real difference(const real *x, const real *whole, const real *halves)
 }
 
 /* Computes the error of the end of a step relative to the state. Since the step and its halves may both miss forces
- * near the start, e.g. near a centre, a large difference is followed by comparing the first half with its own halves as
- * long as the difference grows. Momenta of the whole step are compared unless dp is NULL. Returns STRAYED if the half
- * steps have no solution or differ by far more than the state. */
+ * near the start, e.g. near a centre, a large difference is followed by comparing the first half with its own halves
+ * as long as the difference grows. Momenta of the whole step are compared unless dp is NULL. Returns
+ * SPURIOUS_SOLUTION if the half steps have no solution or differ by far more than the state. */
 static SELDOM int compare_with_halves(const step_data *step, const real *dq, const real *dp,
     const solver_options *options, real *error)
 {
@@ -79,13 +79,13 @@ static SELDOM int compare_with_halves(const step_data *step, const real *dq, con
     const int status = solve_halves(step, h, options, halves, changes, first);
     real apart;
     if (status != OK)
-      return status > STATUS(STRAYED) ? status : STATUS(STRAYED);
+      return status > STATUS(SPURIOUS_SOLUTION) ? status : STATUS(SPURIOUS_SOLUTION);
     apart = difference(step->q0, whole, halves);
     *error = larger(*error, apart);
     if (dp && k == 0)
       *error = larger(*error, difference(step->p0, dp, changes));
     if (!(apart <= GROSS_DIFFERENCE))
-      return STATUS(STRAYED);
+      return STATUS(SPURIOUS_SOLUTION);
     if (!(apart > RESOLVED_STEP && apart > before))
       break;
     before = apart;

@@ -10,7 +10,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.frameworks.flow import imported
 from scvi_codegen.frameworks.flow_of_arrays import ArrayFlow, Arrays
 from scvi_codegen.native import building
-from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND, with_xla_flow
+from scvi_codegen.rendering.flow import XLA_PARTS, XLA_SECOND_ORDER, with_xla_flow
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.validation.argument_types import checks_arguments, of
@@ -76,7 +76,9 @@ class JaxFlow(ArrayFlow):
         """Name of the second derivatives, which are compiled when JAX first needs them."""
         import jaxlib
 
-        return self._registered(with_xla_flow(self.second_derivatives, jaxlib.__version__, second=True), [XLA_SECOND])
+        return self._registered(
+            with_xla_flow(self.second_derivatives, jaxlib.__version__, second=True), [XLA_SECOND_ORDER]
+        )
 
     def _registered(self, source: Source, parts: Sequence[str]) -> str:
         import jax

@@ -1,9 +1,9 @@
 """JAX primitives of the flow: four C functions that XLA calls, and their transformation rules.
 
-``states`` computes the states; ``push``, linear in its second argument, is the JVP, and ``pull`` the VJP; ``bend``,
-linear in cotangents and in tangents, is the derivative of ``pull`` with respect to the start (Hessian-vector product).
-Tangents and cotangents have an axis of their own for those that share a trajectory: the steps are linearised once for
-all of them, so that a Jacobian costs far less than its columns one by one.
+``states`` computes the states; ``jvp``, linear in its second argument, is the JVP, and ``vjp`` the VJP;
+``vjp_derivative``, linear in cotangents and in tangents, is the derivative of ``vjp`` with respect to the start
+(Hessian-vector product). Tangents and cotangents have an axis of their own for those that share a trajectory: the steps
+are linearised once for all of them, so that a Jacobian costs far less than its columns one by one.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ def _repeated(given: Any, count: int, axis_index: int) -> Any:
 
 
 STATES: Primitive = _primitive("states", lambda x, n, size: (*x[:-1], n, size), _states_batched)
-JVP: Primitive = _primitive("push", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: JVP))
-VJP: Primitive = _primitive("pull", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: VJP))
-VJP_DERIVATIVE: Primitive = _primitive("bend", lambda x, w, v, *_: v, _linear_batched(lambda: VJP_DERIVATIVE))
+JVP: Primitive = _primitive("jvp", lambda _, v, n, size: (*v[:-1], n, size), _linear_batched(lambda: JVP))
+VJP: Primitive = _primitive("vjp", lambda x, w, *_: (*w[:-2], x[-1]), _linear_batched(lambda: VJP))
+VJP_DERIVATIVE: Primitive = _primitive("vjp_derivative", lambda x, w, v, *_: v, _linear_batched(lambda: VJP_DERIVATIVE))
 
 
 def _states_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:

@@ -93,8 +93,8 @@ class Derivatives:
     @property
     def families(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
         """Stage groups with the derivatives of their kernels, and second derivatives, if requested and nonzero."""
-        bends = self.curvatures or (None,) * len(self.by_given)
-        return tuple(zip(self.program.families, self.by_given, bends, strict=True))
+        curvatures = self.curvatures or (None,) * len(self.by_given)
+        return tuple(zip(self.program.families, self.by_given, curvatures, strict=True))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:

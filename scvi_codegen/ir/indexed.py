@@ -19,12 +19,12 @@ class ConstrainedSteps:
 
     Attributes:
         conditions: g, g_t and the derivatives of g with respect to each slot, at every element.
-        bends: d^2 g / dt^2 at constant velocities.
+        curvatures: d^2 g / dt^2 at constant velocities.
         parts: fractions of a step, each of which is a RATTLE step.
     """
 
     conditions: tuple[LoopedKernel, ...]
-    bends: tuple[LoopedKernel, ...]
+    curvatures: tuple[LoopedKernel, ...]
     parts: tuple[Number, ...]
 
 

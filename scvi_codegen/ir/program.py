@@ -60,13 +60,13 @@ class StageCurve:
     Attributes:
         highest, next: h times this sum is the displacement due to the leading Legendre coefficient of the
             accelerations, and to the next lower one, if any.
-        bends: h times the absolute values of these sums is the displacement due to the curvature.
+        curvatures: h times the absolute values of these sums is the displacement due to the curvature.
         power: exponent of h in the squared leading displacement over that of the curvature.
     """
 
     highest: tuple[Number, ...]
     next: tuple[Number, ...]
-    bends: tuple[tuple[Number, ...], tuple[Number, ...]]
+    curvatures: tuple[tuple[Number, ...], tuple[Number, ...]]
     power: int
 
 

@@ -54,8 +54,8 @@ def constrained_steps(system: IndexedSystem, stages: StageSystem, method: Method
             "the forces or the constraints"
         )
     pairs = list(_kernels(system))
-    conditions, bends = (tuple(kernels) for kernels in zip(*pairs, strict=True))
-    return ConstrainedSteps(conditions=conditions, bends=bends, parts=lower_vector(_parts(stages, method)))
+    conditions, curvatures = (tuple(kernels) for kernels in zip(*pairs, strict=True))
+    return ConstrainedSteps(conditions=conditions, curvatures=curvatures, parts=lower_vector(_parts(stages, method)))
 
 
 def _parts(stages: StageSystem, method: Method) -> Vector:
@@ -89,5 +89,5 @@ def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel
         )
         both = [*term.slots, *zip(v, accesses, strict=True)]
         second = [constraint_second_rate(term, system.coordinates, system.time, v)]
-        curvature = kernel_of(system, f"bend_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
+        curvature = kernel_of(system, f"curvature_{number}", second, both, [*u, *v], "d^2 g / dt^2 along v.")
         yield condition, replace(condition, slots=(*accesses, *accesses), along=len(accesses), kernel=curvature)

@@ -144,8 +144,8 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
         if degree == 0:
             return None
         first, tops = 0, _highest_of(shape, None if held else degree)
-        bends = [(0, last), (0, (last + 1) // 2)]
-        rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in bends]
+        differences = [(0, last), (0, (last + 1) // 2)]
+        rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in differences]
         power = 2 * degree
     elif isinstance(shape, Accelerations | ShotCurve | PrintedCurve) and _distinct(shape.tableau.c):
         c, size = shape.tableau.c, len(shape.tableau.c)
@@ -156,7 +156,9 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
         return None
     before, behind = (mp.zero,) * first, (mp.zero,) * (count - first - len(tops[0]))
     highest, below = (lower_vector((*before, *top, *behind)) for top in tops)
-    return StageCurve(highest=highest, next=below, bends=(lower_vector(rows[0]), lower_vector(rows[1])), power=power)
+    return StageCurve(
+        highest=highest, next=below, curvatures=(lower_vector(rows[0]), lower_vector(rows[1])), power=power
+    )
 
 
 def _highest_of(shape: Velocities, degree: int | None) -> list[Vector]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.native.building import Library
-from scvi_codegen.native.options import NEEDED, SolverOptions, checked_options
+from scvi_codegen.native.options import FALLBACK_REQUIRED, SolverOptions, checked_options
 
 __all__ = ["Binding"]
 
@@ -95,7 +95,7 @@ class Binding:
         def call(*arguments: Any) -> Any:
             before = bytes(memory)
             status = function(*own, *arguments)
-            if status != NEEDED:
+            if status != FALLBACK_REQUIRED:
                 return status
             self.set_fallback()
             memory[:] = before

@@ -13,7 +13,14 @@ from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["FAILURES", "NOT_CONVERGED", "REASONS", "STATUS", "SolverOptions", "checked_options", "step_failure"]
 
-STATUS = {1: "not converged", 2: "singular", 3: "not finite", 4: "vanished", 5: "strayed", 6: "no memory"}
+STATUS = {
+    1: "not converged",
+    2: "singular",
+    3: "not finite",
+    4: "step size underflow",
+    5: "spurious solution",
+    6: "no memory",
+}
 REASONS = {
     1: "the iteration did not converge",
     2: "a matrix is singular",
@@ -23,7 +30,7 @@ REASONS = {
     6: "there is not enough memory",
 }
 """Descriptions of the status of computations at a state."""
-NEEDED = 6
+FALLBACK_REQUIRED = 6
 """Status of a step that requires Newton's method (:mod:`scvi_codegen.native.binding`), or memory for it."""
 
 NOT_CONVERGED = "not converged"
@@ -40,13 +47,13 @@ FAILURES = {
         "a value is infinite or NaN: the Lagrangian is undefined there, or the step is far too large",
         "Use a smaller step, and check that the Lagrangian is defined all along the motion",
     ),
-    "vanished": (
+    "step size underflow": (
         "the step size is below machine precision",
         "The motion ends there (a collision, a singularity, a mass of 0), its forces are not smooth, or from rest at "
         "the origin they grow as a power of t beyond the method's degree. Set t_end before that time, or use a method "
         "of higher degree",
     ),
-    "strayed": (
+    "spurious solution": (
         "the iteration converged to a spurious solution of the stage equations",
         "Use a smaller step, or give t_end alone for adaptive steps",
     ),

@@ -14,21 +14,21 @@ from scvi_codegen.rendering.source import Source, included
 
 __all__ = ["casadi_name", "with_casadi_flow", "with_flow_of_rows", "with_xla_flow"]
 
-XLA_PARTS = ("states", "push", "pull")
+XLA_PARTS = ("states", "jvp", "vjp")
 """XLA handlers: states, tangent vectors of states (JVP), gradients with respect to inputs (VJP)."""
-XLA_SECOND = "bend"
+XLA_SECOND_ORDER = "vjp_derivative"
 """XLA handler of derivatives of gradients."""
 
 
 def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) -> Source:
-    """Return a source with the XLA custom calls ``<prefix>_xla_states``, ``_push``, ``_pull``.
+    """Return a source with the XLA custom calls ``<prefix>_xla_states``, ``_jvp``, ``_vjp``.
 
     Args:
         derivatives: a source with derivatives of steps.
         version: of the library whose ``xla/ffi/api/c_api.h`` it is compiled with; a source is specific to one version.
         second: whether to add second derivatives, ``_curvature``, which the source must have.
     """
-    parts = (*XLA_PARTS, *([XLA_SECOND] if second else ()))
+    parts = (*XLA_PARTS, *([XLA_SECOND_ORDER] if second else ()))
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
     headers = ("flow", "xla_flow", *(("flow_second", "xla_second") if second else ()))
     return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers)

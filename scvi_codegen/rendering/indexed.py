@@ -47,7 +47,7 @@ def render_indexed(program: IndexedProgram) -> Source:
     if program.fixed_point is None:
         scalars += [each.kernel for each in program.forces]
     if program.held:
-        scalars += [each.kernel for each in (*program.held.conditions, *program.held.bends)]
+        scalars += [each.kernel for each in (*program.held.conditions, *program.held.curvatures)]
     applied = (*program.forces, *program.products, *program.diagonals)
     context = {
         "program": program,

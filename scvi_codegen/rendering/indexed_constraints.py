@@ -28,7 +28,7 @@ def constraint_context(program: IndexedProgram) -> dict[str, Any]:
     found = {
         "functions": [text for pair in zip(*_texts(program, held), strict=True) for text in pair],
         "conditions": [each.kernel.name for each in held.conditions],
-        "bends": [each.kernel.name for each in held.bends],
+        "curvatures": [each.kernel.name for each in held.curvatures],
         "sizes": list(sizes_text(program, " ".join(counts))),
         "count": " + ".join(counts),
         "entries": " + ".join(entries),
@@ -40,7 +40,7 @@ def _texts(program: IndexedProgram, held: ConstrainedSteps) -> tuple[list[str], 
     """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
     return (
         [_condition(program, each) for each in held.conditions],
-        [_curvature(program, each) for each in held.bends],
+        [_curvature(program, each) for each in held.curvatures],
         [_places(program, each) for each in held.conditions],
     )
 

@@ -183,7 +183,7 @@ class AdaptiveEnsemble:
             times=times,
             q=q,
             p=p,
-            status=np.array([each.status for each in found], dtype="<U16"),
+            status=np.array([each.status for each in found], dtype="<U32"),
             steps=np.array([each.steps for each in found], dtype=np.int64),
             h=0.0,
             plans=tuple(self.plans),

@@ -29,23 +29,23 @@ class ChaosIndicators:
 
     Attributes:
         t: (n,) times.
-        lengths: (n, k) logarithms of the norms of the tangent vectors, which are 1 at the start.
-        greatest: (n, k) maxima of these logarithms over all steps so far.
-        stretches: (n, k) logarithms of the diagonal of R: the first i sum to the log volume of i tangent vectors.
-        rates: (n, k) 2/T times the integral of T d(lengths), T the elapsed time: MEGNO before averaging.
+        log_norms: (n, k) logarithms of the norms of the tangent vectors, which are 1 at the start.
+        max_log_norms: (n, k) maxima of these logarithms over all steps so far.
+        log_r_diagonal: (n, k) logarithms of the diagonal of R: the first i sum to the log volume of i tangent vectors.
+        rates: (n, k) 2/T times the integral of T d(log_norms), T the elapsed time: MEGNO before averaging.
         mean_rates: (n, k) time averages of ``rates``.
         status: (K,) for an ensemble, ``"ok"`` or the reason of a failure, after which values are NaN; else ``None``.
     """
 
     t: Array
-    lengths: Array
-    greatest: Array
-    stretches: Array
+    log_norms: Array
+    max_log_norms: Array
+    log_r_diagonal: Array
     rates: Array
     mean_rates: Array
     status: NDArray[np.str_] | None = None
 
-    __repr__ = summary("t", "lengths")
+    __repr__ = summary("t", "log_norms")
 
     @classmethod
     def of(cls, t: Array, found: Array, status: NDArray[np.str_] | None = None) -> ChaosIndicators:
@@ -57,8 +57,8 @@ class ChaosIndicators:
 
         QR method of Benettin et al., Meccanica 15 (1980) 9.
         """
-        time = np.abs(self.t - self.t[0]).reshape(-1, *[1] * (self.stretches.ndim - 1))
-        exponents: Array = -np.sort(-self.stretches / np.where(time > 0.0, time, np.nan), axis=-1)
+        time = np.abs(self.t - self.t[0]).reshape(-1, *[1] * (self.log_r_diagonal.ndim - 1))
+        exponents: Array = -np.sort(-self.log_r_diagonal / np.where(time > 0.0, time, np.nan), axis=-1)
         return exponents
 
     def megno(self) -> Array:
@@ -76,17 +76,17 @@ class ChaosIndicators:
         It grows as log t for regular motion and as lambda t for chaotic motion: Froeschle, Lega & Gonczi, Celest. Mech.
         Dyn. Astron. 67 (1997) 41; Froeschle & Lega, ibid. 78 (2000) 167.
         """
-        greatest: Array = self.greatest.max(axis=-1)
-        return greatest
+        largest: Array = self.max_log_norms.max(axis=-1)
+        return largest
 
     def log_gali(self, k: int = 2) -> Array:
         """Return (n,) natural logarithms of :meth:`gali`, also where GALI underflows."""
-        most = self.lengths.shape[-1]
+        most = self.log_norms.shape[-1]
         if checked_count(k, "k", least=1) > most:
             raise StateError(
                 f"k = {k} exceeds the number of tangent vectors, {most}: compute deviations with count={k}"
             )
-        volume: Array = (self.stretches - self.lengths)[..., :k].sum(axis=-1)
+        volume: Array = (self.log_r_diagonal - self.log_norms)[..., :k].sum(axis=-1)
         return volume
 
     def gali(self, k: int = 2) -> Array:

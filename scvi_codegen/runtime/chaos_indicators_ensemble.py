@@ -70,7 +70,7 @@ class ChaosIndicatorsEnsemble:
         self.t = times_after(start, self.h, np.arange(steps + 1))[0]
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
         self.changes = InitialTangents.checked(stepper, count, directions)
-        self.status = np.full(len(self.q), OK, dtype="<U16")
+        self.status = np.full(len(self.q), OK, dtype="<U32")
         self.found = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> ChaosIndicators:

@@ -100,7 +100,7 @@ class Ensemble:
         if stepper.interface.energy_parameter:
             self.times = np.full((saved_count, self.count), np.nan)
             self.times[0] = self.t0
-        self.status = np.full(self.count, OK, dtype="<U16")
+        self.status = np.full(self.count, OK, dtype="<U32")
         self.done = np.zeros(self.count, dtype=np.int64)
 
     def __len__(self) -> int:

@@ -43,7 +43,7 @@ class EnsembleTrajectory:
         t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
         q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
         status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
-            ``"vanished"``, ``"interrupted"``).
+            ``"step size underflow"``, ``"interrupted"``).
         steps: (k,) completed steps.
         h: step size; 0 for adaptive steps.
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.

@@ -83,7 +83,7 @@ class GrowthCheck:
         self.run, self.requested, self.advance_until = run, requested, advance_until or self._to
         self.wanted = adaptive and requested is not False and warnings_wanted()
         if self.wanted:
-            self.start: Any = run.checkpoint() if isinstance(run, Memory) else run.mark
+            self.start: Any = run.checkpoint() if isinstance(run, Memory) else run.snapshot
             self.parameters = (
                 run.parameters.copy() if isinstance(run, Memory) else None
             )  # inputs change them during the run

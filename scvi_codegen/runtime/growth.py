@@ -12,7 +12,7 @@ from scvi_codegen.runtime.inputs import Array
 
 __all__ = ["SERIES", "Growth", "ill_conditioned", "r_factors"]
 
-SERIES = ("lengths", "greatest", "stretches", "rates", "mean_rates")
+SERIES = ("log_norms", "max_log_norms", "log_r_diagonal", "rates", "mean_rates")
 """Names of the accumulated series, defined in :class:`~scvi_codegen.runtime.chaos_indicators.ChaosIndicators`."""
 
 MOST_GROWTH_RATIO = 1e3
@@ -24,32 +24,32 @@ class Growth:
 
     Args:
         t: (n,) times of saved values.
-        stretches: (k,) or (K, k) logarithms of the diagonal of R at the start, where norms are 1.
+        log_r_diagonal: (k,) or (K, k) logarithms of the diagonal of R at the start, where norms are 1.
 
     Attributes:
         found: (5, n, k) or (5, n, K, k) values of :data:`SERIES`; NaN at times that were not reached.
     """
 
-    def __init__(self, t: Array, stretches: Array) -> None:
-        self.start, nothing = float(t[0]), np.zeros_like(stretches)
-        self.stretches = stretches
-        self.lengths = self.greatest = self.moments = self.rates = self.areas = nothing
-        self.found = np.full((len(SERIES), len(t), *stretches.shape), np.nan)
-        self.found[:, 0] = [nothing, nothing, stretches, nothing, nothing]
+    def __init__(self, t: Array, log_r_diagonal: Array) -> None:
+        self.start, nothing = float(t[0]), np.zeros_like(log_r_diagonal)
+        self.log_r_diagonal = log_r_diagonal
+        self.log_norms = self.max_log_norms = self.moments = self.rates = self.areas = nothing
+        self.found = np.full((len(SERIES), len(t), *log_r_diagonal.shape), np.nan)
+        self.found[:, 0] = [nothing, nothing, log_r_diagonal, nothing, nothing]
 
-    def add(self, t: Array, numbers: NDArray[np.intp], grown: Array, stretched: Array) -> None:
+    def add(self, t: Array, numbers: NDArray[np.intp], log_growth: Array, log_diagonals: Array) -> None:
         """Add consecutive steps; the integrals use the trapezoidal rule.
 
         Args:
             t: (steps + 1,) times at their ends.
             numbers: (steps,) index of the saved value at the end of each step, -1 for none.
-            grown, stretched: (steps, .., k) logarithms relative to the start of the first step; of ``stretched`` only
-                the saved rows and the last are used.
+            log_growth, log_diagonals: (steps, .., k) logarithms relative to the start of the first step; of
+                ``log_diagonals`` only the saved rows and the last are used.
         """
-        times = np.abs(t - self.start).reshape(-1, *[1] * self.lengths.ndim)
-        lengths = self.lengths + grown
-        greatest = np.maximum(np.maximum.accumulate(lengths, axis=0), self.greatest)
-        steps = np.diff(lengths, axis=0, prepend=self.lengths[np.newaxis])
+        times = np.abs(t - self.start).reshape(-1, *[1] * self.log_norms.ndim)
+        log_norms = self.log_norms + log_growth
+        max_log_norms = np.maximum(np.maximum.accumulate(log_norms, axis=0), self.max_log_norms)
+        steps = np.diff(log_norms, axis=0, prepend=self.log_norms[np.newaxis])
         moments = self.moments + np.cumsum((times[1:] + times[:-1]) / 2 * steps, axis=0)
         rates = 2.0 * moments / times[1:]
         means = rates.copy()
@@ -58,13 +58,17 @@ class Growth:
         areas = self.areas + np.cumsum(np.diff(times, axis=0) / 2 * means, axis=0)
         saved = np.flatnonzero(numbers >= 0)
         self.found[:, numbers[saved]] = [
-            lengths[saved],
-            greatest[saved],
-            self.stretches + stretched[saved],
+            log_norms[saved],
+            max_log_norms[saved],
+            self.log_r_diagonal + log_diagonals[saved],
             rates[saved],
             areas[saved] / times[saved + 1],
         ]
-        self.lengths, self.greatest, self.stretches = lengths[-1], greatest[-1], self.stretches + stretched[-1]
+        self.log_norms, self.max_log_norms, self.log_r_diagonal = (
+            log_norms[-1],
+            max_log_norms[-1],
+            self.log_r_diagonal + log_diagonals[-1],
+        )
         self.moments, self.rates, self.areas = moments[-1], rates[-1], areas[-1]
 
 

@@ -66,8 +66,8 @@ def second_order_adjoints(
     """Return (2, k, variables) adjoints at the start and their tangents, from those ``now`` after the last state.
 
     Args:
-        slopes, bends: (n, 2m) and (n, 2m, 2m) derivatives of the function.
-        changes: (k, variables) tangent vectors at the start.
+        derivatives, hessian_blocks: (n, 2m) and (n, 2m, 2m) derivatives of the function.
+        tangents: (k, variables) tangent vectors at the start.
         now: (2, k, variables) adjoints and their tangents after the last state.
     """
     between = list(pieces(states))

@@ -86,7 +86,7 @@ class IndexedSearch:
 
     def step(self) -> None:
         """Take one step of the run, or the part of it up to a terminal event."""
-        run, before, values = self.run, self.run.mark, self.values
+        run, before, values = self.run, self.run.snapshot, self.values
         run.advance(1)
         self.values = self._values(run)
         low = run._run.t_low - before.run_fields["t_low"]

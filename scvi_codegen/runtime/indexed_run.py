@@ -189,7 +189,7 @@ class IndexedRun(OneThread):
         return other
 
     @property
-    def mark(self) -> IndexedSnapshot:
+    def snapshot(self) -> IndexedSnapshot:
         """Snapshot of the present state for :meth:`rollback`."""
         kept = {name: self._numbers[name].copy() for name in STATE}
         run_fields = {name: getattr(self._run, name) for name in RUN_FIELDS}
@@ -203,13 +203,13 @@ class IndexedRun(OneThread):
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
     @alone
-    def rollback(self, mark: IndexedSnapshot) -> None:
+    def rollback(self, snapshot: IndexedSnapshot) -> None:
         """Restore a snapshot; the predictor of the next step is reset."""
-        for name, values in mark.arrays.items():
+        for name, values in snapshot.arrays.items():
             self._numbers[name][:] = values
-        for name, value in mark.run_fields.items():
+        for name, value in snapshot.run_fields.items():
             setattr(self._run, name, value)
-        self._run.guess, self.iterations = 0, mark.iterations
+        self._run.guess, self.iterations = 0, snapshot.iterations
 
     def _pointer(self, name: str) -> Any:
         return self._binding.pointer(self._numbers[name])

@@ -78,8 +78,8 @@ def lost_energy_surface(states: Trajectory, longest: float) -> StepFailedError |
 def _singular_time_error(stepper: Integrator, t: float, number: int, evidence: str) -> StepFailedError:
     return StepFailedError(
         f"step {number} at t = {t:.17g} failed: the time transformation dt = g dtau is singular there: g "
-        f"reaches 0 ({evidence}). g must be positive along the whole motion: use another, or adaptive steps",
-        status="stalled",
+        f"reaches 0 ({evidence}). g must be positive along the whole motion: use another g, or adaptive steps",
+        status="time transformation singular",
         step=number,
         t=t,
         residual=float("nan"),

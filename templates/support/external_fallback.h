@@ -1,5 +1,6 @@
 /* Fallback to the Newton solver of another library, which is loaded on demand. Until it is set, a step whose
- * fixed-point iteration fails returns NEEDED, is not performed, and has to be repeated. Requires: fallback.h. */
+ * fixed-point iteration fails returns FALLBACK_REQUIRED, is not performed, and has to be repeated. Requires:
+ * fallback.h. */
 static const fallback *library_fallback; /* set once, before the calls that need it are repeated */
 
 void NAME(set_fallback)(const void *shared_fallback)
@@ -12,5 +13,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
     solver_report *report, double *workspace)
 {
   (void)status;
-  return library_fallback ? library_fallback->step(step, dq, dp, options, report, workspace) : STATUS(NEEDED);
+  if (!library_fallback)
+    return STATUS(FALLBACK_REQUIRED);
+  return library_fallback->step(step, dq, dp, options, report, workspace);
 }

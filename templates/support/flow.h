@@ -115,7 +115,7 @@ static void fill_chunk(const flow_call *way, const real *x, long long done, int 
   }
 }
 
-/* Propagates the vectors over a chunk of steps; STRAYED if a recomputed step differs. */
+/* Propagates the vectors over a chunk of steps; SPURIOUS_SOLUTION if a recomputed step differs. */
 static int propagate_chunk_of_steps(const flow_call *way, const real *x, long long done, int length, int back,
     solver_report *report)
 {
@@ -132,7 +132,7 @@ static int propagate_chunk_of_steps(const flow_call *way, const real *x, long lo
     report->steps = done + mismatch;
     report->t = way->t[mismatch];
   }
-  return mismatch < length ? STATUS(STRAYED) : OK;
+  return mismatch < length ? STATUS(SPURIOUS_SOLUTION) : OK;
 }
 
 /* Offset of the state at the end of a step in an array (count, kept states, FLOW_STATE) for vector c; -1 if that state

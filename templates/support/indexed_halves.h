@@ -140,7 +140,7 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
       *error = difference(run, &p, n);
     *error = larger(*error, apart);
     if (!(apart <= GROSS_DIFFERENCE))
-      status = STATUS(STRAYED);
+      status = STATUS(SPURIOUS_SOLUTION);
     go = status == OK && apart > RESOLVED_STEP && apart > before;
     before = apart;
     memcpy(kept.whole + own.first, kept.first + own.first, sizeof(double) * (size_t)(own.end - own.first));

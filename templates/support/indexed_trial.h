@@ -60,7 +60,7 @@ static SELDOM int compare_trial(run_memory *run, trial *now, int momenta, const 
   const int status = compare_with_halves(run, now->given, now->n, momenta, options, apart);
   try_step(run, now, 0, options, &unread);
   if (status == OK && !(now->error < INFINITY))
-    return STATUS(STRAYED);
+    return STATUS(SPURIOUS_SOLUTION);
   now->error = error;
   return status;
 }

@@ -36,7 +36,7 @@ static int linearise_step(linearised_step *at, const solver_options *options, re
     return status;
   gather(END_POSITION, 1, step->h, at->data.z, M, dq, 0, 1);
   if (is_spurious(step, at->data.z, dq, report->iterations - before))
-    return STATUS(STRAYED);
+    return STATUS(SPURIOUS_SOLUTION);
   evaluate(step, at->data.z, at->data.rows, size_p, size_q, at->data.factors, &at->shape);
   if (!factorise(at->data.factors, &at->shape, at->data.pivot))
     return SINGULAR;

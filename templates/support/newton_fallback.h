@@ -10,5 +10,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   gather(END_POSITION, 1, step->h, newtons.z, M, dq, 0, 1);
   memset(dq + M, 0, sizeof(double) * M);
   memset(dp + M, 0, sizeof(double) * M);
-  return status == OK && is_spurious(step, newtons.z, dq, report->iterations - before) ? STATUS(STRAYED) : status;
+  if (status == OK && is_spurious(step, newtons.z, dq, report->iterations - before))
+    return STATUS(SPURIOUS_SOLUTION);
+  return status;
 }

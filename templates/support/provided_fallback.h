@@ -8,7 +8,7 @@ static SELDOM int provided_step(const step_data *step, double *dq, double *dp, c
   step_data own = *step;
   int status;
   if (workspace == NULL)
-    return STATUS(NEEDED);
+    return STATUS(FALLBACK_REQUIRED);
   own.scratch = workspace;
   own.first = 1;
   own.tables = NULL;

@@ -59,7 +59,7 @@ static int shorten(run_memory *run, const trial *now, int most)
   return size_of_level(run->grid_level) > SMALLEST_RELATIVE_STEP * (MATH(fabs)(now->at.t) + REAL_EPSILON * left);
 }
 
-/* Tries the next step with smaller and smaller sizes until its error is admissible; returns VANISHED on underflow. */
+/* Tries the next step with smaller and smaller sizes until its error is admissible, or STEP_SIZE_UNDERFLOW. */
 HOT int find_step(run_memory *run, trial *now, const solver_options *options, solver_report *report)
 {
   const real least = LITTLE * now->limits.fewer;
@@ -75,7 +75,7 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
       run->avoiding = AVOIDED;
     }
     if (!shorten(run, now, failed ? DOWN_FAILED : MOST_DOWN))
-      return STATUS(VANISHED);
+      return STATUS(STEP_SIZE_UNDERFLOW);
     try_step(run, now, least, options, report);
   }
   now->error = larger(now->error, least);
@@ -101,7 +101,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
   for (;;) {
     real apart;
     int status = compare_trial(run, now, steps_to_compare, options, &apart);
-    if (status > STATUS(STRAYED))
+    if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
     if (status == OK && apart <= allowed) {
       now->apart = MATH(pow)(apart, 1 / ERROR_POWER);
@@ -111,7 +111,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
     run->steps_to_compare = STEPS_COMPARED_AFTER_DOUBT;
     now->error = INFINITY;
     if (!shorten(run, now, MOST_DOWN))
-      return STATUS(VANISHED);
+      return STATUS(STEP_SIZE_UNDERFLOW);
     run->error_before = now->limits.most;
     status = find_step(run, now, options, report);
     if (status != OK)

@@ -63,12 +63,12 @@ XLA_FFI_Error *NAME(xla_states)(XLA_FFI_CallFrame *frame)
   return answers_version(frame) ? NULL : flow_of_frame(FLOW_STATES, frame);
 }
 
-XLA_FFI_Error *NAME(xla_push)(XLA_FFI_CallFrame *frame)
+XLA_FFI_Error *NAME(xla_jvp)(XLA_FFI_CallFrame *frame)
 {
   return answers_version(frame) ? NULL : flow_of_frame(FLOW_JVP, frame);
 }
 
-XLA_FFI_Error *NAME(xla_pull)(XLA_FFI_CallFrame *frame)
+XLA_FFI_Error *NAME(xla_vjp)(XLA_FFI_CallFrame *frame)
 {
   return answers_version(frame) ? NULL : flow_of_frame(FLOW_VJP, frame);
 }

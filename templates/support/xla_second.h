@@ -2,7 +2,7 @@
 
 /* x (.., STEP_INPUTS), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count,
  * STEP_INPUTS); results like the latter. */
-XLA_FFI_Error *NAME(xla_bend)(XLA_FFI_CallFrame *frame)
+XLA_FFI_Error *NAME(xla_vjp_derivative)(XLA_FFI_CallFrame *frame)
 {
   flow_call way;
   solver_report report;

@@ -139,7 +139,7 @@ def test_handlers_of_xla_are_exported(tmp_path):
 
     assert_allclose(handled("states", [ROWS], (2, KEPT, 4)), [states(row) for row in ROWS], **WAYS)
     exact, changes = np.array([partials(row) for row in ROWS]), np.tile(np.eye(SIZE), (2, 1, 1))
-    pushed = handled("push", [ROWS, changes], (2, SIZE, KEPT, 4))
+    pushed = handled("jvp", [ROWS, changes], (2, SIZE, KEPT, 4))
     assert_allclose(np.moveaxis(pushed, 1, -1), exact, rtol=1e-11, atol=1e-11)
-    pulled = handled("pull", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))
+    pulled = handled("vjp", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))
     assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)

@@ -169,7 +169,7 @@ def test_second_derivatives_are_those_of_leapfrog(save_every):
 def test_a_jacobian_linearises_a_trajectory_once():
     flow = jax_flow(kepler(), steps=30)
     q, p = jnp.array([0.5, 0.0]), jnp.array([0.0, 1.6])
-    for derivative, part in ((jax.jacfwd, "push"), (jax.jacrev, "pull")):
+    for derivative, part in ((jax.jacfwd, "jvp"), (jax.jacrev, "vjp")):
         text = jax.jit(derivative(lambda q: flow(q, p, h=H)[0])).lower(q).as_text()
         calls = re.findall(rf"custom_call @\w+_{part}.*", text)
         assert len(calls) == 1
