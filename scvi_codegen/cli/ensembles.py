@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.cli.conservation import momentum_report
-from scvi_codegen.cli.formatting import counted, duration, span_remark
+from scvi_codegen.cli.formatting import counted, duration
 from scvi_codegen.cli.memory import check_memory
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.models.ensemble_file import EnsembleStates
@@ -96,7 +96,7 @@ def _work(
         "parameters": states.parameters,
         "options": options,
     }
-    if model.system.inputs:
+    if model.system.inputs or model.has_shorter_last_step:
         inputs = model.all_inputs()
         return ensemble_work(*start, inputs=inputs, h=model.step, t_end=model.end, **common)
     if model.h is None:
@@ -117,11 +117,6 @@ def ensemble_summary(model: Model, outcome: EnsembleOutcome) -> str:
         f"{_describe_steps(model, result)} saved of each",
         f"{outcome.seconds:.3g} s, {duration(outcome.seconds / max(steps, 1))} per step of a trajectory; "
         f"prepared in {outcome.preparation:.2f} s",
-        *(
-            []
-            if model.h is None or model.system.inputs
-            else span_remark(model.span, model.step, model.step_count, model.t)
-        ),
         ", ".join(f"{number} {status}" for status, number in _statuses(result)),
     ]
     return "\n".join([*lines, *_failures(result), _energy_report(model, result), *momentum_report(result)])

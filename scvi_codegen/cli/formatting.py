@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scvi_codegen.runtime.times import WHOLE
-
-__all__ = ["counted", "duration", "in_known_digits", "span_remark", "table"]
+__all__ = ["counted", "duration", "in_known_digits", "table"]
 
 
 def counted(count: int, what: str) -> str:
@@ -21,16 +19,6 @@ def duration(seconds: float) -> str:
         if seconds >= scale:
             return f"{seconds / scale:.3g} {unit}"
     return f"{seconds / 1e-9:.3g} ns"
-
-
-def span_remark(span: float | None, h: float, steps: int, t: float) -> list[str]:
-    """Return a line that names the end of a run of a fixed step size that does not divide its span; else none."""
-    if span is None or abs(span / abs(h) - steps) <= WHOLE * max(1.0, steps):
-        return []
-    return [
-        f"span {span:g} is not a whole number of steps of {abs(h):g}: the run is the nearest number of them, {steps}, "
-        f"and ends at t = {t + steps * h:.12g}, not {t + math.copysign(span, h):g}; give a step that divides the span"
-    ]
 
 
 def in_known_digits(x: float, error: float) -> str:

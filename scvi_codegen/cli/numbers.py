@@ -31,9 +31,9 @@ def run_numbers(
     t, q, p = outcome.end
     return {
         **_about(model),
-        "steps": run.steps,
+        "steps": trajectory.steps,
         "rejected_steps": run.rejected_steps,
-        "h": run.plan.tau or None if run.plan else run.h,
+        "h": run.plan.tau or None if run.plan else model.h or run.h,
         "states": len(trajectory),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

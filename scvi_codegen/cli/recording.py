@@ -14,13 +14,12 @@ from typing import Any
 import click
 import numpy as np
 
-from scvi_codegen.cli.command_group import tell
-from scvi_codegen.cli.formatting import counted, duration, span_remark
+from scvi_codegen.cli.formatting import counted, duration
 from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.running import conserved, final_state
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
-from scvi_codegen.models.model import Model
+from scvi_codegen.models.model import Model, whole_steps_in
 from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
@@ -147,14 +146,12 @@ class Recording:
                 "a recorded run in transformed time needs a number of steps: give --step and --steps"
             )
         run = model.start(model.stepper(solver=solver), options=options)
-        if not run.plan:
-            tell("\n".join(span_remark(model.span, model.step, model.step_count, model.t)))
         return self._with_progress(
             record_run,
             run,
             Path(folder),
             first=0,
-            steps=None if run.plan else model.step_count,
+            steps=None if run.plan else model.whole_step_count(),
             save_every=model.save_every,
             model=text,
             certificate=self.certificate,
@@ -173,8 +170,7 @@ class Recording:
                 "a recorded run in transformed time needs a number of steps: give --steps, not --span"
             )
         elif span is not None:
-            steps = max(1, round(span / abs(manifest.h)))
-            tell("\n".join(span_remark(span, manifest.h, steps, manifest.t)))
+            steps = whole_steps_in(span, manifest.h, manifest.t)
         plan = manifest.steps if steps is None else steps
         return self._with_progress(resume_run, Path(folder), first=recorded.steps, steps=plan, **further)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
-from scvi_codegen.cli.formatting import counted, duration, in_known_digits, span_remark
+from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
@@ -95,12 +95,12 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     preparation = time.perf_counter() - began
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
         work, pieces = _Chunks(model, run, caught, show_progress), []
-        for steps in model.input_segments(run):
+        for steps in model.segments(run):
             pieces.append(work.segment(steps))
             if work.failure is not None or work.stopped:
                 break
     pieces = pieces or [run.record(0)]
-    trajectory = DrivenTrajectory(tuple(pieces)) if model.system.inputs else pieces[0]
+    trajectory = DrivenTrajectory(tuple(pieces)) if _in_segments(model) else pieces[0]
     return RunOutcome(
         trajectory=trajectory,
         run=run,
@@ -136,7 +136,7 @@ class _Chunks:
                 break
             pieces.append(self._chunk(self.size if last is None else min(self.size, last - run.steps)))
         joined = _joined(pieces)
-        return with_final_state(joined, run) if self.model.system.inputs else joined
+        return with_final_state(joined, run) if _in_segments(self.model) else joined
 
     def _chunk(self, steps: int) -> Trajectory:
         model, run = self.model, self.run
@@ -196,6 +196,11 @@ def _reached(model: Model, run: Run) -> int:
     return int(BAR_LENGTH * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
 
 
+def _in_segments(model: Model) -> bool:
+    """Return True if a run consists of segments, at whose ends states are saved whatever the output stride."""
+    return bool(model.system.inputs) or model.has_shorter_last_step
+
+
 def _by_time(model: Model) -> bool:
     """Return True if the number of steps is not known in advance."""
     return model.ends_at_time or bool(model.system.inputs)
@@ -208,10 +213,9 @@ def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Bal
     lines = [
         model.system.name,
         f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
-        f"{counted(run.steps, 'step')} {describe_step_size(model.h, run)} "
+        f"{counted(trajectory.steps, 'step')} {describe_step_size(model.h, run)} "
         f"from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} saved",
-        *([] if _by_time(model) else span_remark(model.span, model.step, model.step_count, model.t)),
     ]
     if run.steps:
         lines.append(f"{_speed(outcome, model.save_every)}; prepared in {outcome.preparation:.2f} s")
@@ -246,11 +250,9 @@ def describe_step_size(h: float | None, run: Run) -> str:
 
 
 def _speed(outcome: RunOutcome, save_every: int) -> str:
-    text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.run.steps)} a step"
-    driven = bool(outcome.run.stepper.interface.inputs)  # states at breakpoints and at the end are saved, too
-    watched = (
-        outcome.run.steps if driven else (len(outcome.trajectory) - 1) * save_every
-    )  # steps up to the last saved state
+    text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.trajectory.steps)} a step"
+    saved = outcome.trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
+    watched = outcome.run.steps if saved else (len(outcome.trajectory) - 1) * save_every
     if not watched:
         return text
     return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"

@@ -12,7 +12,7 @@ import click
 import numpy as np
 
 from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure, tell
-from scvi_codegen.cli.formatting import counted, duration, span_remark
+from scvi_codegen.cli.formatting import counted, duration
 from scvi_codegen.cli.memory import check_state_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
@@ -109,7 +109,12 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
             show_progress(int(BAR_LENGTH * (run.t - model.t) / model.covered) if controlled else done)
 
         try:
-            record.follow(steps, model.save_every, progress=report_progress, stop=lambda: bool(caught))
+            record.take(keep=True)
+            for segment in model.segments(run):
+                until, last = math.inf if segment is None else run.steps + segment, model.has_shorter_last_step
+                record.continue_recording(
+                    until, model.save_every, progress=report_progress, stop=lambda: bool(caught), to_end=last
+                )
         except StepFailedError as error:
             failure = error
     return IndexedOutcome(
@@ -132,10 +137,8 @@ def _summary(model: IndexedModel, outcome: IndexedOutcome) -> Iterator[str]:
     geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
     yield f"{method.title}; {order}, {geometry}"
     kept = counted(len(trajectory.t), "state")
-    lengths = "of adaptive size" if run.plan else f"of {run.h:g}"
+    lengths = "of adaptive size" if run.plan else f"of {model.h:g}"
     yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} saved"
-    if model.h is not None:
-        yield from span_remark(model.span, model.step, model.step_count, model.t)
     if run.steps:
         each = outcome.seconds / run.steps
         yield (

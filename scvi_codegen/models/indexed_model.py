@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,10 @@ from scvi_codegen.models.model import (
     check_error,
     check_one_of,
     check_step,
+    is_whole,
     real,
     steps_in,
+    whole_steps_in,
 )
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.validation.argument_types import check_kind
@@ -110,11 +112,34 @@ class IndexedModel:
 
     @property
     def step_count(self) -> int:
-        """Number of fixed steps: ``steps``, or the integer (at least 1) nearest to ``span`` / h."""
+        """Number of fixed steps: ``steps``, or ``span`` / h rounded up, as the last step may be shorter."""
         if self.steps is not None:
             return self.steps
         assert self.span is not None  # by construction
         return steps_in(self.span, self.step)
+
+    def whole_step_count(self) -> int:
+        """Return the number of steps of a run that cannot end with a shorter step, as of :class:`Model`."""
+        return self.step_count if self.span is None else whole_steps_in(self.span, self.step, self.t)
+
+    @property
+    def has_shorter_last_step(self) -> bool:
+        """True if the span is not a whole number of fixed steps, so that the last step is shorter."""
+        return not (self.span is None or self.h is None or is_whole(self.span, self.h))
+
+    def segments(self, run: IndexedRun) -> Iterator[int | None]:
+        """Prepare a run of this model for each segment of equal steps, and yield its number of steps.
+
+        ``None`` stands for steps up to the target time of the run.
+        """
+        if not self.has_shorter_last_step:
+            yield None if run.plan else self.step_count
+            return
+        from scvi_codegen.runtime.runs_with_inputs import planned_segments  # imported here: not needed for reading
+
+        for segment in planned_segments(run.t, self.t + self.covered, run.h, {}):
+            run.update(h=segment.h)
+            yield segment.steps
 
     @property
     def covered(self) -> float:
@@ -153,7 +178,11 @@ class IndexedModel:
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """Integrate over the whole span; raises as :meth:`IndexedStepper.integrate`."""
-        lengths = self._step_arguments if self.h is None else {**self._step_arguments, "steps": self.step_count}
+        lengths = self._step_arguments
+        if self.has_shorter_last_step:
+            lengths["t_end"] = self.t + self.covered
+        elif self.h is not None:
+            lengths["steps"] = self.step_count
         return self.stepper().integrate(
             **self._initial_arguments, **lengths, save_every=self.save_every, progress=progress
         )

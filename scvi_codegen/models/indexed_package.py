@@ -60,7 +60,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         },
         moving=moving if moving in arrays else "",
         constraints=bool(interface.constraints),
-        run={"t": model.t, "h": model.step, "steps": model.step_count, "save_every": model.save_every},
+        run={"t": model.t, "h": model.step, "steps": model.whole_step_count(), "save_every": model.save_every},
     )
     texts = {**source.files, **example, **{f"{name}.txt": _lines(values) for name, values in arrays.items()}}
     texts |= model_texts(model)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.errors import ModelFileError
+from scvi_codegen.errors import MethodWarning, ModelFileError, warn
 from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import Method, as_method
@@ -35,8 +35,10 @@ __all__ = [
     "check_length",
     "check_one_of",
     "check_step",
+    "is_whole",
     "real",
     "steps_in",
+    "whole_steps_in",
 ]
 
 DEFAULT_METHOD = SVI(8)
@@ -128,7 +130,7 @@ class Model:
 
     @property
     def step_count(self) -> int:
-        """Number of fixed steps: ``steps``, or the integer (at least 1) nearest to ``span`` / h.
+        """Number of fixed steps: ``steps``, or ``span`` / h rounded up, as the last step may be shorter.
 
         Raises:
             ModelFileError: if the number is not known in advance, because the run ends at a time.
@@ -142,6 +144,15 @@ class Model:
             )
         assert self.span is not None  # by construction
         return steps_in(self.span, step)
+
+    def whole_step_count(self) -> int:
+        """Return the number of steps of a run that cannot end with a shorter step; see :func:`whole_steps_in`."""
+        return self.step_count if self.span is None else whole_steps_in(self.span, self.step, self.t)
+
+    @property
+    def has_shorter_last_step(self) -> bool:
+        """True if the span is not a whole number of fixed steps, so that the last step is shorter."""
+        return not (self.span is None or self.ends_at_time or is_whole(self.span, self.step))
 
     @property
     def ends_at_time(self) -> bool:
@@ -213,8 +224,8 @@ class Model:
 
         return self._inputs_and_parameters(stepper)[1](first_inner_time(self.t, self.end))
 
-    def input_segments(self, run: Run) -> Iterator[int | None]:
-        """Prepare a run of this model for each segment between breakpoints of its inputs, or for the whole span.
+    def segments(self, run: Run) -> Iterator[int | None]:
+        """Prepare a run of this model for each segment of equal steps, between breakpoints of its inputs.
 
         Yields:
             Number of steps of the segment; ``None`` for steps up to the target time of the run.
@@ -222,7 +233,7 @@ class Model:
         Raises:
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
-        if not self.system.inputs:
+        if not (self.system.inputs or self.has_shorter_last_step):
             yield None if run.plan else self.step_count
             return
         from scvi_codegen.runtime.runs_with_inputs import prepared_segments  # imported here, as NumPy above
@@ -232,7 +243,7 @@ class Model:
 
     @property
     def end(self) -> float:
-        """Final time of a run with inputs."""
+        """Final time."""
         from scvi_codegen.runtime.runs_with_inputs import final_time
 
         return final_time(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
@@ -253,7 +264,7 @@ class Model:
         return found, parameters_of(stepper, self.parameters, found)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """Start the run of this model at its initial state, to be advanced :attr:`step_count` steps or to its end."""
+        """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end."""
         p, h = self.momenta(stepper), self.h
         if h is None and self.has_time_transformation:
             from scvi_codegen.runtime.largest_step import largest_step  # imported here: not needed for reading
@@ -333,9 +344,30 @@ def check_adaptive(tolerance: float | None, span: float | None) -> None:
         raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
 
 
+def is_whole(span: float, h: float) -> bool:
+    """Return True if a span is a whole number of steps, up to rounding."""
+    from scvi_codegen.runtime.times import WHOLE  # imported here: not needed for reading a model
+
+    steps = span / abs(h)
+    return round(steps) > 0 and abs(steps - round(steps)) <= WHOLE * max(1.0, steps)
+
+
 def steps_in(span: float, h: float) -> int:
-    """Return the integer (at least 1) nearest to span / h."""
-    return max(1, round(span / abs(h)))
+    """Return the number of steps in a span of which the last may be shorter."""
+    return round(span / abs(h)) if is_whole(span, h) else math.ceil(span / abs(h))
+
+
+def whole_steps_in(span: float, h: float, t: float) -> int:
+    """Return the number (at least 1) of equal steps nearest to a span; warn of the end of the run if it differs."""
+    steps = max(1, round(span / abs(h)))
+    if not is_whole(span, h):
+        warn(
+            f"span {span:g} is not a whole number of steps of {abs(h):g}, and recorded runs and C programs have equal "
+            f"steps: {steps} steps end at t = {t + steps * h:.12g}, not {t + math.copysign(span, h):g}; give a step "
+            "that divides the span",
+            MethodWarning,
+        )
+    return steps
 
 
 def check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:

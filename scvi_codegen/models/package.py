@@ -226,7 +226,8 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
     else:
-        steps = OUTPUTS if model.h is None or model.time_transformation is not None else max(1, model.step_count)
+        count = OUTPUTS if model.h is None or model.time_transformation is not None else None
+        steps = count or max(1, model.step_count if model.system.inputs else model.whole_step_count())
     save_every = max(1, steps // OUTPUTS)
     return ExampleRun(
         q=model.q,

@@ -49,12 +49,14 @@ def ensemble_work(
     Raises:
         StateError: if a shape, name or number is invalid, or the stepper has a time transformation.
     """
-    if inputs is not None:
+    if inputs is not None or (h is not None and t_end is not None and steps is None):
         if t_eval is not None:
+            if inputs is None:
+                raise StateError("t_eval requires adaptive steps: omit h")
             raise StateError("t_eval is not supported with inputs: omit t_eval")
         interval: dict[str, Any] = {"h": h, "steps": steps, "t_end": t_end, "tolerance": tolerance}
         return _work_with_inputs(
-            stepper, q, p, inputs=inputs, velocity=velocity, t=t, parameters=parameters, **interval, **others
+            stepper, q, p, inputs=inputs or {}, velocity=velocity, t=t, parameters=parameters, **interval, **others
         )
     _check_no_time_transformation(stepper)
     p = momenta_of_each(stepper, q, p, velocity, t, parameters)
@@ -69,7 +71,9 @@ def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple
     """Return h and steps of a fixed-step ensemble; raise ``StateError`` for missing or contradictory arguments."""
     given = [name for name, value in others.items() if value is not None]
     if h is None or steps is None:
-        raise StateError("give either h and steps (fixed step size) or t_end alone (adaptive step size)")
+        raise StateError("give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)")
+    if others["t_end"] is not None:
+        raise StateError(f"give either steps={steps} or t_end with h, not both")
     if given:
         raise StateError(f"{given[0]} requires adaptive steps: give t_end without h and steps")
     return h, steps

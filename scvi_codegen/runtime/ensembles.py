@@ -52,9 +52,10 @@ class Ensembles(ConstrainedStates):
                 (k, n), one row per trajectory. Fixed steps are common, end at all breakpoints and lead to one t_end.
             velocity: (k, m) initial velocities, instead of p.
             h, steps, save_every, t, options, progress: as in :meth:`integrate`.
-            t_end: final time, or (k,) final times, for adaptive steps, instead of h and steps. Every
-                ``save_every``-th state and the last state of each trajectory are saved, with their times in ``times``.
-                ``progress`` is then called with the number of completed trajectories.
+            t_end: final time; with h the last step is shorter unless h divides the time. Without h and steps: final
+                time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
+                trajectory are saved, with their times in ``times``, and ``progress`` is called with the number of
+                completed trajectories.
             tolerance: relative error of an adaptive step; by default round-off.
             t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
             parameters: values by name, one number or k each; or an array (k, number of parameters).

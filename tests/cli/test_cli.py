@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shlex
@@ -28,7 +29,7 @@ from scvi_codegen.cli.conservation import energy_report
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_model, parse_model, save_model
+from scvi_codegen.models.model_file import load_indexed_model, load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 pytestmark = pytest.mark.long
@@ -296,16 +297,38 @@ class TestRun:
         text = output_of("run", "kepler", "--tolerance", "1e-12", "--span", "3")
         assert "order 16, symplectic only at fixed step size, symmetric" in text
 
-    def test_a_span_that_the_step_does_not_divide_is_reported(self):
-        """Single runs, recorded ones, continued ones, ensembles and sums over indices; not where the step divides."""
+    def test_a_run_ends_at_its_span_with_a_shorter_last_step(self):
+        """The last states of single runs, ensembles and array systems are those of Python's t_end."""
         Path("s.csv").write_text("q1,q2,q1_dot,q2_dot\n1.0,0.0,0.0,1.0\n")
-        ring = str(Path(__file__).parents[2] / "examples/fput_ring.toml")
-        end = "of steps of 0.3: the run is the nearest number of them, 3, and ends at t = 0.9"
-        for words in (("kepler",), ("kepler", "-o", "a.run"), ("kepler", "--ensemble", "s.csv"), (ring,)):
-            assert end in output_of("run", *words, "--step", "0.3", "--span", "1"), words
-        assert "ends at t = 2.1, not 2;" in output_of("run", "--resume", "a.run", "--span", "2")
+        words = ("--step", "0.3", "--span", "1", "--save-every", "2")
+        stepper = compile_stepper(problem("kepler").system, SVI(8))
+        expected = stepper.integrate([1.0, 0.0], velocity=[0.0, 1.0], h=0.3, t_end=1.0)
+        for more in (("--q", "1,0", "--velocity", "0,1"), ("--ensemble", "s.csv")):
+            document = json.loads(output_of("run", "kepler", *words, *more, "-o", "a.npz", "--json"))
+            assert document.get("h", 0.3) == 0.3
+            assert document["steps"] in (4, {"least": 4, "most": 4})
+            with np.load("a.npz") as saved:
+                assert saved["t"] == pytest.approx([0.0, 0.6, 0.9, 1.0], abs=1e-15)
+                assert saved["q"][-1].ravel() == pytest.approx(expected.q[-1], abs=1e-15)
+        path = Path(__file__).parents[2] / "examples/fput_ring.toml"
+        text = output_of("run", str(path), *words, "-o", "r.npz")
+        assert "4 steps of 0.3 from t = 0 to t = 1; 4 states saved" in text
+        model = load_indexed_model(path, {"run": {"step": 0.3, "span": 1.0}})
+        whole = model.stepper().integrate(model.q, velocity=model.velocity, h=0.3, t_end=1.0)
+        with np.load("r.npz") as saved:
+            assert saved["q_q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)
+        assert model.integrate().t[-1] == 1.0
+
+    def test_equal_steps_of_recorded_runs_and_programs_end_elsewhere_with_a_warning(self):
+        for words in (("run", "kepler", "-o", "a.run"), ("generate", "kepler", "-o", "program")):
+            found = invoke(*words, "--step", "0.3", "--span", "1")
+            assert found.exit_code == 0
+            assert "Warning: span 1 is not a whole number of steps of 0.3" in found.stderr
+            assert "3 steps end at t = 0.9, not 1" in found.stderr
+        assert "steps end at t = 2.1, not 2;" in invoke("run", "--resume", "a.run", "--span", "2", "--json").stderr
         for words in ("--step 0.25 --span 1", "--step 0.3 --steps 3", "--tolerance 1e-9 --span 1"):
-            assert "whole number" not in output_of("run", "kepler", *words.split())
+            assert "whole number" not in invoke("run", "kepler", *words.split(), "-o", "b.run").output
+            shutil.rmtree("b.run")
 
     def test_summary_lists_conserved_quantities(self):
         text = output_of("run", "kepler")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import ExpressionError, ModelFileError, SystemDefinitionError
+from scvi_codegen.errors import ExpressionError, MethodWarning, ModelFileError, SystemDefinitionError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
@@ -322,11 +323,25 @@ def test_models_from_python_are_checked_and_accept_arrays():
             kepler(**changes)
 
 
-def test_step_count_is_the_integer_nearest_to_the_span():
-    assert kepler(h=0.3, span=1.0).step_count == 3
-    assert kepler(h=-0.3, span=1.0).step_count == 3
+def test_the_last_step_of_a_span_may_be_shorter():
+    assert kepler(h=0.3, span=1.0).step_count == 4
+    assert kepler(h=-0.3, span=1.0).step_count == 4
     assert kepler(h=5.0, span=1.0).step_count == 1
     assert kepler(steps=0, span=None).step_count == 0
+    assert [kepler(h=0.1, span=span).has_shorter_last_step for span in (0.3, 0.31, 1e8)] == [False, True, False]
+    for h, expected in ((0.3, [0.3, 0.1]), (-0.3, [-0.3, -0.1]), (5.0, [1.0])):
+        model = kepler(h=h, span=1.0)
+        run = model.start(compile_stepper(model.system, model.method))
+        sizes = [run.record(steps).step_sizes[0] for steps in model.segments(run)]
+        assert run.t == math.copysign(1.0, h)
+        assert sizes == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("h", "steps", "end"), [(0.3, 3, "0.9"), (-0.3, 3, "-0.9"), (0.28, 4, "1.12"), (5.0, 1, "5")])
+def test_equal_steps_end_near_the_span_with_a_warning(h, steps, end):
+    with pytest.warns(MethodWarning, match=re.escape(f"{steps} steps end at t = {end}, not {math.copysign(1, h):g}")):
+        assert kepler(h=h, span=1.0).whole_step_count() == steps
+    assert kepler(h=0.1, span=1.0).whole_step_count() == 10  # without a warning
 
 
 def test_a_model_starts_from_its_velocities_and_parameters():

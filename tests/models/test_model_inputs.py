@@ -59,7 +59,7 @@ def test_model_with_inputs_equals_integrate(file, monkeypatch, tmp_path):
     stepper = compile_stepper(model.system, model.method)
     expected = stepper.integrate([0.3], velocity=[0.1], inputs=dict(model.inputs), h=0.1, t_end=2.3)
     run = model.start(stepper)
-    for steps in model.input_segments(run):
+    for steps in model.segments(run):
         run.advance(steps)
     assert (run.t, run.q[0], run.p[0]) == (expected.t[-1], expected.q[-1, 0], expected.p[-1, 0])
 
@@ -195,7 +195,7 @@ def test_names_that_are_not_inputs_are_rejected():
         Model(**given, inputs={"u": np.sin})
     model = Model(**given)
     with pytest.raises(ModelFileError, match=r"the input u is not set: .*--input u=FILE"):
-        next(model.input_segments(model.start(compile_stepper(system, "svi:2"))))
+        next(model.segments(model.start(compile_stepper(system, "svi:2"))))
 
 
 def test_hamiltonian_has_inputs():

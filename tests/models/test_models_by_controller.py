@@ -174,7 +174,7 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
         model = sc.Model(method=sc.SVI(2), h=tau, span=6.0, **common)
         driven = model.stepper().integrate(model.q, model.p, inputs=pushes, h=tau, t_end=6.0)
         run = model.start(model.stepper())
-        for steps in model.input_segments(run):
+        for steps in model.segments(run):
             run.record(steps)
         assert np.array_equal(run.q, driven.q[-1])
         errors.append(abs(driven.q[-1] - exact)[0])

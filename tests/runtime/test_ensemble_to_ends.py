@@ -49,6 +49,18 @@ def test_each_trajectory_equals_the_single_run(kepler, threads, save_every):
     assert np.nanmax(np.abs(runs.momentum_errors())) < 1e-12
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_fixed_steps_end_at_t_end_with_a_shorter_step(kepler, threads):
+    for h, t_end in ((0.03, 0.1), (-0.03, -0.1), (0.25, 0.1)):
+        runs = kepler.integrate_ensemble(Q, P, h=h, t_end=t_end, save_every=2, threads=threads)
+        for j in range(len(Q)):
+            run = kepler.integrate(Q[j], P[j], h=h, t_end=t_end)
+            assert runs.t[-1] == t_end == run.t[-1]
+            assert (runs.status[j], runs.steps[j]) == ("ok", run.steps)
+            assert np.abs(runs.q[-1, j] - run.q[-1]).max() < 1e-15
+            assert np.abs(runs.p[-1, j] - run.p[-1]).max() < 1e-15
+
+
 def test_states_at_common_times_end_with_each_trajectory(kepler):
     times = np.linspace(0.0, 20.0, 9)
     runs = kepler.integrate_ensemble(Q, P, t_end=ENDS, tolerance=TOLERANCE, t_eval=times)
@@ -97,8 +109,11 @@ def test_interrupt_returns_completed_states(kepler):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({}, "give either h and steps"),
-        ({"h": 0.1, "steps": 3, "t_end": 1.0}, "t_end requires adaptive steps"),
+        ({}, "give either h with steps or t_end"),
+        ({"h": 0.1, "steps": 3, "t_end": 1.0}, "give either steps=3 or t_end with h"),
+        ({"h": 0.1, "t_end": -1.0}, "h = 0.1 has the wrong sign"),
+        ({"h": 0.1, "t_end": [1.0, 2.0, 3.0, 4.0]}, "with h all trajectories have one t_end"),
+        ({"h": 0.1, "t_end": 1.0, "t_eval": [0.5]}, "t_eval requires adaptive steps"),
         ({"h": 0.1, "steps": 3, "tolerance": 1e-9}, "tolerance requires adaptive steps"),
         ({"t_end": [1.0, 2.0]}, "one time or 4"),
         ({"t_end": [1.0, 2.0, -1.0, 3.0]}, "split the ensemble"),

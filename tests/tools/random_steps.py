@@ -159,8 +159,12 @@ def compiled(name: str, method: Any, solver: str = "auto") -> Any:
 
 
 def displaced(q: Array, end: Array, other: Array) -> float:
-    """The difference of two ends of a step beside the state, as estimates are."""
-    size = np.abs(q) + np.abs(end - q)
+    """The difference of two ends of a step beside the state, as estimates are.
+
+    The displacement is the larger of both: a step of three periods through a kick at its start may end at 200 times the
+    distance of the motion, and so do its half steps, which the estimate compares it with.
+    """
+    size = np.abs(q) + np.maximum(np.abs(end - q), np.abs(other - q))
     return float(np.max(np.abs(end - other) / (size + size.max() + 1e-300)))
 
 
