@@ -146,7 +146,7 @@ class StepEquations:
         return clipped(f"<{count} equation{'s' * (count > 1)} of {self.system.name} by {self.method.name}>", LONGEST)
 
     def _repr_latex_(self) -> str | None:
-        """LaTeX of all equations, nothing if a notebook could not show them."""
+        """Return the LaTeX of all equations, nothing if a notebook could not show them."""
         size = sympy.count_ops(self.equations[0].residual) * len(self.equations)
         return self.to_latex() if size <= MOST_SHOWN * LARGEST_SHOWN else None
 

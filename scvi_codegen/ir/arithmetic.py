@@ -75,12 +75,12 @@ class _Graph:
         return self._ids[content]
 
     def operands(self, k: int) -> tuple[int, ...]:
-        """Ids of the operands of a node, all smaller than its own."""
+        """Return the ids of the operands of a node, all smaller than its own."""
         content = self.nodes[k]
         return content[1] if isinstance(content, tuple) else ()
 
     def read(self, expression: sympy.Expr) -> int:
-        """The id of a SymPy expression."""
+        """Return the id of a SymPy expression."""
         if expression not in self._read:
             self._read[expression] = self._build(expression)
         return self._read[expression]
@@ -196,7 +196,7 @@ class _Graph:
         return self.node(("*", (square, x))) if n % 2 else square
 
     def _rank(self, factor: sympy.Expr) -> tuple[int, int]:
-        """Order of factors: numbers, parameters, composites, coordinates; ties by the order of first reading."""
+        """Return the sort key of a factor: numbers, parameters, composites, coordinates; then the order of reading."""
         if self.is_constant(factor):
             return (0, self.read(factor))
         if isinstance(factor, sympy.Symbol):
@@ -261,7 +261,7 @@ def _linearise(graph: _Graph, roots: Sequence[int]) -> tuple[tuple[Expression, .
 
 
 def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
-    """Reachable nodes, operands first; results that depend on the first arguments come first.
+    """Return the reachable nodes, operands first; results that depend on the first arguments come first.
 
     In a chain a result shares subexpressions with its neighbours only, so that numbers are used soon after they are
     computed, which helps compilers and processors.
@@ -283,7 +283,7 @@ def _order(graph: _Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _first_arguments(graph: _Graph) -> list[float]:
-    """Smallest index of an argument on which each node depends."""
+    """Return the smallest index of an argument on which each node depends."""
     first: list[float] = []
     for k, content in enumerate(graph.nodes):  # operands have smaller ids
         if isinstance(content, Load) and content.source == "u":

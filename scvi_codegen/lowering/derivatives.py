@@ -75,7 +75,7 @@ def _time_derivatives(system: MechanicalSystem, arguments: Sequence[Symbol]) -> 
 
 
 def _energy_derivatives(system: MechanicalSystem) -> Kernel:
-    """Kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE is the change of K / rate."""
+    """Return the kernel of the gradient of the energy E of a state: since K = rate (H - E) = 0, dE = dK / rate."""
     assert system.clock is not None
     m, energy = system.dimension, system.clock.energy
     partials = gradient(system.formula, (*system.coordinates, *system.parameters))
@@ -94,7 +94,7 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
 
 
 def _curvature(system: MechanicalSystem, family: StageGroup) -> Kernel | None:
-    """Kernel of the Hessian-vector product of multipliers . results, as the gradient of a directional derivative."""
+    """Return the kernel of the Hessian-vector product of multipliers . results: gradient of a derivative."""
     depends = (*family.arguments, *system.parameters, system.time)
     multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(family.results))]
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]

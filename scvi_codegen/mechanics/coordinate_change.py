@@ -22,7 +22,7 @@ __all__ = ["change_coordinates"]
 def change_coordinates(
     system: LagrangianSystem, old: Mapping[str, str], *, coordinates: Sequence[str]
 ) -> LagrangianSystem:
-    """The system in other coordinates, by a point transformation q = q(u, t): v = q_u u' + q_t.
+    """Return the system in other coordinates, by a point transformation q = q(u, t): v = q_u u' + q_t.
 
     Momenta change by the transposed derivative, p_u = q_u^T p_q; energy and Lagrangian keep their values.
 

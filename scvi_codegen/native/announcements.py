@@ -58,7 +58,7 @@ def announced(what: str) -> Iterator[None]:
 
 @contextmanager
 def announce_to(listener: Callable[[str], None]) -> Iterator[None]:
-    """Context in which announcements are passed to a function, from a separate thread, instead of stderr."""
+    """Pass announcements to a function, from a separate thread, instead of stderr."""
     token = _listener.set(listener)
     try:
         yield

@@ -315,7 +315,7 @@ def run_compiler(command: list[str], folder: Path) -> None:
 
 @contextmanager
 def _finished(command: list[str], folder: Path) -> Iterator[None]:
-    """Context in which a command runs concurrently, and which waits for it; raises BuildError if it fails."""
+    """Run a command concurrently with the block and wait for it; raise BuildError if it fails."""
     with running(command, folder) as process:
         yield
         try:

@@ -19,7 +19,7 @@ GUARDED = 'exec 3<&0 </dev/null; (read -r end <&3; kill -KILL 0) >/dev/null 2>&1
 
 @contextmanager
 def running(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Context in which a program runs in a folder; it is killed with its children at the end.
+    """Run a program in a folder during the block; kill it with its children at the end.
 
     Its temporary files are in the folder, too. A program that cannot be run has the status 126 or 127, as in a shell.
     Without POSIX only the program itself is killed, and not if Python is killed.

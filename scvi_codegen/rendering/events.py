@@ -77,7 +77,7 @@ def _kernel(interface: Interface, functions: Sequence[str | Expr]) -> tuple[Kern
 
 
 def _names(interface: Interface) -> dict[str, Symbol]:
-    """Names that a function may use; coordinates and parameters take precedence over default names of momenta."""
+    """Return the names that a function may use; coordinates and parameters precede default names of momenta."""
     velocities = [name + DOT for name in interface.coordinates]
     return {
         name: symbol(name)

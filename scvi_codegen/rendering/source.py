@@ -219,7 +219,7 @@ class Interface:
         return len(self.coordinates)
 
     def about(self) -> dict[str, str]:
-        """Title, system, method, and version of this package, to accompany every computed number."""
+        """Return title, system, method, and version of this package, to accompany every computed number."""
         return {"title": self.title, "system": self.system, "method": self.method, "version": __version__}
 
     @property
