@@ -148,7 +148,7 @@ def benchmark(
         json_path: file to write, after each section.
         plot_path: file of the plot; for adaptive cases a second one, NAME-steps, shows step sizes along an orbit.
         resume: keep the sections of ``json_path`` that did not fail, and add others to them.
-        say: called with a description of each activity.
+        report_activity: called with a description of each activity.
         show: called with the text of the report, section by section.
 
     Raises:

@@ -68,7 +68,7 @@ def achieved(
     return float(np.linalg.norm(run.q[-1] - exact)) / size
 
 
-def assert_as_promised(advice: Advice, error: float, tolerance: float) -> None:
+def assert_achieved(advice: Advice, error: float, tolerance: float) -> None:
     """Half the tolerance is aimed at; high orders miss it where the error is no smooth function of the step.
 
     Measured: 0.03 to 0.5 of the tolerance, nearly always above 0.3, and 0.9 to 1.3 of the error expected.
@@ -89,7 +89,7 @@ class TestAchievedErrors:
         advice = advise(system, method, q, p, span, tolerance)
         size = math.sqrt(1.0 + 1.5 * eccentricity**2)  # in the mean over an orbit
         error = achieved(system, advice, q, p, kepler_end(eccentricity, span), size)
-        assert_as_promised(advice, error, tolerance)
+        assert_achieved(advice, error, tolerance)
 
     @pytest.mark.parametrize(
         ("method", "span", "tolerance"),
@@ -112,7 +112,7 @@ class TestAchievedErrors:
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, method, q, p, span, tolerance)
         error = achieved(system, advice, q, p, kepler_end(0.2, span), 1.0)
-        assert_as_promised(advice, error, tolerance)
+        assert_achieved(advice, error, tolerance)
 
     @pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-11])
     @pytest.mark.parametrize("method", [SVI(8), SVI(4), RadauIIA(3)], ids=name)
@@ -120,7 +120,7 @@ class TestAchievedErrors:
         q, p, span = [1.5], [0.0], 1100.0
         advice = advise(pendulum(), method, q, p, span, tolerance)
         error = achieved(pendulum(), advice, q, p, pendulum_end(span), 1.5 / math.sqrt(2.0))
-        assert_as_promised(advice, error, tolerance)
+        assert_achieved(advice, error, tolerance)
 
     @pytest.mark.parametrize(
         ("method", "tolerance"), [(SVI(8), 1e-6), (SVI(8), 1e-9), (SVI(8), 1e-11), (SVI(5), 1e-9)], ids=name
@@ -133,7 +133,7 @@ class TestAchievedErrors:
         advice = advise(system, method, q, p, span, tolerance)
         exact = outer_reference(span)
         error = achieved(system, advice, q, p, exact, float(np.linalg.norm(exact)))
-        assert_as_promised(advice, error, tolerance)
+        assert_achieved(advice, error, tolerance)
 
     def test_advice_backward_with_parameters_and_time(self):
         system, span = problem("duffing").system, -40.0
@@ -344,9 +344,9 @@ class TestCommandLine:
 
 
 def test_symplecticity_is_not_claimed_under_forces():
-    kept = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
+    saved = advise(problem("duffing").system, SVI(4), [0.5], [0.0], 5.0, 1e-6)
     damped = LagrangianSystem.from_text(
         name="damped", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2", dissipation="q_dot**2/10"
     )
-    assert "symplectic" in kept.message
+    assert "symplectic" in saved.message
     assert "symplectic" not in advise(damped, SVI(4), [0.5], [0.0], 5.0, 1e-6).message

@@ -86,10 +86,10 @@ class TestLongSteps:
 
     @pytest.mark.filterwarnings("error")
     def test_late_or_stepwise_push_does_not_warn(self):
-        held = sc.LagrangianSystem.from_text(
+        constrained = sc.LagrangianSystem.from_text(
             name="held", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2 + u*x", inputs=["u"]
         )
-        stepper = sc.compile_stepper(held, "svi:1")
+        stepper = sc.compile_stepper(constrained, "svi:1")
         stepper.integrate([0.0], [0.0], inputs={"u": ([0.0, 1.0, 1.1, 30.0], [0.0, 0.0, 1.0, 1.0])}, h=0.1, t_end=30.0)
         going = stepper.start([0.0], [0.0], h=0.1)
         for k in range(200):
@@ -225,7 +225,7 @@ class TestLostEnergy:
         sc.compile_indexed(pair, method).integrate(**start, **steps)
 
 
-class TestPromises:
+class TestTolerances:
     def test_near_collision_is_integrated_or_rejected(self):
         state = "--q 1.999,0 --velocity 0,0.022366272 --span 18.849555921538759"
         assert re.search(r"q1 =\s+1\.99", run(f"kepler {state} --tolerance 1e-9").output)
@@ -340,9 +340,9 @@ class TestKnownDigits:
         assert in_known_digits(x, error) == text
 
     def test_command_line_prints_correct_digits(self):
-        said = run("kepler --steps 400").output
-        assert "in the digits confirmed by a second run)" in said
-        assert len(re.search(r"q1 =\s+(\S+)", said)[1]) < 17
+        printed = run("kepler --steps 400").output
+        assert "in the digits confirmed by a second run)" in printed
+        assert len(re.search(r"q1 =\s+(\S+)", printed)[1]) < 17
 
 
 @pytest.mark.full
@@ -364,15 +364,15 @@ def test_wrong_steps_are_rejected_or_reported(seed):
             stepper = sc.compile_stepper(problem.system, method)
             for _ in range(100):
                 q, p = random.normal(size=(2, stepper.dimension))
-                said = _said_of_wrong(stepper, judge, q, p, problem.step * 10.0 ** random.uniform(-1.0, 1.0))
-                assert said is not False or method.degree < 8
-                found.append(said)
-    wrong = [said for said in found if said is not None]
+                printed = _report_of_wrong(stepper, judge, q, p, problem.step * 10.0 ** random.uniform(-1.0, 1.0))
+                assert printed is not False or method.degree < 8
+                found.append(printed)
+    wrong = [printed for printed in found if printed is not None]
     assert len(wrong) > 80  # so that there is something to be said
     assert wrong.count(False) < 0.08 * len(wrong)
 
 
-def _said_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.ndarray, h: float) -> bool | None:
+def _report_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.ndarray, h: float) -> bool | None:
     """Of a step off by more than a hundredth whether that was said."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sc.AccuracyWarning)

@@ -90,7 +90,7 @@ def test_chaotic_trajectory_is_classified_as_chaotic():
     assert 0.3 < found[2.5].tenfold < 10.0
 
 
-def of_promise(**more):
+def claimed_run(**more):
     """A run whose worst step and energy are in doubt or not."""
     q = np.ones((64, 1))
     stated = {"step_error": 1e-12, "worst_step_time": 3.25, "q": q, "p": q, "velocity": q, "steps": 63}
@@ -112,15 +112,15 @@ def of_promise(**more):
 def test_claimed_tolerance_is_compared_with_the_final_error(known, more, words):
     system = sc.LagrangianSystem.from_text(name="free", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
     regular, chaotic = (Known(q=np.array([known]), p=np.array([9.0]), tenfold=tenfold) for tenfold in (math.inf, 2.0))
-    found = missed_tolerance(system, of_promise(**more), 1e-6, regular)
+    found = missed_tolerance(system, claimed_run(**more), 1e-6, regular)
     assert (words in found) if words else found == ""
-    assert bool(missed_tolerance(system, of_promise(**more), 1e-6, chaotic)) == bool(more)
+    assert bool(missed_tolerance(system, claimed_run(**more), 1e-6, chaotic)) == bool(more)
 
 
 def test_missing_second_run_is_made_if_the_estimate_is_doubtful(driven, monkeypatch):
     asked = []
     monkeypatch.setattr(tolerance_check, "known_digits", lambda system, run, *, most: asked.append(most))
-    assert missed_tolerance(driven, of_promise(), 1e-6) == ""
+    assert missed_tolerance(driven, claimed_run(), 1e-6) == ""
     assert asked == []
-    assert "alone has a relative error" in missed_tolerance(driven, of_promise(step_error=1e-4), 1e-6)
+    assert "alone has a relative error" in missed_tolerance(driven, claimed_run(step_error=1e-4), 1e-6)
     assert asked == [10_000 + 4 * 63]

@@ -379,10 +379,10 @@ class TestCommand:
     def test_runs_without_peers(self, tmp_path, monkeypatch):
         monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
         path = tmp_path / "out.json"
-        said = []
+        messages = []
         plan = bench.Plan(peers=("heyoka", "cyrk", "rebound"), quick=True, methods=(SVI(4),))
         names = ["planar-pendulum", "drift"]
-        text = bench.benchmark(names, plan, json_path=str(path), report_activity=said.append).text()
+        text = bench.benchmark(names, plan, json_path=str(path), report_activity=messages.append).text()
         assert "skipped heyoka: heyoka is not installed (pip install 'scvi-codegen[bench]')" in text
         assert "skipped cyrk: CyRK is not installed" in text
         data = json.loads(path.read_text())
@@ -390,7 +390,7 @@ class TestCommand:
         assert data["cases"][0]["rows"][0]["best"] is None
         assert max(found["error"] for found in data["cases"][0]["measurements"]) < 1e-6
         assert len(data["tables"][0]["rows"]) == 6
-        assert "planar-pendulum: reference" in said
+        assert "planar-pendulum: reference" in messages
 
     def test_interrupt_saves_completed_measurements(self, tmp_path, monkeypatch):
         def interrupt(plan, report_activity):

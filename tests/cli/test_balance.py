@@ -55,8 +55,8 @@ def test_printed_balance_is_that_of_the_run():
     assert work[-1] < -0.01
     assert 0.0 < error < 1e-6
     changed = np.abs(energy - energy[0]).max()
-    said = f"energy: forces act, it changed by {changed:.3g} at most; energy balance |E - E0 - W| {error:.1e} at most"
-    assert said in text
+    line = f"energy: forces act, it changed by {changed:.3g} at most; energy balance |E - E0 - W| {error:.1e} at most"
+    assert line in text
     found = json.loads(output_of(MODEL, "--json"))
     assert found["work"] == pytest.approx(work[-1])
     assert found["energy_balance"] == pytest.approx(error)

@@ -414,11 +414,11 @@ class TestRun:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
     def test_interrupted_run_saves_computed_states(self, number, monkeypatch):
         @contextmanager
-        def third_portion(steps: int) -> Iterator[Callable[[int], None]]:
+        def third_chunk(steps: int) -> Iterator[Callable[[int], None]]:
             done = []
             yield lambda count: signal.raise_signal(number) if done.append(count) or len(done) == 3 else None
 
-        monkeypatch.setattr("scvi_codegen.cli.running.progress_bar", third_portion)
+        monkeypatch.setattr("scvi_codegen.cli.running.progress_bar", third_chunk)
         result = invoke("run", "kepler", "--steps", "1000000", "-o", "orbit.npz")
         assert result.exit_code == 130
         assert "Error: interrupted at t = " in result.stderr

@@ -27,9 +27,9 @@ def doctor(*words: str) -> tuple[int, str]:
 def findings(status: int = 0) -> dict[str, dict[str, Any]]:
     result = CliRunner().invoke(main, ["doctor", "--json"], prog_name="scvi-codegen")
     assert result.exit_code == status, result.output
-    said = json.loads(result.stdout)
-    assert said["ok"] == (status == 0)
-    return {found["name"]: found for found in said["findings"]}
+    report = json.loads(result.stdout)
+    assert report["ok"] == (status == 0)
+    return {found["name"]: found for found in report["findings"]}
 
 
 @pytest.fixture
@@ -50,24 +50,24 @@ def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
 
 def test_trial_stepper_is_compiled_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path / "cache"))
-    status, said = doctor()
+    status, report = doctor()
     assert status == 0
-    error = re.search(r"^ok +trial +a pendulum, .*relative energy error (\S+)$", said, re.MULTILINE)
+    error = re.search(r"^ok +trial +a pendulum, .*relative energy error (\S+)$", report, re.MULTILINE)
     assert error is not None
     assert float(error[1]) < 1e-10
-    assert re.search(r"^ok +compiler ", said, re.MULTILINE)
-    assert re.search(r"^ok +cache .*0 compiled integrators", said, re.MULTILINE)
+    assert re.search(r"^ok +compiler ", report, re.MULTILINE)
+    assert re.search(r"^ok +cache .*0 compiled integrators", report, re.MULTILINE)
     assert not (tmp_path / "cache").exists()
 
 
 def test_missing_compiler_names_what_to_install(tmp_path, monkeypatch):
     no_compiler(monkeypatch, tmp_path)
-    status, said = doctor()
+    status, report = doctor()
     assert status == 1
-    assert re.search(r"^fails compiler +none$", said, re.MULTILINE)
-    assert "apt install gcc" in said
-    assert "trial" not in said
-    assert "integrators cannot be compiled and run on this machine: compiler" in said
+    assert re.search(r"^fails compiler +none$", report, re.MULTILINE)
+    assert "apt install gcc" in report
+    assert "trial" not in report
+    assert "integrators cannot be compiled and run on this machine: compiler" in report
     assert findings(1)["compiler"]["status"] == "fails"
 
 

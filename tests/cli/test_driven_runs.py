@@ -66,8 +66,8 @@ def test_run_with_inputs_and_its_file_equal_integrate(model):
     assert Path("run.png").stat().st_size > 1000
     assert "24 steps of 0.1 from t = 0 to t = 2.3" in text  # one more than without a breakpoint within a step
     assert "in the digits confirmed by a second run" in text
-    told = [re.search(r"[\d.]+ iterations a step", each)[0] for each in (text, output_of())]
-    assert told[0] == told[1]
+    reported = [re.search(r"[\d.]+ iterations a step", each)[0] for each in (text, output_of())]
+    assert reported[0] == reported[1]
 
 
 def test_inputs_of_the_command_line_replace_those_of_the_file(model):
@@ -83,7 +83,7 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["--input", "u"], "not of the form NAME=FILE"),
         (["--input", "v=u.csv"], "'v' is not an input of 'pushed pendulum', whose inputs are u"),
@@ -95,10 +95,10 @@ def test_inputs_of_the_command_line_replace_those_of_the_file(model):
         (["--parameter", "u_0=1"], "no parameter 'u_0'"),
     ],
 )
-def test_unsupported_options_are_rejected(words, said):
+def test_unsupported_options_are_rejected(words, message):
     result = invoke(*words)
     assert result.exit_code == 2, result.output
-    assert said in result.stderr
+    assert message in result.stderr
 
 
 def test_ensemble_of_runs_with_inputs(model):

@@ -66,7 +66,7 @@ def test_every_command_is_tested():
 
 @pytest.mark.parametrize("words", QUIET_COMMANDS, ids=lambda words: " ".join(words[:2]).replace("/", " "))
 def test_quiet_prints_nothing_and_json_prints_one_document(words, monkeypatch):
-    monkeypatch.setattr(benchmark, "SECTIONS", {"nothing-but-this": lambda plan, say: NO_TIMES})
+    monkeypatch.setattr(benchmark, "SECTIONS", {"nothing-but-this": lambda plan, report: NO_TIMES})
     invoke("run", *KEPLER, "-o", "orbit.run")
     assert invoke(*words).stdout
     quiet = invoke(*words, "--quiet")

@@ -122,7 +122,7 @@ def pushed(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
 TRANSFORMED = SPRINGS + 'time_transformation = "1/(1 + x**2 + y**2)"\n'
 
 
-def held_pendulum(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
+def constrained_pendulum(t: Array, q: Array, p: Array) -> tuple[Array, Array, Array]:
     v = p / M
     factor = G * q[:, 1:] - square(v)
     return v, M * (np.array([0.0, -G]) + factor * q), none(q)
@@ -189,7 +189,7 @@ lagrangian = "m*(x_dot**2 + y_dot**2)/2 - {G}*m*y + 0*k*c"
 constraints = ["x**2 + y**2 = 1"]
 """,
         start="q = [0.6, -0.8]\nq_dot = [0.4, 0.3]\n",
-        rates=held_pendulum,
+        rates=constrained_pendulum,
         energy=lambda t, q, p: column(square(p) / (2 * M)) + M * G * q[:, 1],
         method=("svi:2", "svi-2-gauss-lobatto-3", 4),
         pessimism=10_000.0,  # the estimate is one of the multipliers' curve, too
@@ -617,9 +617,9 @@ def test_every_number_of_advice_is_correct(springs):
     pilots = [re.fullmatch(r"  h = (\S+) +(?:error (\S+)|no correct digit|fails) .*", line) for line in lines[1:]]
     rows = [(float(row[1]), row[2]) for row in pilots if row]
     assert len(rows) >= 3
-    for h, said in rows:
+    for h, message in rows:
         steps = round(5.25 / h)
-        if said is None or steps > 2000:
+        if message is None or steps > 2000:
             continue
         model = sc.LagrangianSystem.from_text(
             name="springs", coordinates=["x", "y"], parameters={"m": M, "k": K, "c": C},
@@ -627,7 +627,7 @@ def test_every_number_of_advice_is_correct(springs):
         )  # fmt: skip
         again = sc.compile_stepper(model, "svi:2").integrate(q[0], p[0], h=5.25 / steps, steps=steps, t=T)
         off = np.linalg.norm(again.q[-1] - end[0]) / math.sqrt(np.mean(np.sum(q**2, axis=1)))
-        assert 0.2 * off < float(said) < 20 * off
+        assert 0.2 * off < float(message) < 20 * off
 
 
 RING = """

@@ -157,8 +157,8 @@ def test_generate_for_an_array_system(ring: str) -> None:
     flags = ["-O1", "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wno-psabi", "-Werror"]
     command = [*find_compiler(), *flags, "main.c", "ring_svi.c", "-lm", "-o", "main"]
     subprocess.run(command, cwd="ring_svi", check=True)
-    said = subprocess.run(["./main"], cwd="ring_svi", check=True, capture_output=True, text=True).stdout
-    assert said.count("energy =") == 5
+    printed = subprocess.run(["./main"], cwd="ring_svi", check=True, capture_output=True, text=True).stdout
+    assert printed.count("energy =") == 5
     end = np.loadtxt("ring_svi/end.txt")
     assert end[:8] == pytest.approx(document["final"]["q"]["q"], abs=1e-14)
     assert end[8:] == pytest.approx(document["final"]["p"]["q"], abs=1e-14)

@@ -255,7 +255,7 @@ class TestPage:
         assert page.count("(19a)") == page.count("(19b)") == 2
 
     @pytest.mark.parametrize(
-        ("more", "said"),
+        ("more", "message"),
         [
             ({"forces": {"x": "-c*x_dot**3"}}, "Generalised forces f; below"),
             ({"damping": "c"}, "Momenta are damped at one rate,"),
@@ -263,10 +263,10 @@ class TestPage:
         ],
         ids=["forces", "damping", "constraints"],
     )
-    def test_forces_and_constraints_of_a_lagrangian_are_shown(self, more, said):
+    def test_forces_and_constraints_of_a_lagrangian_are_shown(self, more, message):
         plain, acted_on = (derivation_html(swing(**each), sc.SVI(2, "gauss-lobatto:3")) for each in ({}, more))
-        assert said in acted_on
-        assert said not in plain
+        assert message in acted_on
+        assert message not in plain
         Page(acted_on)
 
     def test_composition_is_shown_as_its_leapfrog_steps(self):
@@ -328,9 +328,9 @@ def test_page_renders_in_a_browser(browser, tmp_path, size, scheme):
         )
         assert len(sides) > 20
         for left, right in sides:
-            beside = left[1] == right[1] and left[0] < right[0]
+            extra = left[1] == right[1] and left[0] < right[0]
             below = left[2] <= right[1] and left[0] == right[0]
-            assert beside if size == "desk" else below
+            assert extra if size == "desk" else below
         assert view.evaluate("[...document.querySelectorAll('svg')].every(e => e.getBoundingClientRect().width > 200)")
 
 

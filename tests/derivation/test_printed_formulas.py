@@ -84,8 +84,8 @@ class Case:
             rates = [*zip(q, v, strict=True), *zip(v, a, strict=True)]
             return sum((sympy.diff(expression, x) * rate for x, rate in rates), sympy.diff(expression, t))
 
-        E = [along(momentum) - force - beside for momentum, force, beside in zip(Lv, Lq, f, strict=True)]
-        S = sum((m * (each + beside) for m, each, beside in zip(lam, E, f, strict=False)), sympy.S.Zero)
+        E = [along(momentum) - force - extra for momentum, force, extra in zip(Lv, Lq, f, strict=True)]
+        S = sum((m * (each + extra) for m, each, extra in zip(lam, E, f, strict=False)), sympy.S.Zero)
         found = {
             "L_q": [x + y + z for x, y, z in zip(Lq, f, reaction, strict=True)],
             "L_v": Lv,
@@ -654,11 +654,11 @@ def of_functions(name: str, entry: Entry, index: int) -> bool:
     if entry.pair == "gather":
         known = {"B": mp.mpf(2), "table_1,n": mp.mpf(3), "table_2,n": mp.mpf(5), "z_1": mp.mpf(7), "z_2": mp.mpf(11)}
         return close(value(entry.tree[2], known.__getitem__), mp.mpf(21 + 55))
-    return entry.pair == "fixed_point" and of_sweep(name, entry)
+    return entry.pair == "fixed_point" and of_iteration(name, entry)
 
 
 @cache
-def sweep_numbers(name: str) -> tuple[int, dict[str, Any]]:
+def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
     """What the letters of a sweep are on the solved step, at all of its points; its tables are those of the package."""
     case, method, _ = made(name)
     q, p, h, t = start_of(case)
@@ -730,8 +730,8 @@ def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
     return found
 
 
-def of_sweep(name: str, entry: Entry) -> bool:
-    count, known = sweep_numbers(name)
+def of_iteration(name: str, entry: Entry) -> bool:
+    count, known = iteration_numbers(name)
     _, left, right = entry.tree
     if left == ("name", "P", "n", "") and "projection" in known:
         return True  # fewer velocities than points: their corrections are means of P_n - L_v, which the page leaves out

@@ -199,12 +199,12 @@ class TestSymmetry:
 
 class TestOutcomes:
     def test_certificate_display_shows_checks_and_violations(self):
-        kept, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
-        assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in kept
-        assert "<strong>" not in kept
+        saved, broken = certificate()._repr_html_(), certificate(Outcome.VIOLATED)._repr_html_()
+        assert "all measured properties are satisfied: 1 satisfied, 1 not measured" in saved
+        assert "<strong>" not in saved
         assert "<strong>VIOLATED</strong>" in broken
-        assert "it is &lt;4&gt;; from 4 steps" in kept
-        assert kept.count("3.98") == kept.count("3.7<") == 1
+        assert "it is &lt;4&gt;; from 4 steps" in saved
+        assert saved.count("3.98") == saved.count("3.7<") == 1
 
     def test_advice_shows_the_step_and_its_evidence(self):
         shown = advice()._repr_html_()

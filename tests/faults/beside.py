@@ -14,7 +14,7 @@ from scvi_codegen.mechanics import forms as mechanics
 from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.tables.quadrature import gauss_lobatto
 
-__all__ = ["BESIDE"]
+__all__ = ["PARTS"]
 
 FORCES_AND_INPUTS = (
     text(
@@ -284,7 +284,7 @@ SECOND = (
         changed_result(lambda found: found | {k: found[k] * sympy.Rational(1000001, 10**6) for k in list(found)[:1]}),
     ),
 )
-BESIDE = (
+PARTS = (
     *FORCES_AND_INPUTS,
     *DAMPING,
     *RATTLES,

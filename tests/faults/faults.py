@@ -99,8 +99,8 @@ def without_rates_of(*names: str) -> Make:
 
     def make(original: Any) -> Any:
         def rate(expressions: Any, variables: Any, rates: Any) -> Any:
-            kept = [pair for pair in zip(variables, rates, strict=False) if pair[0].name not in names]
-            return original(expressions, *(tuple(part) for part in zip(*kept, strict=True)))
+            remaining = [pair for pair in zip(variables, rates, strict=False) if pair[0].name not in names]
+            return original(expressions, *(tuple(part) for part in zip(*remaining, strict=True)))
 
         return rate
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import sympy
-from beside import BESIDE
+from beside import PARTS
 from certified_cases import case
 from faults import (
     Mutation,
@@ -32,7 +32,7 @@ from faults import (
     wrong_tableau,
 )
 from iterations import ITERATIONS
-from paces import PACES
+from paces import STEP_SIZE_FAULTS
 from sabotage import changed_property, changed_result, of_entries
 
 from scvi_codegen.formulas import derivatives
@@ -401,7 +401,7 @@ MUTATIONS = (
         ),
     ),
     Mutation("the chain rule of L_d lost", case("kepler/scvi"), as_printed),
-    *BESIDE,
-    *PACES,
+    *PARTS,
+    *STEP_SIZE_FAULTS,
     *ITERATIONS,
 )

@@ -11,11 +11,11 @@ from sabotage import changed_result
 from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.runtime.integrator import Integrator
 
-__all__ = ["PACES"]
+__all__ = ["STEP_SIZE_FAULTS"]
 
 TO_NINE_DIGITS = replace(CONTROLLED, tolerance=1e-9)
 
-PACES = (
+STEP_SIZE_FAULTS = (
     text("a clock that is fast", case("slowed/svi-3"), r"\? sum\[0\] :", "? sum[0] * 1.00000001 :", within="duration"),
     text("a time that is met to eight digits", case("slowed/svi-3"), r"\(4 \* REAL_EPSILON\)", "1e-8"),
     function(

@@ -48,7 +48,7 @@ def entry(folder: Path, number: int) -> Path:
     return folder / f"_scvi_{building.fingerprint(source(number), flags=FAST)}"
 
 
-def held(folder: Path) -> set[int]:
+def entries_in(folder: Path) -> set[int]:
     return {number for number in range(10) if entry(folder, number).exists()}
 
 
@@ -66,15 +66,15 @@ class TestSize:
         monkeypatch.setenv(cache.SIZE_VARIABLE, str(3 * cache._size(entry(folder, 0)) + 500))
         answer(0)  # used again, from the cache
         answer(3)
-        assert held(folder) == {0, 2, 3}
+        assert entries_in(folder) == {0, 2, 3}
         answer(4)
-        assert held(folder) == {0, 3, 4}
+        assert entries_in(folder) == {0, 3, 4}
 
     def test_latest_entry_remains_for_any_limit(self, folder, monkeypatch):
         monkeypatch.setenv(cache.SIZE_VARIABLE, "1")
         for number in range(3):
             assert answer(number) == number
-            assert held(folder) == {number}
+            assert entries_in(folder) == {number}
 
     def test_entries_are_counted_once_below_the_limit(self, folder, monkeypatch):
         """And not for each that is written: there may be thousands."""
@@ -98,7 +98,7 @@ class TestSize:
         assert info.size == sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
         monkeypatch.setenv(cache.SIZE_VARIABLE, "1K")
         answer(0)
-        assert (held(folder), sc.cache_info().texts, sc.cache_info().references) == ({0}, 0, 0)
+        assert (entries_in(folder), sc.cache_info().texts, sc.cache_info().references) == ({0}, 0, 0)
 
     @pytest.mark.parametrize(
         ("given", "size"), [("", 2**30), ("0", 0), ("1234", 1234), ("500M", 500 * 2**20), ("1.5 GiB", 3 * 2**29)]
@@ -117,7 +117,7 @@ class TestSize:
         monkeypatch.setenv(cache.SIZE_VARIABLE, "0")
         for number in range(3):
             answer(number)
-        assert held(folder) == {0, 1, 2}
+        assert entries_in(folder) == {0, 1, 2}
         assert "without a limit" in str(sc.cache_info())
 
 
@@ -263,14 +263,14 @@ class TestClearing:
     def test_cache_commands_on_the_command_line(self, folder):
         answer(1)
 
-        def said(*words: str) -> str:
+        def message(*words: str) -> str:
             result = CliRunner().invoke(main, ["cache", *words])
             assert result.exit_code == 0, result.output
             return result.output
 
-        assert said("path") == f"{folder}\n"
-        assert said() == said("info")
-        assert "1 compiled integrators, 0 generated texts, 0 reference solutions" in said("info")
-        assert f"of 1 GiB ({cache.SIZE_VARIABLE})" in said("info")
-        assert said("clear").startswith("removed ")
-        assert held(folder) == set()
+        assert message("path") == f"{folder}\n"
+        assert message() == message("info")
+        assert "1 compiled integrators, 0 generated texts, 0 reference solutions" in message("info")
+        assert f"of 1 GiB ({cache.SIZE_VARIABLE})" in message("info")
+        assert message("clear").startswith("removed ")
+        assert entries_in(folder) == set()

@@ -110,9 +110,9 @@ def test_second_derivatives_are_those_of_runs():
     curvature = ca.dot(states, weights) + ca.sumsqr(states[:, 1])
     found = ca.Function("H", given, [ca.hessian(curvature, x)[0]])(Q, P, 1.1, 0.0, H).full()
     motion = run(30)
-    kept = np.concatenate([motion.q, motion.p], axis=1)
+    saved = np.concatenate([motion.q, motion.p], axis=1)
     partials, curvatures = weights.T.copy(), np.zeros((4, 4, 4))
-    partials[1] += 2 * kept[1]
+    partials[1] += 2 * saved[1]
     curvatures[1] = 2 * np.eye(4)
     expected = motion.hessian_product(partials, np.eye(7), curvatures)
     whole = np.vstack([expected.q, expected.p, expected.parameters, expected.t, expected.h])

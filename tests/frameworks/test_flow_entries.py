@@ -14,7 +14,7 @@ from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
 
-KEPT, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)
+SAVED, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)
 compiled = cache(stepper)
 WAYS = {"rtol": 0, "atol": 2e-12}
 
@@ -33,14 +33,14 @@ def called(binding, name, head, arrays, shape):
 
 
 def test_values_of_batches():
-    found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, KEPT, 4))
+    found = called(flow().library, "flow_rows", (0, STEPS, EVERY, 0, 2), [ROWS, ROWS], (2, SAVED, 4))
     assert_allclose(found, [states(row) for row in ROWS], **WAYS)
 
 
 def test_forward_and_adjoint_derivatives_of_batches():
     changes = np.tile(np.eye(SIZE), (2, 1, 1))
     exact = np.array([partials(row) for row in ROWS])
-    pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, KEPT, 4))
+    pushed = called(flow().library, "flow_rows", (1, STEPS, EVERY, SIZE, 2), [ROWS, changes], (2, SIZE, SAVED, 4))
     assert_allclose(pushed, np.moveaxis(exact, -1, 1), rtol=1e-11, atol=1e-11)
     one = np.tile(weights(), (2, 1, 1, 1))
     pulled = called(flow().library, "flow_rows", (2, STEPS, EVERY, 1, 2), [ROWS, one], (2, 1, SIZE))
@@ -63,19 +63,19 @@ def test_external_functions_of_casadi_are_exported():
     functions = "".join(f"int {prefix}{name}{arguments}" for prefix in ("", "jac_", "adj1_"))
     source = replace(source, declarations=source.declarations + functions + shapes)
     lib, ffi, _ = building.load(source, flags=compiled().flags)
-    assert list(ffi.unpack(getattr(lib, f"{name}_sparsity_out")(0), 3)) == [4, KEPT, 1]
+    assert list(ffi.unpack(getattr(lib, f"{name}_sparsity_out")(0), 3)) == [4, SAVED, 1]
 
     def external(prefix, arrays, shape):
-        found, kept = np.zeros(shape), [np.ascontiguousarray(array, dtype=float) for array in arrays]
-        given = [ffi.cast("double *", array.ctypes.data) for array in kept]
+        found, saved = np.zeros(shape), [np.ascontiguousarray(array, dtype=float) for array in arrays]
+        given = [ffi.cast("double *", array.ctypes.data) for array in saved]
         result = ffi.new("double *[]", [ffi.cast("double *", found.ctypes.data)])
         function = getattr(lib, prefix + name)
         assert function(ffi.new("const double *[]", given), result, ffi.NULL, ffi.NULL, 0) == 0
         return found
 
     for row in ROWS:
-        assert_allclose(external("", [row], (KEPT, 4)), states(row), **WAYS)
-        columns = external("jac_", [row, row], (SIZE, KEPT, 4))
+        assert_allclose(external("", [row], (SAVED, 4)), states(row), **WAYS)
+        columns = external("jac_", [row, row], (SIZE, SAVED, 4))
         assert_allclose(np.moveaxis(columns, 0, -1), partials(row), rtol=1e-11, atol=1e-11)
         pulled = external("adj1_", [row, row, weights()], (SIZE,))
         assert_allclose(pulled, np.tensordot(weights(), partials(row), 2), rtol=1e-11, atol=1e-11)
@@ -125,11 +125,11 @@ def test_handlers_of_xla_are_exported(tmp_path):
 
     def handled(part, arrays, shape):
         alive = [np.ascontiguousarray(array, dtype=float) for array in (*arrays, np.zeros(shape))]
-        buffers, kept = [], []
+        buffers, saved = [], []
         for array in alive:
             dims = ffi.new("int64_t[]", list(array.shape))
             buffers.append(ffi.new("buffer *", (ffi.cast("void *", array.ctypes.data), array.ndim, dims)))
-            kept.append(dims)
+            saved.append(dims)
         counts = [ffi.new("long long *", value) for value in (EVERY, STEPS)]  # sorted by name
         scalars = [ffi.new("scalar *", (ffi.cast("void *", count),)) for count in counts]
         args, rets = ffi.new("buffer *[]", buffers[:-1]), ffi.new("buffer *[]", buffers[-1:])
@@ -137,9 +137,9 @@ def test_handlers_of_xla_are_exported(tmp_path):
         assert getattr(lib, f"{source.prefix}_xla_{part}")(frame) == ffi.NULL
         return alive[-1]
 
-    assert_allclose(handled("states", [ROWS], (2, KEPT, 4)), [states(row) for row in ROWS], **WAYS)
+    assert_allclose(handled("states", [ROWS], (2, SAVED, 4)), [states(row) for row in ROWS], **WAYS)
     exact, changes = np.array([partials(row) for row in ROWS]), np.tile(np.eye(SIZE), (2, 1, 1))
-    pushed = handled("jvp", [ROWS, changes], (2, SIZE, KEPT, 4))
+    pushed = handled("jvp", [ROWS, changes], (2, SIZE, SAVED, 4))
     assert_allclose(np.moveaxis(pushed, 1, -1), exact, rtol=1e-11, atol=1e-11)
     pulled = handled("vjp", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))
     assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)

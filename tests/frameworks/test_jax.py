@@ -160,8 +160,8 @@ def test_second_derivatives_are_those_of_leapfrog(save_every):
     size = np.abs(expected).max()
     assert_allclose(jax.jit(jax.hessian(along))(x), expected, atol=1e-11 * size)
     assert_allclose(jax.jacrev(jax.grad(along))(x), expected, atol=1e-11 * size)
-    beside = jax.vmap(jax.hessian(along))(jnp.stack([1.01 * x, x]))
-    assert_allclose(beside[1], expected, atol=1e-11 * size)
+    extra = jax.vmap(jax.hessian(along))(jnp.stack([1.01 * x, x]))
+    assert_allclose(extra[1], expected, atol=1e-11 * size)
     product = jax.jvp(jax.grad(along), (x,), (jnp.arange(8.0),))[1]
     assert_allclose(product, expected @ jnp.arange(8.0), atol=1e-10 * size)
 

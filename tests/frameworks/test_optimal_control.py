@@ -142,7 +142,7 @@ def test_unreachable_end_is_an_error_with_the_last_iterate():
 
 
 @pytest.mark.parametrize(
-    ("changed", "error", "said"),
+    ("changed", "error", "message"),
     [
         ({"bounds": {"u": (1, -1)}}, StateError, "u: the lower bound 1 exceeds the upper bound -1"),
         ({"bounds": {"u": (1, 2, 3)}}, StateError, "u must be a number, or two numbers"),
@@ -156,9 +156,9 @@ def test_unreachable_end_is_an_error_with_the_last_iterate():
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_invalid_problems_are_reported(changed, error, said):
+def test_invalid_problems_are_reported(changed, error, message):
     asked = {"system": SWING, "method": SVI(2), **UP, **changed}
-    with pytest.raises(error, match=said):
+    with pytest.raises(error, match=message):
         optimal_control(**asked)
 
 

@@ -74,8 +74,8 @@ def test_second_derivatives_are_those_of_leapfrog():
     for outer, inner in (("jacfwd", "jacrev"), ("jacrev", "jacrev"), ("jacrev", "jacfwd")):
         found = getattr(torch.func, outer)(getattr(torch.func, inner)(along(by_c)))(numbers(X))
         assert_allclose(found, expected, atol=1e-10)
-    beside = torch.func.vmap(torch.func.hessian(along(by_c)))(torch.stack([1.01 * numbers(X), numbers(X)]))
-    assert_allclose(beside[1], expected, atol=1e-10)
+    extra = torch.func.vmap(torch.func.hessian(along(by_c)))(torch.stack([1.01 * numbers(X), numbers(X)]))
+    assert_allclose(extra[1], expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("save_every", [None, 4])

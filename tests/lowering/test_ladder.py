@@ -41,11 +41,11 @@ def test_coefficients_have_106_bits(method):
 @pytest.mark.parametrize("degree", [2, 8])
 def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degree):
     fixed_point = program_of(system, sc.SVI(degree)).fixed_point
-    ladder, same = predictor_of(fixed_point), predictor_of(fixed_point).reach
+    predictor, same = predictor_of(fixed_point), predictor_of(fixed_point).reach
     for found, wanted in (
-        (ladder.alone[same], fixed_point.guess.last_alone),
-        (ladder.last[same][same], fixed_point.guess.last),
-        (ladder.before[same][same], fixed_point.guess.before),
+        (predictor.alone[same], fixed_point.guess.last_alone),
+        (predictor.last[same][same], fixed_point.guess.last),
+        (predictor.before[same][same], fixed_point.guess.before),
     ):
         expected = np.array(wanted, dtype=float)
         assert np.allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
@@ -55,7 +55,7 @@ def test_predictor_without_step_size_change_is_that_of_fixed_steps(system, degre
 def test_predictor_follows_a_polynomial_across_step_size_changes(method):
     system = sc.problem("double-pendulum").system
     fixed_point = program_of(system, method).fixed_point
-    ladder, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)
+    predictor, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)
     accelerations = fixed_point.kept is StoredValues.ACCELERATIONS  # z = h a is kept
 
     def curve(t):
@@ -67,7 +67,7 @@ def test_predictor_follows_a_polynomial_across_step_size_changes(method):
             scales = (h_before, h_last, h_next) if accelerations else (1.0, 1.0, 1.0)
             before, last = scales[0] * curve(points - 1.0), scales[1] * curve(h_last * points)
             wanted = scales[2] * curve(h_last + h_next * points)
-            tables = [np.array(each[into_last + 2][into_next + 2]) for each in (ladder.last, ladder.before)]
+            tables = [np.array(each[into_last + 2][into_next + 2]) for each in (predictor.last, predictor.before)]
             padded = [np.pad(values, (0, fixed_point.lanes - len(points))) for values in (last, before)]
             found = sum(table @ values for table, values in zip(tables, padded, strict=True))
             assert np.allclose(found[: len(points)], wanted, rtol=1e-8, atol=1e-8)

@@ -146,14 +146,14 @@ def test_kernels_have_the_values_and_derivatives_of_their_formulas(name, method)
         point |= {symbol: 1 + value for symbol, value in point.items() if symbol in system.parameters}
         numbers = [float(point[symbol]) for symbol in symbols]
         m = len(family.arguments)
-        expected = [float(exact(e, point)) for e in (*family.results, *slopes_in_order(family))]
+        expected = [float(exact(e, point)) for e in (*family.results, *derivatives_in_order(family))]
         found = interpret(own.derivative, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
         values = interpret(own.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(values, expected[: len(values)], rtol=1e-12, atol=1e-14)
 
 
-def slopes_in_order(family: Any) -> list[sympy.Expr]:
+def derivatives_in_order(family: Any) -> list[sympy.Expr]:
     return [
         derivative
         for scatter in family.scatters

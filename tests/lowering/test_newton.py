@@ -106,7 +106,7 @@ def test_newton_matrix_has_minimal_size():
 
 
 @pytest.mark.parametrize("method", [SVI(3), SCVI(3)], ids=lambda method: method.name)
-class TestKeptFactors:
+class TestReusedFactors:
     """Runs of a chain with enough unknowns that factors go from step to step."""
 
     def test_runs_reuse_enough_factors(self, method):
@@ -116,8 +116,8 @@ class TestKeptFactors:
         q, p = state()
         expected = chain(method).integrate(q, p, h=0.15, steps=60)
         run = chain(method).start(q, p, h=0.15)
-        for portion in (1, 1, 2, 7, 20, 29):
-            last = run.record(portion)
+        for chunk in (1, 1, 2, 7, 20, 29):
+            last = run.record(chunk)
             run = chain(method).from_checkpoint(run.checkpoint())
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])
@@ -129,8 +129,8 @@ class TestKeptFactors:
         stepper = chain(method, pumped=True)
         expected = stepper.integrate(q / 2, p, h=0.02, steps=60)
         run = stepper.start(q / 2, p, h=0.02)
-        for portion in (*[1] * 30, 7, 23):
-            last = run.record(portion)
+        for chunk in (*[1] * 30, 7, 23):
+            last = run.record(chunk)
             run = stepper.from_checkpoint(run.checkpoint())
         assert np.array_equal(last.q[-1], expected.q[-1])
         assert np.array_equal(last.p[-1], expected.p[-1])

@@ -14,7 +14,7 @@ COUPLED = sc.LagrangianSystem.from_text(
     name="pair", coordinates=["q", "r"], lagrangian="(q_dot**2 + r_dot**2 + q_dot*r_dot/2)/2 - q**2/2 - r**2/2 - q*r/3"
 )
 HAMILTONIAN = sc.HamiltonianSystem.from_text(name="mixed", coordinates=["q"], hamiltonian="p_q**2/2 + q**2/2 + p_q*q/3")
-SWEPT = [
+ITERATED = [
     *((OSCILLATOR, method) for method in ("svi:2", "scvi:3", "sc:3")),
     (COUPLED, "svi:3"),
     (HAMILTONIAN, "gauss:3"),
@@ -30,7 +30,7 @@ def stop(steps: int) -> None:
     raise StoppedError
 
 
-@pytest.mark.parametrize(("system", "method"), SWEPT, ids=[f"{system.name}-{method}" for system, method in SWEPT])
+@pytest.mark.parametrize(("system", "method"), ITERATED, ids=[f"{system.name}-{method}" for system, method in ITERATED])
 def test_iterations_that_overflow_do_not_converge(system, method):
     stepper = sc.compile_stepper(system, method, solver="fixed-point", flags=QUICK_FLAGS)
     start = np.linspace(1.0, 0.5, stepper.dimension), np.zeros(stepper.dimension)
@@ -44,7 +44,7 @@ def test_iterations_that_overflow_do_not_converge(system, method):
         stepper.integrate(*start, t_end=1e14, tolerance=1e-9, progress=stop)
 
 
-@pytest.mark.parametrize(("system", "method"), SWEPT, ids=[f"{system.name}-{method}" for system, method in SWEPT])
+@pytest.mark.parametrize(("system", "method"), ITERATED, ids=[f"{system.name}-{method}" for system, method in ITERATED])
 def test_step_count_does_not_depend_on_scale(system, method):
     stepper = sc.compile_stepper(system, method, solver="fixed-point", flags=QUICK_FLAGS)
     start = np.linspace(1.0, 0.5, stepper.dimension), np.zeros(stepper.dimension)

@@ -17,7 +17,7 @@ from scvi_codegen.methods import as_method
 FLAGS = {"flags": QUICK_FLAGS}
 
 
-def bodies(name: str, count: int, **beside: object) -> sc.LagrangianSystem:
+def bodies(name: str, count: int, **extra: object) -> sc.LagrangianSystem:
     """Masses as parameters but for the first, which is a number; a family of two kinds of constants."""
     names = [f"{c}{i}" for i in range(count) for c in "xyz"]
     masses = ["2", *(f"m{i}" for i in range(1, count))]
@@ -28,7 +28,7 @@ def bodies(name: str, count: int, **beside: object) -> sc.LagrangianSystem:
     ]
     parameters = {f"m{i}": 1 + i / 7 for i in range(1, count)} | {"c": 0.1}
     return sc.LagrangianSystem.from_text(
-        name=name, coordinates=names, lagrangian=" + ".join(kinetic + pairs), parameters=parameters, **beside
+        name=name, coordinates=names, lagrangian=" + ".join(kinetic + pairs), parameters=parameters, **extra
     )
 
 

@@ -23,7 +23,7 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper
 
 H, T, STATES = 0.1, 0.7, 20
-ONE_SWEEP = SolverOptions(tolerance=1e300)
+ONE_ITERATION = SolverOptions(tolerance=1e300)
 ROUNDING = 64 * 2.0**-52
 
 
@@ -91,7 +91,7 @@ def test_velocities_are_updated_by_the_full_mass_matrix_to_first_order(system):
         residual += H / 2 * (H / 2 * F_q(*at) @ r + F_v(*at) @ r) - H / 2 * P_q(*at) @ r
         r = np.linalg.solve(mass(*at), residual)
         expected = q0 + H * (v0 + r), p0 + H * (force(*at) + H / 2 * F_q(*at) @ r + F_v(*at) @ r)
-        assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
+        assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_constant_masses_update_velocities_and_forces_at_the_same_iterate(system
         x = q0 + H / 2 * v0
         v = v0 + np.linalg.solve(mass(x, v0, t), p0 + H / 2 * force(x, v0, t) - momentum(x, v0, t))
         expected = q0 + H * v, p0 + H * force(q0 + H / 2 * v, v, t)
-        assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
+        assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)
 
 
 def test_many_coordinates_do_not_request_the_jacobian():
@@ -125,4 +125,4 @@ def test_momenta_follow_forces_and_velocities_follow_momenta():
         p = p0 - H / 2 * derivative(q0 + H / 2 * v0, p0, t)
         v = velocity(q0 + H / 2 * v0, p, t)
         expected = q0 + H * v, p0 - H * derivative(q0 + H / 2 * v, p, t)
-        assert close(stepper.step(q0, p0, H, T, options=ONE_SWEEP), expected)
+        assert close(stepper.step(q0, p0, H, T, options=ONE_ITERATION), expected)

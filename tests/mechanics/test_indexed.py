@@ -13,9 +13,9 @@ GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
 DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
 
 
-def system(coordinates: str, lagrangian: str, **beside: object) -> IndexedSystem:
+def system(coordinates: str, lagrangian: str, **extra: object) -> IndexedSystem:
     """A system of one array."""
-    return IndexedSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **beside)
+    return IndexedSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **extra)
 
 
 @pytest.mark.parametrize(
@@ -37,12 +37,12 @@ def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "beside", [{"parameters": {"q": 1}}, {"parameters": {"N": 1}}, {"parameters": {"k[N]": 1, "k": 2}}]
+    "extra", [{"parameters": {"q": 1}}, {"parameters": {"N": 1}}, {"parameters": {"k[N]": 1, "k": 2}}]
 )
-def test_name_has_one_meaning(beside: dict[str, dict[str, float]]) -> None:
+def test_name_has_one_meaning(extra: dict[str, dict[str, float]]) -> None:
     """Arrays, numbers and sizes."""
     with pytest.raises(SystemDefinitionError):
-        system("q[N]", "sum(i in N, q_dot[i]**2)", **beside)
+        system("q[N]", "sum(i in N, q_dot[i]**2)", **extra)
 
 
 def test_momentum_maps_of_bodies_in_space() -> None:
@@ -94,7 +94,7 @@ def test_unrolled_system_has_one_coordinate_per_element() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sizes", "beside", "message"),
+    ("sizes", "extra", "message"),
     [
         ({}, {}, "the sizes of 'chain' are N: give exactly these"),
         ({"N": 1}, {}, r"q\[1\] has the index \[1\], which is outside of q\[N\]"),
@@ -104,14 +104,14 @@ def test_unrolled_system_has_one_coordinate_per_element() -> None:
     ],
 )
 def test_systems_that_cannot_be_unrolled_are_rejected(
-    sizes: dict[str, int], beside: dict[str, object], message: str
+    sizes: dict[str, int], extra: dict[str, object], message: str
 ) -> None:
     """Sizes, tables and parameters are those of the system."""
     chain = IndexedSystem.from_text(
         name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
     )
     with pytest.raises(SystemDefinitionError, match=message):
-        unroll_sums(chain, sizes, **beside)
+        unroll_sums(chain, sizes, **extra)
 
 
 def test_derived_terms_are_displayed() -> None:
@@ -249,7 +249,7 @@ def test_forces_are_unrolled() -> None:
 
 
 @pytest.mark.parametrize(
-    ("beside", "message"),
+    ("extra", "message"),
     [
         ({"forces": {"x[i]": "1"}}, "a force must act on coordinates"),
         ({"forces": {"q[i]": "-q_dot[j]"}}, "'j' is not an index"),
@@ -259,7 +259,7 @@ def test_forces_are_unrolled() -> None:
         ({"dissipation": "sum(i in N, q[i]**2)"}, "contains no velocity"),
     ],
 )
-def test_invalid_forces_are_rejected(beside: dict[str, object], message: str) -> None:
+def test_invalid_forces_are_rejected(extra: dict[str, object], message: str) -> None:
     """By the parser, or by what they are."""
     with pytest.raises(SystemDefinitionError, match=message):
-        system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **beside)
+        system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **extra)

@@ -619,9 +619,9 @@ def test_only_large_singular_values_are_called_large(smallest):
     rng = np.random.default_rng(7)
     left, right = (np.linalg.qr(rng.normal(size=(size, size)))[0] for size in (50, 40))
     matrix = left[:, :40] * np.append(np.geomspace(1.0, max(smallest, 1e-3), 39), smallest) @ right
-    said = invariants._all_larger(matrix, 1e-9)
-    assert not said or smallest > 1e-9
-    assert said or smallest < 1e-6
+    message_text = invariants._all_larger(matrix, 1e-9)
+    assert not message_text or smallest > 1e-9
+    assert message_text or smallest < 1e-6
 
 
 def test_without_conserved_quantities_no_singular_values_are_computed(monkeypatch):

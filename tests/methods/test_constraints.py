@@ -207,7 +207,7 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
 
 
 @pytest.mark.parametrize(
-    ("third", "said"),
+    ("third", "message_text"),
     [
         (
             "(u - 1)**2 + y**2 = 1",
@@ -217,7 +217,7 @@ def test_constraints_that_depend_on_time_forces_and_coupled_masses():
     ],
 )
 @pytest.mark.parametrize("method", ["svi:1", "svi:2"])
-def test_constraints_dependent_on_the_manifold_are_named(method, third, said):
+def test_constraints_dependent_on_the_manifold_are_named(method, third, message_text):
     """Generic points do not show it: G loses rank on the constraint manifold alone."""
     system = LagrangianSystem.from_text(
         name="loop",
@@ -227,9 +227,9 @@ def test_constraints_dependent_on_the_manifold_are_named(method, third, said):
     )
     stepper = compile_stepper(system, method)
     for q in ([1.0, 0.0, 2.0, 0.0], [0.6, 0.8, 1.6, 0.3]):
-        with pytest.raises(StateError, match=said):
+        with pytest.raises(StateError, match=message_text):
             stepper.integrate(q, velocity=[0.0, 0.0, 0.0, 1.0], h=0.05, steps=3)
-        with pytest.raises(StateError, match=said):
+        with pytest.raises(StateError, match=message_text):
             stepper.integrate_ensemble([q, q], velocity=[[0.0, 0.0, 0.0, 1.0]] * 2, h=0.05, steps=3)
 
 
@@ -268,7 +268,7 @@ def test_constraint_violation_is_independent_of_units(unit):
         return compile_stepper(slide, lobatto(2))
 
     plain, scaled = crank(1.0), crank(unit)
-    for slide, angle, rate, said in (
+    for slide, angle, rate, message_text in (
         (0.3, np.arcsin(0.3) + 2e-4, 0.5, None),
         (0.3, np.arcsin(0.3), 0.501, None),
         (1e-3, 1.002e-3, 0.5, None),
@@ -279,14 +279,14 @@ def test_constraint_violation_is_independent_of_units(unit):
         other = q / [unit, 1.0], p * [unit, 1.0]
         found = []
         for stepper, start in ((plain, (q, p)), (scaled, other)):
-            if said:
-                with pytest.raises(said, match="violates the constraints") as told:
+            if message_text:
+                with pytest.raises(message_text, match="violates the constraints") as reported:
                     stepper.integrate(*start, h=0.1, steps=1)
             else:
                 with pytest.warns(AccuracyWarning, match="violates the constraints") as warned:
                     stepper.integrate(*start, h=0.1, steps=1)
-                told = warned[0].message
-            found.append(re.search(r"by (\S+) \(relative\)", str(getattr(told, "value", told))).group(1))
+                reported = warned[0].message
+            found.append(re.search(r"by (\S+) \(relative\)", str(getattr(reported, "value", reported))).group(1))
         assert found[0] == found[1]
 
 
@@ -367,7 +367,7 @@ def test_constraints_from_sympy_and_lagranges_method():
 
 
 @pytest.mark.parametrize(
-    ("constraints", "said"),
+    ("constraints", "message_text"),
     [
         (["x**2 + y**2 = l**2", "2*x**2 + 2*y**2 - 2*l**2"], "of 'plane' leave no degree of freedom.*nothing to int"),
         (["x = l*cos(t)", "y = l*sin(t)"], "2 constraints on 2 coordinates.*fully driven .*by a force or torque"),
@@ -378,8 +378,8 @@ def test_constraints_from_sympy_and_lagranges_method():
         ("x - y", "list of texts"),
     ],
 )
-def test_invalid_constraints_are_rejected(constraints, said):
-    with pytest.raises(SystemDefinitionError, match=said):
+def test_invalid_constraints_are_rejected(constraints, message_text):
+    with pytest.raises(SystemDefinitionError, match=message_text):
         LagrangianSystem.from_text(
             name="plane",
             coordinates=["x", "y"],
@@ -434,8 +434,8 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
     text = {"name": "rod", "coordinates": ["x", "y"], "parameters": {"m": 2.0, "g": G, "l": 1.5}}
     formula, circle = "(p_x**2 + p_y**2)/(2*m) + m*g*y", ["x**2 + y**2 = l**2"]
     free = HamiltonianSystem.from_text(hamiltonian=formula, **text)
-    held = lagrangian_of(free, constraints=circle)
-    assert (held.constraints, sympy.expand(held.lagrangian - rod().lagrangian)) == (rod().constraints, 0)
+    constrained = lagrangian_of(free, constraints=circle)
+    assert (constrained.constraints, sympy.expand(constrained.lagrangian - rod().lagrangian)) == (rod().constraints, 0)
     model = f"""
         [system]
         name = "rod"
@@ -452,7 +452,7 @@ def test_constraints_of_a_hamiltonian_equal_those_of_its_lagrangian():
         [run]
         span = 1.0
     """
-    assert parse_model(model).system == held
+    assert parse_model(model).system == constrained
     with pytest.raises(SystemDefinitionError, match=r"lagrangian_of\(system, constraints="):
         HamiltonianSystem.from_text(hamiltonian=formula, constraints=circle, **text)
 

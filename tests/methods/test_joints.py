@@ -62,10 +62,10 @@ def test_angle_between_two_rods_equals_a_rigid_hook(bend):
         far=far,
         bend=bend,
     )[:, 0]
-    bent = f + np.pi - bend
+    outer = f + np.pi - bend
     middle = a * np.column_stack([np.sin(f), -np.cos(f)])
     assert_allclose(run.q[:, :2], middle, atol=1e-9)
-    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(bent), -np.cos(bent)]), atol=1e-9)
+    assert_allclose(run.q[:, 2:], middle + b * np.column_stack([np.sin(outer), -np.cos(outer)]), atol=1e-9)
 
 
 def test_a_point_slides_on_its_line():

@@ -86,8 +86,8 @@ def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
         [0.0, 0.0, 0.3, 0.0], velocity=[2 * np.cos(0.3), 2 * np.sin(0.3), 0.7, 2.0], h=0.1, steps=200
     )
     assert_allclose(run.q[:, 0], 2 / 0.7 * (np.sin(0.3 + 0.7 * run.t) - np.sin(0.3)), atol=2e-12)
-    kept = names.index("momentum of a")
-    assert np.abs(run.momentum_errors()[:, kept]).max() < 1e-15
+    saved = names.index("momentum of a")
+    assert np.abs(run.momentum_errors()[:, saved]).max() < 1e-15
     centripetal = -np.sin(run.q[:, 2]) * 2 * 0.7, np.cos(run.q[:, 2]) * 2 * 0.7
     assert_allclose(run.multipliers().T, centripetal, atol=1e-11)
 

@@ -92,7 +92,7 @@ MODELS = {
 def test_states_equal_those_of_the_stepper_bitwise(name, tmp_path):
     model = MODELS[name]()
     one, h = Slave(Fmu(generate_fmu(model, tmp_path / "one.fmu"), tmp_path / "unpacked")), model.h
-    assert one.start(model.t) == OK, one.said
+    assert one.start(model.t) == OK, one.log
     stepper = stepper_of(model)
     run = stepper.integrate(model.q, model.momenta(stepper), h=h, steps=30, t=model.t)
     names = ["t", *stepper.coordinates, *(f"{name}_dot" for name in stepper.coordinates), *stepper.interface.momenta]
@@ -148,7 +148,7 @@ def test_million_rounded_communication_points_are_reached(fmu):
 def test_saved_fmu_state_continues_bitwise_also_from_bytes(fmu):
     one, other = Slave(fmu), Slave(fmu)
     assert one.start(0.5) == one.step(0.5, 3 * H) == OK
-    state = one.kept()
+    state = one.saved_state()
     data = one.as_bytes(state)
     assert one.set(u=1.0) == one.step(0.8, 2 * H) == OK
     ends = [one.get("t", "q", "p_q", "energy")]
@@ -171,11 +171,11 @@ def test_failed_step_is_discarded_without_side_effects(fmu):
     assert one.start(0.5) == one.step(0.5, H) == OK
     before = one.get("t", "q", "p_q")
     assert one.set(u=float("nan")) == OK
-    kept = one.as_bytes(one.kept())
+    saved = one.as_bytes(one.saved_state())
     assert one.step(0.6, 2.5 * H) == DISCARD
-    assert one.as_bytes(one.kept()) == kept
-    assert one.said[-1][:2] == (DISCARD, b"logStatusDiscard")
-    assert "NaN" in one.said[-1][2]
+    assert one.as_bytes(one.saved_state()) == saved
+    assert one.log[-1][:2] == (DISCARD, b"logStatusDiscard")
+    assert "NaN" in one.log[-1][2]
     assert (one.last, one.get("t", "q", "p_q")) == (before[0], before)
     assert one.set(u=0.0) == one.step(0.6, H) == OK
     assert one.call("Reset") == OK
@@ -201,11 +201,11 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
         assert one.call("GetFloat64", (c_uint32 * 1)(reference), c_size_t(1), values, c_size_t(1)) == ERROR
     assert one.call("GetFloat64", (c_uint32 * 1)(1), c_size_t(1), (c_double * 2)(), c_size_t(2)) == ERROR
     assert one.call("SetFMUState", c_void_p()) == ERROR
-    assert all(status == ERROR and category == b"logStatusError" for status, category, _ in one.said)
-    assert len({message for *_, message in one.said}) > 10
+    assert all(status == ERROR and category == b"logStatusError" for status, category, _ in one.log)
+    assert len({message for *_, message in one.log}) > 10
     for name in NEVER_CALLED:
         assert one.call(name, *[c_void_p()] * 8) == ERROR
-        assert f"fmi3{name}" in one.said[-1][2]
+        assert f"fmi3{name}" in one.log[-1][2]
     assert one.call("GetBoolean", None, c_size_t(0), None, c_size_t(0)) == OK
     one.call("FreeInstance")
 
@@ -214,7 +214,7 @@ def test_failed_instantiation_returns_null(fmu):
     for given in ({"token": b"another"}, {"events": True}):
         one = Slave(fmu, **given)
         assert one.one.value is None
-        assert one.said[-1][0] == ERROR
+        assert one.log[-1][0] == ERROR
 
 
 def test_the_instantiation_token_identifies_the_model():
@@ -246,11 +246,11 @@ def test_discards_are_logged_if_requested(fmu):
     one = Slave(fmu, logging=False)
     assert one.start(0.5, u=float("inf")) == OK
     assert one.step(0.5, H) == DISCARD
-    assert one.said == []
+    assert one.log == []
     names = (c_char_p * 1)(b"logStatusDiscard")
     assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), names) == OK
     assert one.step(0.5, H) == DISCARD
-    assert len(one.said) == 1
+    assert len(one.log) == 1
     assert one.call("SetDebugLogging", c_bool(True), c_size_t(1), (c_char_p * 1)(b"all")) == ERROR
 
 
@@ -260,7 +260,7 @@ def test_initial_states_far_off_their_constraints_are_rejected(tmp_path):
     assert near.start(0.0, x=1.001) == OK
     assert_allclose(np.hypot(*near.get("x", "y")), 1.0, rtol=1e-15)
     assert far.start(0.0, x=1.5) == ERROR
-    assert "violate the constraints" in far.said[-1][2]
+    assert "violate the constraints" in far.log[-1][2]
 
 
 def test_description_has_the_elements_required_by_the_standard(fmu):

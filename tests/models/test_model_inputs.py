@@ -121,7 +121,7 @@ def test_one_file_contains_several_inputs(file):
 
 
 @pytest.mark.parametrize(
-    ("table", "said"),
+    ("table", "message"),
     [
         ("t,u\n0,0\n1,x\n", r"\[inputs\] u: tables/u.csv: line 3, u: 'x' is not a number"),
         ("t,u\n0,0\n\n1,1\n1,2\n", "line 5, t: 1 is not greater than 1"),
@@ -133,15 +133,15 @@ def test_one_file_contains_several_inputs(file):
         ("t,u\n", "at least one line of numbers"),
     ],
 )
-def test_faulty_table_is_reported(file, table, said):
+def test_faulty_table_is_reported(file, table, message):
     (file.parent / "tables" / "u.csv").write_text(table)
-    with pytest.raises(ModelFileError, match=said) as caught:
+    with pytest.raises(ModelFileError, match=message) as caught:
         load_model(file)
     assert str(caught.value).startswith(str(file))
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"t": [0.0, 2.0, 1.0], "u": [0.0, 0.0, 0.0]}, "row 2, t: 1 is not greater than 2"),
         ({"t": [0.0, 1.0], "u": [0.0, np.nan]}, "row 1, u: nan is not a finite number"),
@@ -151,21 +151,21 @@ def test_faulty_table_is_reported(file, table, said):
         ({"t": [0.0, 1.0], "u": [0.0, 1j]}, "u must be real numbers, not complex128"),
     ],
 )
-def test_faulty_archive_is_reported(file, arrays, said):
+def test_faulty_archive_is_reported(file, arrays, message):
     np.savez(file.parent / "u.npz", **arrays)
-    with pytest.raises(ModelFileError, match=said):
+    with pytest.raises(ModelFileError, match=message):
         parse_model(MODEL.replace("tables/u.csv", "u.npz"), folder=file.parent)
 
 
 def test_unreadable_file_is_reported(file):
-    for name, said in {"none.csv": "cannot be read", "u.txt": ".csv or .npz", "tables/u.npz": "no arrays"}.items():
+    for name, message in {"none.csv": "cannot be read", "u.txt": ".csv or .npz", "tables/u.npz": "no arrays"}.items():
         (file.parent / "tables" / "u.npz").write_text("not an archive")
-        with pytest.raises(ModelFileError, match=f"u: {name}: .*{said}"):
+        with pytest.raises(ModelFileError, match=f"u: {name}: .*{message}"):
             parse_model(MODEL.replace("tables/u.csv", name), folder=file.parent)
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         ("3.0", "must be a table"),
         ('{ file = "u.csv", values = [1.0] }', "must have either file, or t and values"),
@@ -179,8 +179,8 @@ def test_unreadable_file_is_reported(file):
         ("{ file = 3 }", "file must be a path"),
     ],
 )
-def test_invalid_entry_is_reported(entry, said):
-    with pytest.raises(ModelFileError, match=said):
+def test_invalid_entry_is_reported(entry, message):
+    with pytest.raises(ModelFileError, match=message):
         parse_model(MODEL.replace('{ file = "tables/u.csv", kind = "cubic" }', entry))
 
 

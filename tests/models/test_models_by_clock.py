@@ -67,23 +67,23 @@ def test_step_size_of_another_time_is_not_reused(model: sc.Model) -> None:
 
 def test_the_command_line_runs_to_a_time(model: sc.Model, tmp_path: Path) -> None:
     orbit = tmp_path / "orbit.npz"
-    said = invoke(
+    printed = invoke(
         "run", "kepler", "--time-transformation", "frequency", "--step", "0.2", "--span", "20", "-o", str(orbit)
     )
-    assert "of 0.2 in tau from t = 0 to t = 20;" in said
+    assert "of 0.2 in tau from t = 0 to t = 20;" in printed
     stepper = sc.compile_stepper(model.system, model.method)
     run = stepper.integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
     with np.load(orbit) as file:
         assert np.array_equal(file["t"], run.t)
         assert np.array_equal(file["q"], run.q)
-    assert f"{run.q[-1, 0]:.17g}" in said
+    assert f"{run.q[-1, 0]:.17g}" in printed
     back = invoke("run", "kepler", "--time-transformation", "frequency", "--step", "-0.2", "--span", "5")
     assert "to t = -5;" in back
 
 
 def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
-    said = invoke("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
-    error = float(said.partition("largest local error: ")[2].partition(" ")[0])
+    printed = invoke("run", "kepler", "--time-transformation", "frequency", "--span", "50", "--tolerance", "1e-8")
+    error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
     far = (
         "--q",
@@ -130,9 +130,9 @@ def test_generated_folders_carry_time_and_energy(model: sc.Model, tmp_path: Path
     )
     rows = np.array([[float(x) for x in line.split()] for line in done.stdout.splitlines() if not line.startswith("#")])
     run = load_package(folder).integrate(model.q, velocity=model.velocity, h=0.2, t_end=20.0)
-    kept = rows[rows[:, 0] <= run.t[-2]]
-    assert len(kept) > 5
-    for t, row in zip(kept[:, 0], kept, strict=True):
+    saved = rows[rows[:, 0] <= run.t[-2]]
+    assert len(saved) > 5
+    for t, row in zip(saved[:, 0], saved, strict=True):
         k = int(np.abs(run.t - t).argmin())
         assert np.abs(np.concatenate([[run.t[k]], run.q[k], run.p[k]]) - row[:5]).max() < 1e-12
     assert np.abs(rows[:, -1]).max() < 1e-13

@@ -83,8 +83,8 @@ def test_controller_of_a_time_transformation_can_be_replaced() -> None:
 
 def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path) -> None:
     model, orbit = sc.load_model(shaken), tmp_path / "orbit.npz"
-    said = invoke("run", str(shaken), "-o", str(orbit))
-    assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in said
+    printed = invoke("run", str(shaken), "-o", str(orbit))
+    assert "of 0.1 in tau by the reversible controller from t = 0 to t = 12;" in printed
     stepper = sc.compile_stepper(model.system, model.method, time_transformation=model.time_transformation)
     run = stepper.integrate(model.q, model.p, h=0.1, t_end=12.0)
     with np.load(orbit) as file:
@@ -100,8 +100,8 @@ def test_command_line_uses_the_steps_of_the_library(shaken: Path, tmp_path: Path
 
 
 def test_command_line_finds_the_step_in_tau(shaken: Path) -> None:
-    said = invoke("run", str(shaken), "--tolerance", "1e-8")
-    error = float(said.partition("largest local error: ")[2].partition(" ")[0])
+    printed = invoke("run", str(shaken), "--tolerance", "1e-8")
+    error = float(printed.partition("largest local error: ")[2].partition(" ")[0])
     assert 1e-12 < error < 1e-7
     words = (
         "--time-transformation",
@@ -185,7 +185,7 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "printed"),
     [
         ("run kepler --controller reversible", "the reversible controller requires a time transformation"),
         ("run kepler --controller pid", "'symplectic', 'reversible'"),
@@ -196,8 +196,8 @@ def test_steps_end_at_breakpoints_of_inputs() -> None:
         ("run FILE --controller symplectic", "depends on time"),
     ],
 )
-def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, said: str) -> None:
-    assert said in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
+def test_unsupported_combinations_with_a_controller_are_reported(shaken: Path, words: str, printed: str) -> None:
+    assert printed in " ".join(invoke(*words.replace("FILE", str(shaken)).split(), status=2).split())
 
 
 def test_unsupported_model_fields_are_reported(shaken: Path, tmp_path: Path) -> None:

@@ -196,8 +196,8 @@ def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
     model, *options = words.split()
     model = str(Path(__file__).parents[2] / "examples" / model) if model.endswith(".toml") else model
     folder = tmp_path / "own"
-    said = CliRunner().invoke(main, ["generate", model, *options, "-o", str(folder)])
-    assert said.exit_code == 0, said.output
+    outcome = CliRunner().invoke(main, ["generate", model, *options, "-o", str(folder)])
+    assert outcome.exit_code == 0, outcome.output
     flags = next(line for line in (folder / "Makefile").read_text().splitlines() if line.startswith("CFLAGS = "))
     assert "-Wall -Wextra" in flags
     command = ["make", "-s", "-C", str(folder), "own_main", f"CFLAGS={flags.removeprefix('CFLAGS = ')} -Werror"]

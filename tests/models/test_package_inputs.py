@@ -81,7 +81,7 @@ def test_segments_in_c_equal_those_in_python(model, seed):
     h = np.copysign(generator.uniform(0.05, 0.3), end - t)
     inputs = checked_inputs(stepper.interface, given)
     ours, theirs = (stepper.start([0.3], [0.1], h=h, t=t) for _ in range(2))
-    table, kept = _tables(stepper, inputs)
+    table, saved = _tables(stepper, inputs)
     values = np.array(stepper.defaults)
     next_steps = stepper.binding.function("next_steps")
     for n in prepared_segments(ours, inputs, end, parameters_of(stepper, None, inputs)):
@@ -92,7 +92,7 @@ def test_segments_in_c_equal_those_in_python(model, seed):
         theirs.update(parameters=values)
         theirs.advance(n)
     assert next_steps(theirs._memory, end, h, table, stepper.binding.pointer(values)) == 0
-    assert len(kept) == 4
+    assert len(saved) == 4
     assert (theirs.t, theirs.q, theirs.p) == (ours.t, ours.q, ours.p)
 
 
@@ -101,7 +101,7 @@ def test_step_longer_than_the_segment_is_shortened(model):
     given = {"u": ([0.0, 0.4, 1.0], [0.1, 0.2, 0.3]), "w": ([0.0, 1.0], [0.0, 0.0])}
     inputs = checked_inputs(stepper.interface, given)
     run = stepper.start([0.3], [0.1], h=1e11)
-    table, kept = _tables(stepper, inputs)
+    table, saved = _tables(stepper, inputs)
     values = np.array(stepper.defaults)
     taken = []
     while stepper.binding.function("next_steps")(run._memory, 0.9, 1e11, table, stepper.binding.pointer(values)) == 1:
@@ -110,18 +110,18 @@ def test_step_longer_than_the_segment_is_shortened(model):
         run.advance(1)
     assert_allclose(taken, [0.4, 0.5])
     assert run.t == 0.9
-    assert len(kept) == 4
+    assert len(saved) == 4
 
 
 def _tables(stepper, inputs):
     """The same data as C takes them, and what must not be forgotten before C has used them."""
-    table, kept = stepper.binding.new(f"input[{len(inputs)}]"), []
+    table, saved = stepper.binding.new(f"input[{len(inputs)}]"), []
     for entry, name in zip(table, stepper.interface.inputs, strict=True):
         data = inputs[name]
-        kept += [np.ascontiguousarray(data.breakpoints), np.ascontiguousarray(data.pieces[:, :4])]
-        entry.t, entry.coefficients = map(stepper.binding.pointer, kept[-2:])
+        saved += [np.ascontiguousarray(data.breakpoints), np.ascontiguousarray(data.pieces[:, :4])]
+        entry.t, entry.coefficients = map(stepper.binding.pointer, saved[-2:])
         entry.pieces, entry.piece = len(data.pieces), 0
-    return table, kept
+    return table, saved
 
 
 def test_folder_with_inputs_runs_from_python(model, tmp_path):

@@ -104,7 +104,7 @@ def test_different_source_or_flag_is_a_different_entry(changed, cache):
     assert len(entries(cache)) == 2
 
 
-def compiler_saying(tmp_path: Path, version: str, name: str = "own-cc") -> str:
+def compiler_reporting(tmp_path: Path, version: str, name: str = "own-cc") -> str:
     """A compiler that is nothing but what it says of itself."""
     script = tmp_path / name
     script.write_text(f"#!/bin/sh\necho '{version}'\n")
@@ -113,11 +113,11 @@ def compiler_saying(tmp_path: Path, version: str, name: str = "own-cc") -> str:
 
 
 def other_compiler(tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", compiler_saying(tmp_path, "1.0", "other-cc"))
+    monkeypatch.setenv("CC", compiler_reporting(tmp_path, "1.0", "other-cc"))
 
 
 def compiler_renewed(tmp_path, monkeypatch):
-    compiler_saying(tmp_path, "1.0, mended")
+    compiler_reporting(tmp_path, "1.0, mended")
     compilers.compiler_version.cache_clear()
 
 
@@ -137,7 +137,7 @@ def other_cffi(tmp_path, monkeypatch):
     "change", [other_compiler, compiler_renewed, compiler_of_several_words, more_flags, other_cffi]
 )
 def test_cache_key_contains_everything_the_binary_depends_on(change, tmp_path, monkeypatch):
-    monkeypatch.setenv("CC", compiler_saying(tmp_path, "1.0"))
+    monkeypatch.setenv("CC", compiler_reporting(tmp_path, "1.0"))
     monkeypatch.delenv(building.FLAGS_VARIABLE, raising=False)
     before = building.fingerprint(source(), flags=FAST)
     assert building.fingerprint(source(), flags=FAST) == before
@@ -148,7 +148,7 @@ def test_cache_key_contains_everything_the_binary_depends_on(change, tmp_path, m
 def test_compilers_with_arguments_are_distinguished_by_command_and_version(tmp_path, monkeypatch):
     found = set()
     for version, word in (("1.0", "-pipe"), ("1.1", "-pipe"), ("1.0", "-m32")):
-        monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, version)} {word}")
+        monkeypatch.setenv("CC", f"{compiler_reporting(tmp_path, version)} {word}")
         compilers.compiler_version.cache_clear()
         found.add(building.fingerprint(source(), flags=FAST))
     assert len(found) == 3
@@ -175,7 +175,7 @@ def test_cache_key_contains_every_part_of_the_source():
 def test_processor_specific_code_is_not_shared_between_processors(where, tmp_path, monkeypatch):
     native, names = "-march=native", []
     monkeypatch.setenv(building.FLAGS_VARIABLE, native if where == "environment" else "")
-    monkeypatch.setenv("CC", f"{compiler_saying(tmp_path, '1.0')} {native if where == 'compiler' else '-pipe'}")
+    monkeypatch.setenv("CC", f"{compiler_reporting(tmp_path, '1.0')} {native if where == 'compiler' else '-pipe'}")
     for processor in ("one", "another"):
         monkeypatch.setattr(fingerprint, "_processor", lambda processor=processor: processor)
         names.append(building.fingerprint(source(), flags=(*FAST, native) if where == "flags" else FAST))

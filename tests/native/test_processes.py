@@ -54,7 +54,7 @@ def child_of(script: Path) -> int:
     return int(file.read_text())
 
 
-def is_gone(pid: int) -> bool:
+def has_ended(pid: int) -> bool:
     """Whether a process ends within moments; one that nobody has reaped has ended."""
     until = time.monotonic() + 300
     while time.monotonic() < until:
@@ -78,7 +78,7 @@ def test_ending_python_ends_the_compiler_and_its_children(slow_compiler, number)
     os.kill(process.pid, number)
     process.communicate(timeout=300)
     assert process.returncode == -number
-    assert is_gone(child)
+    assert has_ended(child)
 
 
 @needs_proc
@@ -86,7 +86,7 @@ def test_compiler_is_ended_after_a_timeout(slow_compiler, monkeypatch):
     monkeypatch.setattr(building, "COMPILE_SECONDS", 1)
     with pytest.raises(BuildError, match="stopped after 1 s"):
         building.load(Source(prefix="tiny", header="", code="", declarations=""))
-    assert is_gone(child_of(slow_compiler))
+    assert has_ended(child_of(slow_compiler))
 
 
 def test_output_status_and_temporary_files_are_handled(tmp_path):
@@ -96,8 +96,8 @@ def test_output_status_and_temporary_files_are_handled(tmp_path):
 
 
 def test_without_a_shell_the_program_starts_directly(tmp_path):
-    told = [sys.executable, "-c", "import os, sys; print(os.environ['TEMP']); sys.exit('no')"]
-    with _alone(told, tmp_path) as process:
+    command = [sys.executable, "-c", "import os, sys; print(os.environ['TEMP']); sys.exit('no')"]
+    with _alone(command, tmp_path) as process:
         assert process.communicate(timeout=300) == (f"{tmp_path}\n", "no\n")
     assert process.returncode == 1
     with _alone([sys.executable, "-c", "import time; time.sleep(3600)"], tmp_path) as process:
@@ -136,19 +136,19 @@ def part(name: str) -> Source:
     return Source(prefix=name, header=f"{declarations}\n", code=code, declarations=declarations)
 
 
-def told(monkeypatch, seconds: float, patience: float) -> list[str]:
+def announced_by(monkeypatch, seconds: float, patience: float) -> list[str]:
     """What is said while something takes so many seconds."""
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", patience)
-    said: list[str] = []
-    with announcements.announce_to(said.append), announcements.announced("deriving"):
+    message: list[str] = []
+    with announcements.announce_to(message.append), announcements.announced("deriving"):
         time.sleep(seconds)
-    return said
+    return message
 
 
 def test_only_slow_work_is_announced(monkeypatch, caplog):
     caplog.set_level(logging.INFO, "scvi_codegen")
-    assert told(monkeypatch, 0.3, 0.05) == ["deriving"]
-    assert told(monkeypatch, 0.0, 0.5) == []
+    assert announced_by(monkeypatch, 0.3, 0.05) == ["deriving"]
+    assert announced_by(monkeypatch, 0.0, 0.5) == []
     assert caplog.messages == ["deriving"]
 
 

@@ -52,12 +52,12 @@ def test_machine_without_a_compiler_uses_the_one_from_the_wheel(tmp_path):
     ran = in_python(environment, "-c", RUN)
     assert ran.returncode == 0, ran.stderr
     assert float(ran.stdout) < 1e-6
-    told = in_python(environment, "-m", "scvi_codegen", "doctor")
-    assert told.returncode == 0, told.stdout + told.stderr
+    outcome = in_python(environment, "-m", "scvi_codegen", "doctor")
+    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
     assert re.search(
-        r"^ok +compiler .*-m ziglang cc: .*\(extra compiler: the PATH has no cc, gcc or clang\)$", told.stdout, re.M
+        r"^ok +compiler .*-m ziglang cc: .*\(extra compiler: the PATH has no cc, gcc or clang\)$", outcome.stdout, re.M
     )
-    assert re.search(r"^ok +trial ", told.stdout, re.M)
+    assert re.search(r"^ok +trial ", outcome.stdout, re.M)
 
 
 def broken(code: str) -> str:
@@ -68,17 +68,17 @@ def broken(code: str) -> str:
 
 def test_compiler_without_headers_is_replaced_by_the_one_from_the_wheel(tmp_path, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
-    said = broken("#include <no_such_header.h>\n")
-    assert "no_such_header.h" in said
-    assert "pip install 'scvi-codegen[compiler]' (ziglang), and set CC='python -m ziglang cc'" in said
+    message = broken("#include <no_such_header.h>\n")
+    assert "no_such_header.h" in message
+    assert "pip install 'scvi-codegen[compiler]' (ziglang), and set CC='python -m ziglang cc'" in message
 
 
 def test_the_compiler_from_the_wheel_does_not_recommend_itself(tmp_path, monkeypatch):
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     monkeypatch.setenv("CC", f"{sys.executable} -c exit('refused') ziglang")
-    said = broken("")
-    assert "rejected" in said
-    assert "pip install" not in said
+    message = broken("")
+    assert "rejected" in message
+    assert "pip install" not in message
 
 
 WATCHED = """#!/bin/sh

@@ -300,7 +300,7 @@ def scvi_printed(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: 
     """(34a)-(34e): the same with partial derivatives by the end node values, as printed."""
     values, partials = table(nodes, c), table(nodes, c, derivative) / h
 
-    def end_slopes(Q: np.ndarray) -> np.ndarray:
+    def end_derivatives(Q: np.ndarray) -> np.ndarray:
         at = (t + c * h, values @ Q, partials @ Q)
         G = h * (values.T @ (w[:, None] * system.force(*at)) + partials.T @ (w[:, None] * system.momentum(*at)))
         return G[[0, -1]]
@@ -308,11 +308,11 @@ def scvi_printed(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: 
     def rows(unknown: np.ndarray) -> np.ndarray:
         Q = np.vstack([q0[None], unknown[1:]])
         E = collocation(system, t, q0, unknown[1:], unknown[0], h, nodes)[0]
-        return np.vstack([end_slopes(Q)[:1] + p0, E])
+        return np.vstack([end_derivatives(Q)[:1] + p0, E])
 
     v0 = system.velocity(t, q0, p0)
     unknown = newton(rows, np.vstack([v0[None], q0 + np.outer(nodes[1:] * h, v0)]))
-    return unknown[-1], end_slopes(np.vstack([q0[None], unknown[1:]]))[1]
+    return unknown[-1], end_derivatives(np.vstack([q0[None], unknown[1:]]))[1]
 
 
 def sc_position(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any) -> State:

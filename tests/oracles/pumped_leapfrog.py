@@ -33,7 +33,7 @@ def stepper():
 def states(row):
     """(kept, 4) states from the numbers of ``STEP_INPUTS``, which may be complex."""
     q, p, (m, k, a, w, t, h) = row[:2], row[2:4], row[4:]
-    kept = [np.concatenate([q, p])]
+    saved = [np.concatenate([q, p])]
 
     def force(q, t):
         coupling = a * np.cos(w * t)
@@ -44,8 +44,8 @@ def states(row):
         q = q + h * p / m
         p = p + h / 2 * force(q, t + (n + 1) * h)
         if (n + 1) % EVERY == 0:
-            kept.append(np.concatenate([q, p]))
-    return np.array(kept)
+            saved.append(np.concatenate([q, p]))
+    return np.array(saved)
 
 
 def partials(row):

@@ -37,14 +37,14 @@ L = "(1 + x**2)*x_dot**2/2 + y_dot**2/2 + x_dot*y_dot/3 + cos(x) - y**2*x/4 + y*
 GAMMA = 0.4 * 0.9
 
 
-def damped(lagrangian=L, **beside):
+def damped(lagrangian=L, **extra):
     return LagrangianSystem.from_text(
         name="damped",
         coordinates=["x", "y"],
         lagrangian=lagrangian,
         parameters={"c": 0.4, "m": 0.9},
         damping="c*m",
-        **beside,
+        **extra,
     )
 
 

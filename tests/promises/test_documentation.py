@@ -79,10 +79,10 @@ def test_equal_numbers_are_accepted():
     agree("period 6.325, kept to 3e-14, after 12 steps", "period 6.326, kept to 2e-15, after 12 steps\n")
 
 
-@pytest.mark.parametrize(("said", "printed"), [("1.234", "1.237"), ("12", "13"), ("3e-14", "4e-13"), ("x 1", "y 1")])
-def test_different_numbers_are_detected(said, printed):
+@pytest.mark.parametrize(("message", "printed"), [("1.234", "1.237"), ("12", "13"), ("3e-14", "4e-13"), ("x 1", "y 1")])
+def test_different_numbers_are_detected(message, printed):
     with pytest.raises(AssertionError, match=r"is said|said\n"):
-        agree(said, printed)
+        agree(message, printed)
 
 
 def test_gallery_pages_have_a_light_picture_a_formula_output_and_a_source():
@@ -218,8 +218,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
         pytest.skip("sphinx, myst-parser or furo is not installed: pip install 'scvi-codegen[docs]'")
     folder = tmp_path_factory.mktemp("site")
-    [said] = re.findall(r"^python (-m sphinx .*) site$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
-    command = [sys.executable, *said.split(), str(folder), "-q"]
+    [command] = re.findall(
+        r"^python (-m sphinx .*) site$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    command = [sys.executable, *command.split(), str(folder), "-q"]
     built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     return folder
@@ -258,7 +260,7 @@ class TestTheSite:
         assert wide == []
         assert pale == []
         assert {url.split(":")[0] for url in view.asked} <= {"file", "data"}
-        assert view.said == []
+        assert view.console == []
 
     def test_keyboard_focus_is_visible(self, site, view):
         """Links in a drawer of a narrow screen open the drawer."""

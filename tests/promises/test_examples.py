@@ -278,9 +278,9 @@ def test_joint_forces_are_the_documented_ones(output_of):
     assert len(forces) == 2
     for found, expected in forces:
         assert float(found) == pytest.approx(float(expected), abs=2e-9)
-    kept = [float(number) for number in re.findall(r"joints kept to (\S+),", output)]
-    assert len(kept) == 6
-    assert max(kept) < 1e-14
+    saved = [float(number) for number in re.findall(r"joints kept to (\S+),", output)]
+    assert len(saved) == 6
+    assert max(saved) < 1e-14
     hangers = [float(number) for number in re.search(r"hangers pull with (\S+) and (\S+)", output).groups()]
     assert sum(hangers) == pytest.approx((9 * 0.2 + 3.0) * 9.81, abs=1e-3)
 

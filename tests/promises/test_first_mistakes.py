@@ -36,7 +36,7 @@ def stepper():
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({"q": [1.0]}, "give either p or velocity with q; got neither"),
         ({"q": [1.0, 2.0], "p": [0.0]}, "q must have shape (1,) for (q), not (2,)"),
@@ -52,14 +52,14 @@ def stepper():
     ],
     ids=lambda part: part if isinstance(part, str) else None,
 )
-def test_first_mistakes_with_runs(given, said, stepper):
+def test_first_mistakes_with_runs(given, message, stepper):
     with pytest.raises(ScviCodegenError) as caught:
         stepper.integrate(**{"h": 0.1, "steps": 3} | given)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (
             {"lagrangian": "q_dot**2/2 + k*cos(q)"},
@@ -69,10 +69,10 @@ def test_first_mistakes_with_runs(given, said, stepper):
     ],
     ids=["a constant", "a force"],
 )
-def test_first_mistakes_with_systems(given, said):
+def test_first_mistakes_with_systems(given, message):
     with pytest.raises(ScviCodegenError) as caught:
         sc.LagrangianSystem.from_text(**TEXT | given)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_system_accepts_positional_arguments_and_scalar_states(stepper):
@@ -91,11 +91,11 @@ def test_system_accepts_positional_arguments_and_scalar_states(stepper):
 def test_zero_mass_and_step_size_underflow_are_explained():
     text = {"lagrangian": "m*q_dot**2/2 - q**2/2", "parameters": {"m": 1.0}}
     stepper = sc.compile_stepper(sc.LagrangianSystem.from_text(**TEXT | text), "svi:2", flags=QUICK_FLAGS)
-    for given, said in (
+    for given, message in (
         ({"h": 0.1, "steps": 9}, "no mass is 0"),
         ({"t_end": 1.0}, "below machine precision.*mass of 0"),
     ):
-        with pytest.raises(sc.StepFailedError, match=said):
+        with pytest.raises(sc.StepFailedError, match=message):
             stepper.integrate([1.0], [0.0], parameters={"m": 0.0}, **given)
 
 
@@ -109,7 +109,7 @@ def test_first_mistakes_with_methods(name, meant, stepper):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words", "said"),
+    ("old", "new", "words", "message"),
     [
         (
             "q_dot = [0.0]",
@@ -124,12 +124,12 @@ def test_first_mistakes_with_methods(name, meant, stepper):
         ("", "", "-o nowhere/run.npz", "there is no folder 'nowhere'"),
     ],
 )
-def test_first_mistakes_with_files_and_commands(old, new, words, said, tmp_path, monkeypatch):
+def test_first_mistakes_with_files_and_commands(old, new, words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("swing.toml").write_text(MODEL.replace(old, new, 1))
     result = CliRunner().invoke(main, ["run", "swing.toml", *words.split()])
     assert result.exit_code == 2, result.output
-    assert said in result.stderr
+    assert message in result.stderr
 
 
 def test_first_mistakes_with_command_names():

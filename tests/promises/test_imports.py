@@ -254,10 +254,10 @@ def test_pyright_checks_public_names(tmp_path):
     )
     (tmp_path / "typed.py").write_text(TYPED)
     words = ["pyright", "--pythonpath", sys.executable, "."]
-    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-    assert 'Type of "sc.SVI(4)" is "SVI"' in said
-    assert re.findall(r"(\w+\.py:\d+):\d+ - error", said) == ["typed.py:5"]
-    assert "1 error, " in said
+    output = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    assert 'Type of "sc.SVI(4)" is "SVI"' in output
+    assert re.findall(r"(\w+\.py:\d+):\d+ - error", output) == ["typed.py:5"]
+    assert "1 error, " in output
 
 
 def test_public_names_exist_and_come_from_the_documented_modules():

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 import re
 
-from language import FRAGMENT, RETIRED_NAMES, RETIRED_PHRASES, ROOT, docstrings, identifiers, messages, prose, words_of
+from language import (
+    FRAGMENT,
+    RETIRED_NAMES,
+    RETIRED_PHRASES,
+    ROOT,
+    docstrings,
+    identifiers,
+    is_retired_in_tests,
+    messages,
+    names_in_tests,
+    prose,
+    words_of,
+)
 
 EXCEPTIONS: dict[str, str] = {}
 """Paths in which a retired term is right, with the reason."""
@@ -41,6 +53,12 @@ def test_no_retired_term_is_a_name():
         if not excepted(text) and words_of(text.text) & RETIRED_NAMES
     }
     assert found == set()
+
+
+def test_no_retired_term_is_a_name_in_tests():
+    names = list(names_in_tests())
+    assert len(names) > 20_000
+    assert {f"{place(text)}: {text.text}" for text in names if is_retired_in_tests(text.text)} == set()
 
 
 def test_messages_are_sentences():

@@ -57,8 +57,8 @@ def test_pickled_stepper_is_equal(option: str) -> None:
         "second_derivatives": own.second_derivatives,
     }  # which go if asked for
     for copy in (copied(own), copied(copied(own))):
-        kept = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
-        assert [name for name in kept if getattr(copy, name) != getattr(own, name)] == []
+        saved = ("title", "interface", "flags", "events", "source", "ensemble", "fallback", "derivatives")
+        assert [name for name in saved if getattr(copy, name) != getattr(own, name)] == []
         assert {"changes": copy._variational_source(2), "second_derivatives": copy.second_derivatives} == made
         plan: dict[str, Any] = {"h": 0.2, "t_end": 0.5} if option == "time_transformation" else {"h": H, "steps": STEPS}
         runs = [each.integrate(Q, P, **plan) for each in (own, copy)]
@@ -138,13 +138,13 @@ def driven() -> Stepper:
     return compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
 
 
-@pytest.mark.parametrize("held", [(), ("u",), ("w",), ("u", "w")])
-def test_run_requires_inputs_that_are_not_set(held: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("names_set", [(), ("u",), ("w",), ("u", "w")])
+def test_run_requires_inputs_that_are_not_set(names_set: tuple[str, ...]) -> None:
     run = driven().start([0.3], [0.1], h=H)
-    run.set_inputs(**dict.fromkeys(held, 0.7))
+    run.set_inputs(**dict.fromkeys(names_set, 0.7))
     copy = copied(run)
     for each in (run, copy):
-        for name in {"u", "w"} - set(held):
+        for name in {"u", "w"} - set(names_set):
             with pytest.raises(sc.StateError, match=r"the input '[uw]' is not set"):
                 each.advance(1)
             each.set_inputs(**{name: 0.2})

@@ -49,7 +49,7 @@ def additions() -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
 def changed(text: str, change: str) -> str:
     """The text with the one place that a diff names changed."""
     lines = [(line[:1], line[1:]) for line in change.splitlines()]
-    old, new = ("".join(f"{line}\n" for sign, line in lines if sign in kept) for kept in (" -", " +"))
+    old, new = ("".join(f"{line}\n" for sign, line in lines if sign in saved) for saved in (" -", " +"))
     assert text.count(old) == 1, f"the page changes what is not there, or not once:\n{change}"
     return text.replace(old, new)
 

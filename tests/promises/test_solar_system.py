@@ -83,7 +83,7 @@ def test_bodies_move_as_einstein_infeld_and_hoffmann_found(example):
 
 def test_the_centre_of_energy_moves_with_the_momentum(example):
     """The theorem of the centre of mass, to the next order in 1/c^2, which no symmetry of the text shows."""
-    bends, gm = [], np.array(list(MASSES.values()))
+    deflections, gm = [], np.array(list(MASSES.values()))
     for c in (10.0, 100.0):
         stepper = sc.compile_stepper(relativistic(example, MASSES, c), sc.SVI(6))
         run = stepper.integrate(PLACES.ravel(), velocity=VELOCITIES.ravel(), h=0.02, steps=100)
@@ -93,9 +93,9 @@ def test_the_centre_of_energy_moves_with_the_momentum(example):
         r = np.linalg.norm(x[:, None] - x[:, :, None], axis=-1) + np.diag([np.inf] * 3)
         energy = gm * (1.0 + ((v**2).sum(-1) / 2.0 - (gm / r).sum(-1) / 2.0) / c**2)
         centre = np.einsum("tb,tbi->ti", energy, x) - run.t[:, None] * p[0].sum(axis=0)
-        bends.append(abs(centre - centre[0]).max())
-    assert 1e-9 < bends[0] < 1e-3
-    assert bends[1] < 2e-4 * bends[0]
+        deflections.append(abs(centre - centre[0]).max())
+    assert 1e-9 < deflections[0] < 1e-3
+    assert deflections[1] < 2e-4 * deflections[0]
 
 
 def advance(example, masses, c, a, e, orbits):

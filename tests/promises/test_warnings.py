@@ -36,7 +36,7 @@ def test_warning_points_to_the_calling_line(act):
 
 
 @pytest.mark.parametrize(
-    ("q", "velocity", "told"),
+    ("q", "velocity", "reported"),
     [
         ([1.001, 0.0], [0.0, 1.0], r"x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
         ([1.0, 0.0], [0.001, 1.0], r"the rate of x\*\*2 \+ y\*\*2 - 1 is 0.002, not 0"),
@@ -47,8 +47,8 @@ def test_warning_points_to_the_calling_line(act):
         ),
     ],
 )
-def test_start_off_its_constraints_warns_with_the_violation(q, velocity, told):
-    with pytest.warns(sc.AccuracyWarning, match=told):
+def test_start_off_its_constraints_warns_with_the_violation(q, velocity, reported):
+    with pytest.warns(sc.AccuracyWarning, match=reported):
         sc.compile_stepper(ROD, "svi:2").start(q, velocity=velocity, h=0.01)
 
 

@@ -285,14 +285,14 @@ TESTED = [SVI(2), SCVI(2), StoermerVerlet()]
 
 def accepted(names: Sequence[str]) -> list[str]:
     """The names that systems may use."""
-    kept = []
+    saved = []
     for name in names:
         try:
             named_system([name])
         except ValueError:
             continue
-        kept.append(name)
-    return kept
+        saved.append(name)
+    return saved
 
 
 def named_system(names: Sequence[str], name: str = "oscillators") -> LagrangianSystem:

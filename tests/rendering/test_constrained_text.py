@@ -92,12 +92,12 @@ def test_packages_are_self_contained(tmp_path):
     assert np.abs(other.multipliers() - one.multipliers()).max() < 1e-10
 
 
-def made_and_run(folder, q, *, precision=None, system=LINKAGE, said=0):
+def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
     """A folder is generated, ``make`` builds what is in it and runs it: the example's states, and all that it said."""
     model = Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
     generate_package(model, folder, embedded=precision)
     found = subprocess.run(["make", "-s", "-C", str(folder)], capture_output=True, text=True)
-    assert (found.returncode != 0) == said
+    assert (found.returncode != 0) == exit_status
     return np.array([line.split() for line in found.stdout.splitlines() if line[0] != "#"], dtype=float), found
 
 
@@ -123,10 +123,10 @@ def test_generated_folders_project_constraints_and_equal_python(precision, tmp_p
 
 def test_states_that_cannot_be_projected_are_rejected_in_c(tmp_path):
     """A state that is far off; and one stretched out, whose rods are one line: what they say depends on each other."""
-    states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], said=1)
+    states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], exit_status=1)
     assert "violates the constraints" in found.stderr
     stretched = LINKAGE.with_parameters(d=4.5)
-    other, also = made_and_run(tmp_path / "stretched", [1.0, 0.0, 3.0, 0.0], system=stretched, said=1)
+    other, also = made_and_run(tmp_path / "stretched", [1.0, 0.0, 3.0, 0.0], system=stretched, exit_status=1)
     assert "the projection of the initial state onto the constraints failed (status 2)" in also.stderr
     assert not len(states)
     assert not len(other)

@@ -76,12 +76,12 @@ def test_an_arm_processor_computes_the_same_bits(name, method, tmp_path):
     """One libm, roundings fixed by flags: 17 digits of every state, and steps of their own lengths, too."""
     needs(QEMU)
     sources = [str(source) for source in sorted(folder_for(name, method, tmp_path).glob("*.c"))]
-    said = {}
+    message = {}
     for target, runner in {"aarch64-linux-musl": [QEMU], "x86_64-linux-musl": []}.items():
         program = tmp_path / target
         compiled(target, "-static", *sources, "-lm", "-o", str(program))
         result = subprocess.run([*runner, str(program)], capture_output=True, text=True, check=True, timeout=300)
-        said[target] = result.stdout
-    arm, intel = said.values()
+        message[target] = result.stdout
+    arm, intel = message.values()
     assert arm == intel
     assert len(arm.splitlines()) > 20

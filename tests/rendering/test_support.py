@@ -29,7 +29,7 @@ def is_sanitized() -> bool:
     return subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
 
 
-def said(program: str, folder: Path, *flags: str) -> str:
+def output_of(program: str, folder: Path, *flags: str) -> str:
     """What a program prints, compiled in a folder under the sanitizers."""
     needs(SANITIZED[0])
     if not is_sanitized():
@@ -49,7 +49,7 @@ def written(source: Source, folder: Path) -> str:
     return alone.prefix
 
 
-LADDER = """
+LEVELS = """
 #include <stdio.h>
 typedef double real;
 typedef struct { int guess; long long change, change_before; } run_memory;
@@ -76,7 +76,7 @@ int main(void)
 def test_predictor_is_limited_to_the_available_tables(tmp_path):
     """From the last step for every change of length that has a table; from two for every pair; from none beyond."""
     assert REACH == 2
-    lines = [list(map(int, line.split())) for line in said(LADDER, tmp_path, f"-I{SUPPORT}").splitlines()]
+    lines = [list(map(int, line.split())) for line in output_of(LEVELS, tmp_path, f"-I{SUPPORT}").splitlines()]
     assert len(lines) == 2 * 13 * 13
     for guess, before, change, *found in lines:
         reached = abs(change) <= REACH and (guess == 1 or abs(before) <= REACH)
@@ -108,12 +108,12 @@ def test_intervals_are_split_only_where_a_root_is_uncertain(tmp_path):
     """x: slope 1, x^3 - x/4: slope -1/4 in the middle and 1/2 outside, both against eight doubts; hollows
     0.01 and 0.001 above zero, of one extremum and of two; the highest power alone."""
     stepper = compile_stepper(problem("harmonic-oscillator").system, SVI(1), events=["q"])
-    beside = stepper.source.beside
-    assert beside is not None
+    extra = stepper.source.beside
+    assert extra is not None
     written(stepper.source, tmp_path)
-    program = f'#include <stdio.h>\n#include "{written(beside, tmp_path)}.c"\n{DOUBT.format()}'
+    program = f'#include <stdio.h>\n#include "{written(extra, tmp_path)}.c"\n{DOUBT.format()}'
     flags = ("-Wno-unused-function", f"{stepper.source.prefix}.c")
-    found = [float(place) for place in said(program, tmp_path, *flags).split()]
+    found = [float(place) for place in output_of(program, tmp_path, *flags).split()]
     assert found == pytest.approx([2.0, 0.0, 2.0, 0.0, 2.0, 0.5, 2.0, 0.2, 2.0, 0.0], abs=1e-6)
 
 
@@ -159,4 +159,4 @@ def test_derivatives_stay_within_their_workspace(system, solver, tmp_path):
     names = re.sub(r"\b([A-Z_]{5,})\b", rf"{prefix.upper()}_\1", DERIVATIVES.format(defaults="1.0, 1.0"))
     names = names.replace(f"{prefix.upper()}_NULL", "NULL")
     names = re.sub(r"\b(linearise\(|report found)", rf"{prefix}_\1", names)
-    said(f'#include <stdlib.h>\n#include "{prefix}.h"\n{names}', tmp_path, f"{prefix}.c")
+    output_of(f'#include <stdlib.h>\n#include "{prefix}.h"\n{names}', tmp_path, f"{prefix}.c")

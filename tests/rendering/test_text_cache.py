@@ -54,8 +54,8 @@ def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monke
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 1)
-    kept = pickle.loads(pickle.dumps(stepper))  # makes also those of controlled steps, fallback and derivatives
-    assert kept.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
+    saved = pickle.loads(pickle.dumps(stepper))  # makes also those of controlled steps, fallback and derivatives
+    assert saved.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
     assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 5)
     assert len(made) == 2  # with the fallback and without
 

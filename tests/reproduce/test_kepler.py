@@ -68,7 +68,7 @@ def test_energy_and_momentum_over_318_revolutions(run, expected):
 
 # Figs. 16-20.
 
-SLOPES = {
+ORDERS = {
     ("SVI", 2): (6, 5, None, 6),
     ("SVI", 4): (10, 9, None, 10),
     ("SVI", 6): (14, 13, None, 14),
@@ -77,7 +77,7 @@ SLOPES = {
     ("SC", 6): (8, 7, 8, 8),
 }
 """(scheme, degree) -> powers of h of q1, q2, momentum, energy from the perihelion of an ellipse."""
-CIRCLE_SLOPES = {
+CIRCLE_ORDERS = {
     ("SVI", 1): (4, 3, None, 6),
     ("SVI", 3): (8, 7, None, 14),
     ("SVI", 5): (12, 11, None, 22),
@@ -90,8 +90,8 @@ CIRCLE_SLOPES = {
 
 @pytest.mark.parametrize(
     ("scheme", "degree", "e", "expected"),
-    [(*key, 0.5, value) for key, value in SLOPES.items()]
-    + [(*key, 0.0, value) for key, value in CIRCLE_SLOPES.items()],
+    [(*key, 0.5, value) for key, value in ORDERS.items()]
+    + [(*key, 0.0, value) for key, value in CIRCLE_ORDERS.items()],
 )
 def test_convergence_orders_of_the_local_error(scheme, degree, e, expected):
     found = orders(scheme, degree, e)

@@ -329,7 +329,7 @@ class TestCommand:
     def test_interrupt_exits_with_130(self, monkeypatch):
         interrupted = Reproduction(interrupted=True)
         monkeypatch.setattr(
-            "scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words, say: interrupted
+            "scvi_codegen.cli.commands.reproduce.reproduce_experiments", lambda *words, **options: interrupted
         )
         done = invoke("slow")
         assert done.exit_code == 130
@@ -364,8 +364,8 @@ def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
     interrupt_group(child)
     output, errors = child.communicate(timeout=300.0)  # by itself it would take twice as long
     assert output == "interrupted ['table-9.txt']\n"
-    told = errors.split("Traceback (most recent call last):\n")[1:]
-    assert [text for text in told if not ("in spawn_main" in text or text.count("\n") <= JUST_STARTING)] == []
+    reported = errors.split("Traceback (most recent call last):\n")[1:]
+    assert [text for text in reported if not ("in spawn_main" in text or text.count("\n") <= JUST_STARTING)] == []
     assert (tmp_path / "made" / "table-9.txt").is_file()
 
 

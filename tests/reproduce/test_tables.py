@@ -87,11 +87,11 @@ def test_tables_6_and_7_have_the_errors_of_the_schemes():
 def test_a_verdict_on_costs_can_fail():
     cheap, dear = (costs.Cost(seconds=seconds, energy=1e-9, position=1e-6) for seconds in (1.0, 2.0))
     setting = costs.SETTINGS[6]
-    kept, lost = (
+    saved, lost = (
         [check.verdict for check in costs._checks(setting, {"SRK": srk, "SVI": svi, "SC": dear})]
         for srk, svi in ((dear, cheap), (cheap, dear))
     )
-    assert (kept[0], kept[2], lost[0], lost[2]) == (Verdict.HOLDS, Verdict.HOLDS, Verdict.FAILS, Verdict.FAILS)
+    assert (saved[0], saved[2], lost[0], lost[2]) == (Verdict.HOLDS, Verdict.HOLDS, Verdict.FAILS, Verdict.FAILS)
 
 
 def test_the_printed_iterations_are_those_of_the_paper():

@@ -157,12 +157,12 @@ def test_verdicts_follow_from_the_numbers(results):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("name", "held", "failed"), [("theorem-4.1", 2, 2), ("theorem-4.2", 2, 1), ("theorem-4.3", 4, 0)]
+    ("name", "satisfied", "failed"), [("theorem-4.1", 2, 2), ("theorem-4.2", 2, 1), ("theorem-4.3", 4, 0)]
 )
-def test_verdicts_on_the_order_and_on_the_rates(name, held, failed, tmp_path):
+def test_verdicts_on_the_order_and_on_the_rates(name, satisfied, failed, tmp_path):
     [experiment] = [each for each in theorems.EXPERIMENTS if each.name == name]
     result = experiment.run({})
-    assert [check.verdict for check in result.checks] == [Verdict.HOLDS] * held + [Verdict.FAILS] * failed
+    assert [check.verdict for check in result.checks] == [Verdict.HOLDS] * satisfied + [Verdict.FAILS] * failed
     assert all(len(row) == len(table.columns) for table in result.tables for row in table.rows)
     writing.write_result(pickle.loads(pickle.dumps(result)), tmp_path)
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".png", ".svg", ".txt"}

@@ -36,29 +36,29 @@ def standing(run):
     return run.t, run.q.tolist(), run.p.tolist()
 
 
-@pytest.mark.parametrize("portion", [1, 7, 1000])
-def test_runs_with_and_without_saved_states_are_equal(pushed, monkeypatch, portion):
+@pytest.mark.parametrize("chunk", [1, 7, 1000])
+def test_runs_with_and_without_saved_states_are_equal(pushed, monkeypatch, chunk):
     """In however many calls of C they are done."""
-    kept = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
-    monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
+    saved = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
+    monkeypatch.setattr(memory, "STEPS_PER_CALL", chunk)
     run = pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2})
     run.advance(100)
     assert run.steps == 100
-    assert standing(run) == (kept.t[-1], kept.q[-1].tolist(), kept.p[-1].tolist())
+    assert standing(run) == (saved.t[-1], saved.q[-1].tolist(), saved.p[-1].tolist())
 
 
-@pytest.mark.parametrize("portion", [3, 10**5])
-def test_run_stops_at_its_target_time(pushed, monkeypatch, portion):
+@pytest.mark.parametrize("chunk", [3, 10**5])
+def test_run_stops_at_its_target_time(pushed, monkeypatch, chunk):
     plan = {"t_end": 3.0, "tolerance": 1e-9}
-    kept = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
-    monkeypatch.setattr(memory, "STEPS_PER_CALL", portion)
-    for steps in ([10**6], [1] * (kept.steps - 1) + [10, 10]):
+    saved = pushed.integrate([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
+    monkeypatch.setattr(memory, "STEPS_PER_CALL", chunk)
+    for steps in ([10**6], [1] * (saved.steps - 1) + [10, 10]):
         run = pushed.start([0.3], [0.1], parameters={"u_0": 0.2}, **plan)
         for each in steps:
             run.advance(each)
         assert run.arrived
-        assert run.steps == kept.steps
-        assert standing(run) == (3.0, kept.q[-1].tolist(), kept.p[-1].tolist())
+        assert run.steps == saved.steps
+        assert standing(run) == (3.0, saved.q[-1].tolist(), saved.p[-1].tolist())
 
 
 def test_run_with_time_transformation_stops_at_its_target_time():
@@ -66,10 +66,10 @@ def test_run_with_time_transformation_stops_at_its_target_time():
         name="Kepler", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2 + 1/sqrt(x**2 + y**2)"
     )
     stepper = compile_stepper(kepler, SVI(3), time_transformation="frequency")
-    kept = stepper.integrate([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
+    saved = stepper.integrate([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
     run = stepper.start([1.0, 0.0], [0.0, 1.1], t_end=5.0, h=0.1)
     run.advance(10**6)
-    assert standing(run) == (5.0, kept.q[-1].tolist(), kept.p[-1].tolist())
+    assert standing(run) == (5.0, saved.q[-1].tolist(), saved.p[-1].tolist())
 
 
 def test_nan_input_leaves_all_inputs_unchanged(pushed):
@@ -100,7 +100,7 @@ def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
 def test_runs_of_one_stepper_are_independent(pushed):
     given = np.array(pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2}).parameters)
 
-    def held(force):
+    def with_force(force):
         run = pushed.start([0.3], [0.1], h=0.05, parameters=given)
         for k in range(200):
             run.set_inputs(u=force * (-1) ** k)
@@ -109,7 +109,7 @@ def test_runs_of_one_stepper_are_independent(pushed):
 
     forces = [0.1 * k for k in range(8)] * 4
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(held, forces))
-    assert together == [held(force) for force in forces]
+        together = list(pool.map(with_force, forces))
+    assert together == [with_force(force) for force in forces]
     assert len({each[1][0] for each in together}) == 8
     assert given[pushed.parameters.index("u_0")] == 0.2

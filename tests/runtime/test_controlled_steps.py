@@ -155,8 +155,10 @@ def test_swinging_atwood_machine_with_adaptive_steps(atwood):
 @pytest.mark.parametrize(("h", "wrong"), [(1.0, True), (0.25, True), (0.01, False)])
 def test_converged_spurious_step_is_reported(atwood, h, wrong):
     q, v = [1.1, 0.8], [0.0, 0.2]
-    said = pytest.raises((AccuracyWarning, StepFailedError), match=r"too long|spurious") if wrong else nullcontext()
-    with said:
+    expectation = (
+        pytest.raises((AccuracyWarning, StepFailedError), match=r"too long|spurious") if wrong else nullcontext()
+    )
+    with expectation:
         run = atwood.integrate(q, atwood.momentum(q, v), h=h, steps=round(100.0 / h))
         assert run.step_error < 1e-3
         assert 0.0 <= run.worst_step_time < 100.0

@@ -60,16 +60,16 @@ def kepler() -> Stepper:
 def test_dense_output_has_the_order_of_the_method(method):
     stepper = compile_stepper(problem("kepler").system, method, flags=FLAGS)
     counts = (40, 80) if stepper.interface.method != "euler" else (400, 800)
-    between, kept = [], []
+    between, saved = [], []
     for n in counts:
         run = stepper.integrate(**START, h=2 * math.pi / n, steps=n)
         t = np.linspace(0, run.t[-1], 501)
         between.append(np.abs(run.at(t)[0] - ellipse(t)).max())
-        kept.append(np.abs(run.q - ellipse(run.t)).max())
+        saved.append(np.abs(run.q - ellipse(run.t)).max())
     expected = method.order if method.order is not None else 1
     assert between[1] > 1e-13
     assert math.log2(between[0] / between[1]) == pytest.approx(expected, abs=0.6)
-    assert between[1] < 1.3 * kept[1]
+    assert between[1] < 1.3 * saved[1]
 
 
 def test_hermite_cubics_are_less_accurate(kepler):
@@ -89,8 +89,8 @@ def test_dense_output_is_continuous_at_saved_states(compiled, sample, method, h)
     assert np.array_equal(run.at(run.t)[1], run.p)
     assert np.array_equal(run.at(np.nextafter(run.t[-1], run.t[-1] + h))[0], run.q[-1])
     for near in (np.nextafter(run.t[1:], run.t[:-1]), np.nextafter(run.t[1:-1], run.t[2:])):
-        kept = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
-        for value, state in zip(run.at(near), kept, strict=True):
+        saved = run.q[1 : 1 + len(near)], run.p[1 : 1 + len(near)]
+        for value, state in zip(run.at(near), saved, strict=True):
             assert np.abs(value - state).max() < 1e-14
 
 

@@ -121,11 +121,11 @@ def test_derivatives_of_a_step_by_all_arguments(form):
     assert_allclose(made.jacobian(Q, P, H, T0), found[:4, :4], rtol=0, atol=1e-15)
     assert_allclose(made.jvp(Q, P, H, T0, tangents=np.eye(4)).T, found[:4, :4], rtol=0, atol=1e-15)
     assert_allclose(made.vjp(Q, P, H, T0, cotangents=np.eye(4)), found[:4, :4], rtol=0, atol=1e-14)
-    held = made.jacobian(Q, P, H, T0, {"E": made.energy(Q, P)})
+    projected = made.jacobian(Q, P, H, T0, {"E": made.energy(Q, P)})
     if is_symplectic(FORMS[form][1], FORMS[form][0]):
         omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
-        assert np.abs(held.T @ omega @ held - omega).max() < 1e-14
-    assert np.abs(found[:4, :4] - held).max() > 1e-4
+        assert np.abs(projected.T @ omega @ projected - omega).max() < 1e-14
+    assert np.abs(found[:4, :4] - projected).max() > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -150,12 +150,12 @@ def test_steps_are_symplectic_with_time_and_its_momentum(form):
     run = made.integrate(Q, P, h=H, steps=10)
     level = made._energy_gradient(Q, P, run.parameters)
     found = run.sensitivity()
-    held = found.state[-1] - np.outer(found.parameters[-1, :, -1], level[:4])
+    projected = found.state[-1] - np.outer(found.parameters[-1, :, -1], level[:4])
     times = found.times.state[-1] - found.times.parameters[-1, -1] * level[:4]
     by_energy = np.append(found.parameters[-1, :, -1], found.times.parameters[-1, -1])
     order = [0, 1, 4, 2, 3, 5]  # q, t, p, -E
     whole = np.eye(6)
-    whole[:4, :4], whole[4, :4], whole[:4, 5], whole[4, 5] = held, times, -by_energy[:4], -by_energy[4]
+    whole[:4, :4], whole[4, :4], whole[:4, 5], whole[4, 5] = projected, times, -by_energy[:4], -by_energy[4]
     whole = whole[np.ix_(order, order)]
     omega = np.kron([[0, 1], [-1, 0]], np.eye(3))
     assert np.abs(whole.T @ omega @ whole - omega).max() < 1e-13 * np.abs(whole).max() ** 2

@@ -52,7 +52,7 @@ def reference(u, w, t_end):
     return state
 
 
-def held(t, inner):
+def zero_order_hold(t, inner):
     return VALUES[np.searchsorted(KNOTS, inner, side="right") - 1]
 
 
@@ -61,7 +61,8 @@ def sloped(t, inner):
 
 
 @pytest.mark.parametrize(
-    ("kind", "exact"), [("constant", held), ("linear", sloped), ("cubic", lambda t, _: CubicSpline(KNOTS, VALUES)(t))]
+    ("kind", "exact"),
+    [("constant", zero_order_hold), ("linear", sloped), ("cubic", lambda t, _: CubicSpline(KNOTS, VALUES)(t))],
 )
 @pytest.mark.parametrize("method", [SVI(2), StoermerVerlet(), Gauss(3)], ids=lambda method: method.name)
 def test_order_is_preserved_across_breakpoints(pendulum, kind, exact, method):
@@ -141,21 +142,21 @@ def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
     """Nothing but what is kept depends on it: states between, work and iterations are those of all states."""
     stepper = compile_stepper(pendulum, SVI(3))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
-    told = []
-    full = stepper.integrate([0.3], [0.1], **given, progress=told.append)
-    assert told[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
-    assert told == sorted(told)
+    reported = []
+    full = stepper.integrate([0.3], [0.1], **given, progress=reported.append)
+    assert reported[-1] == full.steps == sum(map(len, full.pieces)) - len(full.pieces)
+    assert reported == sorted(reported)
     fewer = stepper.integrate([0.3], [0.1], **given, save_every=3)
     assert {0.0, *KNOTS[1:5][KNOTS[1:5] <= t_end].tolist(), t_end} <= set(np.round(fewer.t, 14))
     assert len(fewer) < len(full) / 1.5
-    kept = np.isin(full.t, fewer.t)
-    assert kept.sum() == len(fewer)
-    assert (fewer.q == full.q[kept]).all()
+    saved = np.isin(full.t, fewer.t)
+    assert saved.sum() == len(fewer)
+    assert (fewer.q == full.q[saved]).all()
     assert_allclose(fewer.at(full.t)[0], full.q, atol=1e-13)
-    assert_allclose(fewer.work(), full.work()[kept], atol=1e-13)
+    assert_allclose(fewer.work(), full.work()[saved], atol=1e-13)
     watched = stepper.integrate([0.3], [0.1], **given, save_every=3, events="q")
     assert (watched.iterations == fewer.iterations).all()
-    assert (np.diff(np.cumsum(full.iterations)[kept]) == fewer.iterations[1:]).all()
+    assert (np.diff(np.cumsum(full.iterations)[saved]) == fewer.iterations[1:]).all()
     assert len(stepper.integrate([0.3], [0.1], **{**given, "t_end": 0.0})) == 1
     with pytest.raises(StateError, match=r"t = 3 is outside the trajectory from t = 0 to 2\."):
         full.at(3.0)
@@ -198,7 +199,7 @@ def test_momentum_maps_with_inputs():
 
 
 @pytest.mark.parametrize(
-    ("inputs", "said"),
+    ("inputs", "message"),
     [
         ({"u": (KNOTS, VALUES)}, "the input 'w' is not set"),
         ({"u": (KNOTS, VALUES), "w": (KNOTS, VALUES), "z": 1.0}, "'z' is not an input"),
@@ -217,8 +218,8 @@ def test_momentum_maps_with_inputs():
         ({"u": PPoly([[1.0, 2.0]], [3.0, 1.0, 0.0]), "w": (KNOTS, VALUES)}, "must be ascending: 1 follows 3"),
     ],
 )
-def test_invalid_inputs_are_rejected(pendulum, inputs, said):
-    with pytest.raises(StateError, match=said):
+def test_invalid_inputs_are_rejected(pendulum, inputs, message):
+    with pytest.raises(StateError, match=message):
         compile_stepper(pendulum, SVI(2)).integrate([0.3], [0.0], inputs=inputs, h=0.1, t_end=2.3)
 
 
@@ -246,7 +247,7 @@ def test_spline_coefficients_are_not_parameters(pendulum):
 
 
 @pytest.mark.parametrize(
-    ("parameters", "inputs", "said"),
+    ("parameters", "inputs", "message"),
     [
         ({"u_0": 5.0}, ["u"], "both a parameter and a component of the input 'u'"),
         ({"u": 5.0}, ["u"], "'u' is listed twice"),
@@ -254,7 +255,7 @@ def test_spline_coefficients_are_not_parameters(pendulum):
         ({}, ["u", "q_dot"], "the velocity of 'q'"),
     ],
 )
-def test_names_of_inputs_are_unique(parameters, inputs, said):
+def test_names_of_inputs_are_unique(parameters, inputs, message):
     given = {"name": "s", "parameters": parameters, "inputs": inputs}
     v, u = sympy.symbols("q_dot u")
     for build in (
@@ -262,7 +263,7 @@ def test_names_of_inputs_are_unique(parameters, inputs, said):
         lambda: LagrangianSystem.from_sympy(coordinates=[sympy.Symbol("q")], lagrangian=v**2 / 2 + u, **given),
         lambda: HamiltonianSystem.from_text(coordinates=["q"], hamiltonian="p_q**2/2 + u", **given),
     ):
-        with pytest.raises(SystemDefinitionError, match=said):
+        with pytest.raises(SystemDefinitionError, match=message):
             build()
 
 
@@ -274,8 +275,8 @@ def test_runs_with_inputs_have_finite_ends_and_valid_names(pendulum):
         stepper.start([0.3], [0.0], h=0.1).set_inputs(v=1.0)
     with pytest.raises(StateError, match="input u must be real numbers, not None"):
         stepper.start([0.3], [0.0], h=0.1).set_inputs(u=None)
-    for steps, said in ((-1, "at least 0"), (2.5, "whole number"), ("3", "whole number")):
-        with pytest.raises(StateError, match=f"steps must be .*{said}"):
+    for steps, message in ((-1, "at least 0"), (2.5, "whole number"), ("3", "whole number")):
+        with pytest.raises(StateError, match=f"steps must be .*{message}"):
             stepper.start([0.3], [0.0], h=0.1, parameters={"u_0": 0.0, "w_0": 0.0}).advance(steps)
     with pytest.raises(SystemDefinitionError, match="q"):
         LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian="q_dot**2/2 + q", inputs=["q"])
@@ -363,7 +364,7 @@ def test_inputs_of_a_hamiltonian(pendulum):
     """In text and from SymPy, in H and in forces: as of the Lagrangian of the same motion."""
     data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     expected = compile_stepper(pendulum, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
-    told = HamiltonianSystem.from_text(
+    reported = HamiltonianSystem.from_text(
         name="pushed pendulum",
         coordinates=["q"],
         momenta=["p"],
@@ -382,8 +383,8 @@ def test_inputs_of_a_hamiltonian(pendulum):
         forces={q: u - c * p},
         inputs=[u, w],
     )
-    assert told == taken
-    found = compile_stepper(told, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
+    assert reported == taken
+    found = compile_stepper(reported, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     assert_allclose(found.q, expected.q, atol=1e-13)
 
 

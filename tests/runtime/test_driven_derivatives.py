@@ -83,17 +83,17 @@ def test_tangent_vectors_are_propagated_across_segments(stepper):
 def test_the_hessian_is_the_derivative_of_the_gradient(stepper):
     run = run_from(stepper, START)
     rng = np.random.default_rng(2)
-    weights, bends = rng.normal(size=(len(run), 2)), rng.normal(size=(len(run), 2, 2))
-    bends = bends + bends.transpose(0, 2, 1)
+    weights, hessians = rng.normal(size=(len(run), 2)), rng.normal(size=(len(run), 2, 2))
+    hessians = hessians + hessians.transpose(0, 2, 1)
 
     def gradient(x):
         other = run_from(stepper, x)
-        return by_start(other.pullback(weights + np.einsum("nij,nj->ni", bends, states_of(other))), stepper)
+        return by_start(other.pullback(weights + np.einsum("nij,nj->ni", hessians, states_of(other))), stepper)
 
     directions = np.zeros((stepper._input_size, 4))
     directions[[0, 1, *(2 + stepper.parameters.index(name) for name in ("c", "l"))], range(4)] = 1.0
-    partials = weights + np.einsum("nij,nj->ni", bends, states_of(run))
-    product = run.hessian_product(partials, directions, bends)
+    partials = weights + np.einsum("nij,nj->ni", hessians, states_of(run))
+    product = run.hessian_product(partials, directions, hessians)
     found = by_start(product, stepper)
     expected = derivative(gradient, START)
     assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())

@@ -47,7 +47,7 @@ def of_one(inputs, j):
     }
 
 
-def check_against_drive(stepper, start, inputs, tolerance, **given):
+def check_against_integrate(stepper, start, inputs, tolerance, **given):
     """Times equal those of single runs, states to round-off."""
     _, c = own_values()
     runs = stepper.integrate_ensemble(*start, inputs=inputs, parameters={"c": c}, **given)
@@ -73,8 +73,8 @@ def test_each_trajectory_equals_integrate(pendulum, method, kind):
     stepper = compile_stepper(pendulum, method)
     assert stepper.ensemble is not None
     inputs = {"u": (KNOTS, own_values()[0], kind), "w": ([0.0, 3.0], [0.0, 0.3])}
-    check_against_drive(stepper, starts(1), inputs, 2e-15, h=0.1, t_end=2.3)
-    check_against_drive(stepper, starts(1), inputs, 2e-15, h=-0.1, t=2.55, t_end=0.02, save_every=3)
+    check_against_integrate(stepper, starts(1), inputs, 2e-15, h=0.1, t_end=2.3)
+    check_against_integrate(stepper, starts(1), inputs, 2e-15, h=-0.1, t=2.55, t_end=0.02, save_every=3)
 
 
 @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")
@@ -83,14 +83,14 @@ def test_other_iterations_restart_after_a_shorter_step(coupled):
     assert stepper.ensemble is not None
     assert "_NEEDS_VELOCITIES = 1" in stepper.ensemble.header
     inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
-    check_against_drive(stepper, starts(2), inputs, 2e-14, h=0.05, t_end=2.3)
+    check_against_integrate(stepper, starts(2), inputs, 2e-14, h=0.05, t_end=2.3)
 
 
 def test_methods_without_lanes_are_bitwise_equal(pendulum):
     stepper = compile_stepper(pendulum, SCVI(2), solver="newton")
     assert stepper.ensemble is None
     inputs = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}
-    check_against_drive(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, save_every=4)
+    check_against_integrate(stepper, starts(1), inputs, 0.0, h=0.02, t_end=2.3, save_every=4)
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
@@ -186,11 +186,11 @@ def test_lane_with_failed_iteration_continues_as_scalar_across_breakpoints():
 
 def test_threads_chunks_and_save_every_do_not_change_results(pendulum):
     stepper = compile_stepper(pendulum, SVI(3))
-    inputs, told = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
+    inputs, reported = {"u": (KNOTS, own_values()[0]), "w": ([0.0, 3.0], [0.0, 0.3])}, []
     given = {"inputs": inputs, "h": 0.001, "t_end": 2.3}
-    full = stepper.integrate_ensemble(*starts(1), **given, progress=told.append)
+    full = stepper.integrate_ensemble(*starts(1), **given, progress=reported.append)
     fewer = stepper.integrate_ensemble(*starts(1), **given, save_every=100, threads=1)
-    assert told[-1] == full.steps[0]
+    assert reported[-1] == full.steps[0]
     rows = np.isin(full.t, fewer.t)
     assert rows.sum() == len(fewer.t) == 24 + 3  # breakpoints that fall between hundreds of steps
     assert (full.q[rows] == fewer.q).all()
@@ -211,7 +211,7 @@ def test_files_contain_the_energies_of_each_segment(pendulum, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             {"inputs": {"u": (KNOTS, np.tile(VALUES, (COUNT - 1, 1))), "w": (KNOTS, VALUES)}},
@@ -225,9 +225,9 @@ def test_files_contain_the_energies_of_each_segment(pendulum, tmp_path):
         ({"h": 0.0}, "h"),
     ],
 )
-def test_invalid_arguments_are_rejected(pendulum, change, said):
+def test_invalid_arguments_are_rejected(pendulum, change, message):
     given = {"inputs": {"u": (KNOTS, VALUES), "w": (KNOTS, VALUES)}, "h": 0.1, "t_end": 2.3} | change
-    with pytest.raises(StateError, match=said):
+    with pytest.raises(StateError, match=message):
         compile_stepper(pendulum, SVI(3)).integrate_ensemble(*starts(1), **given)
 
 

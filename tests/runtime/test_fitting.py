@@ -111,8 +111,8 @@ def test_several_quantities_with_gaps_and_individual_noise():
     assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()
     assert np.isnan(found.residuals[::7, 0]).all()
     assert found.deviations.tolist() == sizes
-    held = fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
-    assert held.values[2] == pytest.approx(0.25, abs=1e-6)
+    bounded = fit(oscillator(), TIMES, both[:, 0], bounds={"delta": (0.25, 0.5)}, unknown=SOME, **GUESS)
+    assert bounded.values[2] == pytest.approx(0.25, abs=1e-6)
 
 
 def test_fit_with_known_start_and_tabulated_inputs():
@@ -373,11 +373,11 @@ def test_least_squares_with_equality_constraints_and_bounds():
         partials, found, rows = rng.normal(size=(9, 5)), rng.normal(size=9), 7
         low, high = np.full(5, -np.inf), np.full(5, np.inf)
         low[:3], high[:3] = -rng.uniform(0.01, 0.2, 3), rng.uniform(0.01, 0.2, 3)
-        update, _, held = _bounded_update(partials, found, rows, (low, high))
+        update, _, bounded = _bounded_update(partials, found, rows, (low, high))
         assert np.abs(partials[rows:] @ update + found[rows:]).max() < 1e-12
         assert (low <= update).all()
         assert (update <= high).all()
-        assert ((update == low) | (update == high))[held].all()
+        assert ((update == low) | (update == high))[bounded].all()
         best = np.inf
         for choice in product((None, low, high), repeat=3):
             fixed = np.array([k for k, bound in enumerate(choice) if bound is not None], dtype=int)

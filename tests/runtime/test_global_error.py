@@ -302,9 +302,9 @@ class TestChaos:
     def test_confirmed_digits_are_correct(self, burrau_stepper):
         q, p = PYTHAGOREAN
         run = burrau_stepper.integrate(q, p, t_end=70.0, error=1e-6)
-        kept = np.append(np.flatnonzero(run.t <= run.confirmed_until)[::10], len(run) - 1)
-        exact = integrated(burrau, [*q, *p], run.t[kept])
-        apart = np.linalg.norm(exact[:, :6] - run.q[kept], axis=1)
+        saved = np.append(np.flatnonzero(run.t <= run.confirmed_until)[::10], len(run) - 1)
+        exact = integrated(burrau, [*q, *p], run.t[saved])
+        apart = np.linalg.norm(exact[:, :6] - run.q[saved], axis=1)
         assert apart[:-1].max() <= 1e-6 * np.linalg.norm(q)
         assert apart[-1] <= run.global_error * np.linalg.norm(run.q[-1])
 
@@ -394,16 +394,16 @@ class TestOtherRuns:
         assert ended.confirmed_until == ended.t[-1] < 50.0
         exact = on_an_ellipse(start["q"], start["p"], [0.0, *ended.t[1:]])
         assert np.abs(exact[:, :2] - ended.q).max() <= 1.6 * ended.global_error
-        kept = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, save_every=10)
-        assert len(kept) == -(-kept.steps // 10) + 1
-        assert kept.global_error <= 1e-9
+        saved = kepler_stepper.integrate(**start, t_end=50.0, error=1e-9, save_every=10)
+        assert len(saved) == -(-saved.steps // 10) + 1
+        assert saved.global_error <= 1e-9
 
     def test_constraints_agree_with_an_angle(self):
         """A pendulum held by x^2 + y^2 = 1 and one that has no other coordinate than its angle."""
-        held = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
+        constrained = made("h", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - y", constraints=["x**2 + y**2 = 1"])
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            run = sc.compile_stepper(held, sc.SVI(6, "gauss-lobatto:7")).integrate(
+            run = sc.compile_stepper(constrained, sc.SVI(6, "gauss-lobatto:7")).integrate(
                 [1.0, 0.0], [0.0, 0.4], t_end=10.0, error=1e-8
             )
         exact = integrated(lambda t, y: np.array([y[1], -np.cos(y[0])]), [0.0, 0.4], run.t)[:, 0]
@@ -500,16 +500,18 @@ def loaded(path):
 class TestCommandLine:
     def test_text_and_json_agree_with_the_states(self, tmp_path):
         words = ["run", "kepler", "--span", "20", "--error", "1e-9", "-o", str(tmp_path / "orbit.npz")]
-        told = CliRunner().invoke(main, words)
+        outcome = CliRunner().invoke(main, words)
         document = json.loads(CliRunner().invoke(main, [*words, "--json"]).stdout)
-        found, kept = document["global_error"], loaded(tmp_path / "orbit.npz")
-        exact = on_an_ellipse(kept["q"][0], kept["p"][0], kept["t"])
-        size = np.linalg.norm(kept["q"], axis=1).max()
-        assert told.exit_code == 0
-        assert f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in told.output
-        assert np.linalg.norm(exact[:, :2] - kept["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
+        found, saved = document["global_error"], loaded(tmp_path / "orbit.npz")
+        exact = on_an_ellipse(saved["q"][0], saved["p"][0], saved["t"])
+        size = np.linalg.norm(saved["q"], axis=1).max()
+        assert outcome.exit_code == 0
+        assert (
+            f"global error: estimated at {found['estimate']:.1e} (relative) from {found['runs']} runs" in outcome.output
+        )
+        assert np.linalg.norm(exact[:, :2] - saved["q"], axis=1).max() / size <= found["estimate"] <= 1e-9
         assert found["digits"] == math.floor(-math.log10(found["estimate"])) >= 9
-        assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, kept["t"][-1])
+        assert (found["requested"], found["confirmed"], found["confirmed_until"]) == (1e-9, True, saved["t"][-1])
 
     def test_unconfirmed_result_exits_with_1(self):
         result = CliRunner().invoke(main, ["run", "double-pendulum", "--span", "40", "--error", "1e-9"])
@@ -527,11 +529,11 @@ class TestCommandLine:
         stepper = model.stepper()
         run = stepper.integrate(model.q, model.momenta(stepper), t_end=20.0, error=1e-9)
         folder = sc.load_run(output) if where == "folder" else None
-        kept = {name: getattr(folder, name) for name in "tqp"} if folder else loaded(output)
+        saved = {name: getattr(folder, name) for name in "tqp"} if folder else loaded(output)
         assert document["global_error"]["estimate"] == run.global_error
-        assert np.array_equal(kept["t"], run.t)
-        assert np.array_equal(kept["q"], run.q)
-        assert np.array_equal(kept["p"], run.p)
+        assert np.array_equal(saved["t"], run.t)
+        assert np.array_equal(saved["q"], run.q)
+        assert np.array_equal(saved["p"], run.p)
 
     def test_unconfirmed_recorded_run_exits_with_1(self, tmp_path):
         words = ["run", "double-pendulum", "--span", "40", "--error", "1e-9", "-o", str(tmp_path / "d.run")]
@@ -556,8 +558,8 @@ class TestCommandLine:
         assert found[0] == found[1]
         assert found[0]["confirmed"]
         assert found[0]["estimate"] == run.global_error <= 1e-8
-        kept = loaded(output)
-        assert any(np.array_equal(kept[name], run.q["q"]) for name in kept)
+        saved = loaded(output)
+        assert any(np.array_equal(saved[name], run.q["q"]) for name in saved)
         path.write_text(self.ARRAYS.format(span=200.0, q=[2.5, -1.0, 1.0]))
         result = CliRunner().invoke(main, ["run", str(path)])
         assert result.exit_code == 1

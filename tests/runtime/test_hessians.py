@@ -43,18 +43,18 @@ def stacked(gradient):
 def square(count, seed=0):
     """Weights w and symmetric matrices C of F = sum w . x + x . C x / 2 of so many states."""
     rng = np.random.default_rng(seed)
-    weights, bends = rng.normal(size=(count, 2)), rng.normal(size=(count, 2, 2))
-    return weights, bends + bends.transpose(0, 2, 1)
+    weights, hessians = rng.normal(size=(count, 2)), rng.normal(size=(count, 2, 2))
+    return weights, hessians + hessians.transpose(0, 2, 1)
 
 
 @pytest.mark.parametrize("save_every", [1, 12])
 def test_hessian_of_a_function_of_all_states(stepper, save_every):
     """Against differences of exact gradients, of fourth order; also where steps between are taken again."""
     run = run_from(stepper, START, save_every=save_every)
-    weights, bends = square(len(run))
+    weights, hessians = square(len(run))
 
     def partials(run):
-        return weights + np.einsum("nij,nj->ni", bends, states_of(run))
+        return weights + np.einsum("nij,nj->ni", hessians, states_of(run))
 
     columns = []
     for unit in np.eye(len(START)):
@@ -64,11 +64,11 @@ def test_hessian_of_a_function_of_all_states(stepper, save_every):
         ]
         columns.append((8 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / 12e-4)
     expected = np.array(columns).T
-    product = run.hessian_product(partials(run), np.eye(stepper._input_size), bends)
+    product = run.hessian_product(partials(run), np.eye(stepper._input_size), hessians)
     found = np.vstack([product.q, product.p, product.parameters, product.t, product.h])
     assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     assert_allclose(found, found.T, atol=1e-13 * np.abs(found).max())
-    one = run.hessian_product(partials(run), [0.5, -2.0], bends)
+    one = run.hessian_product(partials(run), [0.5, -2.0], hessians)
     assert_allclose(stacked(one), found[:, :2] @ [0.5, -2.0], rtol=1e-11, atol=1e-11)
 
 
@@ -78,10 +78,10 @@ def test_hessian_of_a_function_of_all_states(stepper, save_every):
 def test_hessian_is_the_derivative_of_the_gradient(stepper, options):
     """As a symmetric form: v . H w = w . H v, and as the change of all states along two directions."""
     run = run_from(stepper, START, **options)
-    weights, bends = square(len(run), 1)
+    weights, hessians = square(len(run), 1)
     v, w = np.random.default_rng(2).normal(size=(2, stepper._input_size))
     v[-1] = w[-1] = 0.0  # the lengths are held
-    both = run.hessian_product(weights, np.stack([v, w], axis=1), bends)
+    both = run.hessian_product(weights, np.stack([v, w], axis=1), hessians)
     found = np.concatenate([both.q, both.p, both.parameters, both.t[np.newaxis]])
     assert v[:-1] @ found[:, 1] == pytest.approx(w[:-1] @ found[:, 0], rel=1e-11)
 
@@ -89,24 +89,24 @@ def test_hessian_is_the_derivative_of_the_gradient(stepper, options):
 def test_many_directions_equal_single_directions(stepper):
     """More of them than are taken through a step at once."""
     run = run_from(stepper, START)
-    weights, bends = square(len(run), 3)
+    weights, hessians = square(len(run), 3)
     directions = np.random.default_rng(4).normal(size=(stepper._input_size, 19))
-    many = run.hessian_product(weights, directions, bends)
+    many = run.hessian_product(weights, directions, hessians)
     names = ("q", "p", "parameters", "t", "h")
     for k in range(directions.shape[1]):
-        alone = run.hessian_product(weights, directions[:, k], bends)
+        alone = run.hessian_product(weights, directions[:, k], hessians)
         for name in names:
             assert_allclose(np.asarray(getattr(many, name))[..., k], getattr(alone, name), rtol=1e-12, atol=1e-12)
 
 
 def test_hessian_of_a_long_run_equals_that_of_its_segments(stepper):
     """More steps than are linearised at a time, with all states and with few."""
-    weights, bends = square(2501, 3)
+    weights, hessians = square(2501, 3)
     weights[np.arange(2501) % 500 > 0] = 0.0
-    bends[np.arange(2501) % 500 > 0] = 0.0
+    hessians[np.arange(2501) % 500 > 0] = 0.0
     whole, some = run_from(stepper, START, steps=2500), run_from(stepper, START, steps=2500, save_every=500)
-    expected = stacked(whole.hessian_product(weights, [1.0, 0.5], bends))
-    found = stacked(some.hessian_product(weights[::500], [1.0, 0.5], bends[::500]))
+    expected = stacked(whole.hessian_product(weights, [1.0, 0.5], hessians))
+    found = stacked(some.hessian_product(weights[::500], [1.0, 0.5], hessians[::500]))
     assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
 
 
@@ -115,10 +115,10 @@ def test_hessian_of_the_energy_at_the_end_equals_that_at_the_start():
     stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
     m, length, g = stepper.defaults
-    partials, bends = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
+    partials, hessians = np.zeros((len(run), 2)), np.zeros((len(run), 2, 2))
     partials[-1] = m * g * length * np.sin(run.q[-1, 0]), run.p[-1, 0] / (m * length**2)
-    bends[-1] = np.diag([m * g * length * np.cos(run.q[-1, 0]), 1 / (m * length**2)])
-    found = run.hessian_product(partials, np.eye(2), bends)
+    hessians[-1] = np.diag([m * g * length * np.cos(run.q[-1, 0]), 1 / (m * length**2)])
+    found = run.hessian_product(partials, np.eye(2), hessians)
     assert_allclose(found.q, [[m * g * length * np.cos(2.0), 0.0]], atol=1e-7)
     assert_allclose(found.p, [[0.0, 1 / (m * length**2)]], atol=1e-7)
 
@@ -139,9 +139,9 @@ def test_pickled_stepper_retains_second_derivatives(stepper):
 
 def test_a_run_without_steps_has_the_hessian_of_the_function(stepper):
     run = run_from(stepper, START, steps=0)
-    _, bends = square(1)
-    found = run.hessian_product(np.ones((1, 2)), np.eye(2), bends)
-    assert_allclose(np.concatenate([found.q, found.p]), bends[0])
+    _, hessians = square(1)
+    found = run.hessian_product(np.ones((1, 2)), np.eye(2), hessians)
+    assert_allclose(np.concatenate([found.q, found.p]), hessians[0])
 
 
 def test_systems_without_a_hessian_are_rejected(stepper):

@@ -35,9 +35,9 @@ def random(*shape: int) -> Any:
     return np.random.default_rng(7).normal(size=shape)
 
 
-def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **beside: Any) -> Case:
+def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **extra: Any) -> Case:
     """A system of one array."""
-    declared = {key: beside.pop(key) for key in ("declared", "places") if key in beside}
+    declared = {key: extra.pop(key) for key in ("declared", "places") if key in extra}
     system = sc.IndexedSystem.from_text(
         name="case",
         coordinates=[coordinates],
@@ -45,7 +45,7 @@ def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **b
         parameters=declared.get("declared"),
         tables=declared.get("places", ()),
     )
-    return Case(system, q, velocity, h, **beside)
+    return Case(system, q, velocity, h, **extra)
 
 
 CASES = {
@@ -191,12 +191,12 @@ def test_energy_does_not_drift() -> None:
 @pytest.mark.parametrize("method", ["svi:2", "stoermer-verlet"])
 def test_energy_has_the_terms_without_coordinates(method: str) -> None:
     """Terms of parameters, fields and time, of one sum or two, as of the system written out; they are no forces."""
-    beside = "3*sin(t) + a**2 + sum(i in N, a*f[i]*cos(t)) - sum(i in N, j in N, f[i]*f[j]) + sum(i in 0..N-2, 7*a)"
+    extra = "3*sin(t) + a**2 + sum(i in N, a*f[i]*cos(t)) - sum(i in N, j in N, f[i]*f[j]) + sum(i in 0..N-2, 7*a)"
     system = sc.IndexedSystem.from_text(
         name="level",
         coordinates=["q[N]"],
         parameters={"a": 2, "f[N]": 1},
-        lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2) + {beside}",
+        lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2) + {extra}",
     )
     written = sc.compile_stepper(sc.unroll_sums(system, {"N": 3}), method)
     f = {"f_0": 0.3, "f_1": -0.7, "f_2": 1.9}
@@ -289,13 +289,13 @@ def test_velocities_depend_on_masses() -> None:
 
 def test_table_with_one_column_may_be_a_list() -> None:
     """What is held in place, say."""
-    held = sc.IndexedSystem.from_text(
+    constrained = sc.IndexedSystem.from_text(
         name="held",
         coordinates=["q[N]"],
         tables=["pins[P, 1]"],
         lagrangian=f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)",
     )
-    stepper = sc.compile_indexed(held, "svi:4")
+    stepper = sc.compile_indexed(constrained, "svi:4")
     runs = [stepper.integrate(random(4), h=0.1, steps=5, tables={"pins": pins}) for pins in ([1, 3], [[1], [3]])]
     assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
     assert np.array_equal(runs[0].q["q"][-1, ::2], random(4)[::2])

@@ -244,7 +244,7 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("bonds", "lengths", "said"),
+    ("bonds", "lengths", "message"),
     [
         ([[0, 1], [1, 2], [0, 1]], [1, 1, 1.001], r"'constraint 3\[0\]' and 'constraint 3\[2\]' contradict each other"),
         ([[0, 1], [1, 2], [0, 1]], [1, 1, 1.0], r"'constraint 3\[0\]' and 'constraint 3\[2\]' are linearly dependent"),
@@ -252,9 +252,9 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     ],
     ids=["contradiction", "a rod twice", "a rod to itself"],
 )
-def test_unsatisfiable_constraints_are_rejected(stepper, bonds, lengths, said):
+def test_unsatisfiable_constraints_are_rejected(stepper, bonds, lengths, message):
     q = [[0.0, 0], [1, 0], [1, 1]]
-    with pytest.raises(StateError, match=said):
+    with pytest.raises(StateError, match=message):
         stepper.start(q, h=0.01, tables={"bonds": bonds, "pins": [0]}, parameters={"l": lengths}).advance(10)
 
 
@@ -268,7 +268,7 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("r[i, 0] = r_dot[i, 1] for i in N", "contains the velocity r_dot"),
         ("g = 1", "no coordinate"),
@@ -278,8 +278,8 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
         ("r[i, 0] = 1 for i in N x", "the end is expected"),
     ],
 )
-def test_invalid_constraints_are_rejected(text, said):
-    with pytest.raises(SystemDefinitionError, match=said):
+def test_invalid_constraints_are_rejected(text, message):
+    with pytest.raises(SystemDefinitionError, match=message):
         sc.IndexedSystem.from_text(
             name="x",
             coordinates=["r[N, 2]"],

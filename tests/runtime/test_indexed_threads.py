@@ -255,12 +255,12 @@ def test_forked_process_has_separate_threads() -> None:
 
 def test_failed_step_fails_in_all_threads() -> None:
     stepper = stepper_of("ring", "svi:4")
-    said = set()
+    message = set()
     for threads in THREADS:
         with pytest.raises(sc.StepFailedError) as caught:
             stepper.integrate(1e3 * start_of("ring"), h=1.0, steps=3, threads=threads)
-        said.add(str(caught.value))
-    assert len(said) == 1
+        message.add(str(caught.value))
+    assert len(message) == 1
 
 
 def test_invalid_thread_counts_are_rejected() -> None:

@@ -67,10 +67,10 @@ def test_unsuitable_time_transformation_is_detected_later() -> None:
 def test_invalid_tolerances_are_reported() -> None:
     assert accuracy_message(9e-16, 1.0, 0.0) is None
     assert accuracy_message(float("nan"), 1.0, 0.0) is not None
-    said = accuracy_message(1e-3, 1.5, 1e-9)
-    assert said is not None
-    assert "t = 1.5" in said
-    assert "1.0e-03, but 1.0e-09 was requested" in said
+    message = accuracy_message(1e-3, 1.5, 1e-9)
+    assert message is not None
+    assert "t = 1.5" in message
+    assert "1.0e-03, but 1.0e-09 was requested" in message
 
 
 def test_systems_without_a_largest_step_are_rejected() -> None:

@@ -105,8 +105,8 @@ class Begun:
         if system is rod:  # at rest beside each other along y, where w is 0
             self.q, self.p = np.array([0.25, 1.25, 2.0, 0.0]), np.array([1.9, 0.95, -0.7, 0.4])
             self.masses = (*MASSES, 0.0)
-        beside = {"parameters": {"m": np.array(MASSES)}} if self.array else {}
-        self.run = self.stepper.start(self.q, self.p, h=H, t=1 / 3, **beside)
+        extra = {"parameters": {"m": np.array(MASSES)}} if self.array else {}
+        self.run = self.stepper.start(self.q, self.p, h=H, t=1 / 3, **extra)
         low_q, low_p = (np.spacing(x[:3]) * LOW for x in (self.q, self.p))
         carries = self.words()[2:]
         carries[0][:3], carries[1][:3] = low_q, low_p
@@ -259,8 +259,8 @@ def test_work_is_the_sum_over_steps() -> None:
     size = max(map(abs, given))
     for n in (1, 150, 300):
         assert abs(run.work()[n] - math.fsum(given[:n])) < 2.0**-52 * math.sqrt(n) * 30 * size
-    kept = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300, save_every=30)
-    assert np.abs(kept.work() - run.work()[::30]).max() < 1e-14
+    saved_states = stepper.integrate([0.3], [0.4], h=0.01, t=0.7, steps=300, save_every=30)
+    assert np.abs(saved_states.work() - run.work()[::30]).max() < 1e-14
 
 
 BY_DESIGN = ("Newton", "rattle", "lobatto")
@@ -275,11 +275,11 @@ def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
         own = Begun(name)
         long = [np.cos(np.arange(len(x))) / 1024 for x in (own.q, own.p)]
         q, p = (x + part if whole else x for x, part in zip((own.q, own.p), long, strict=True))
-        beside = {"parameters": {"m": np.array(MASSES)}} if own.array else {}
-        own.run = own.stepper.start(q, p, h=1 / 16, **beside)
+        extra = {"parameters": {"m": np.array(MASSES)}} if own.array else {}
+        own.run = own.stepper.start(q, p, h=1 / 16, **extra)
         if own.array:
-            for kept, part in zip(own.words()[2:], long, strict=True):
-                kept[:] = 0.0 if whole else part
+            for saved_states, part in zip(own.words()[2:], long, strict=True):
+                saved_states[:] = 0.0 if whole else part
         elif not whole:
             own.run._resume_at(0, (0.0, 0.0), tuple(long))
         own.run.advance(1)

@@ -31,7 +31,7 @@ def arrays() -> sc.IndexedStepper:
     return sc.compile_indexed(system, "svi:2", flags=QUICK_FLAGS)
 
 
-class Held:
+class Holder:
     """A second thread that holds a run until the test has tried to enter it."""
 
     def __init__(self, run: Any, hold: Callable[[Callable[[], None]], Any]) -> None:
@@ -50,7 +50,7 @@ class Held:
         self.inside.set()
         assert self.leave.wait(30.0)
 
-    def __enter__(self) -> Held:
+    def __enter__(self) -> Holder:
         self.thread.start()
         assert self.inside.wait(30.0)
         return self
@@ -81,7 +81,7 @@ def check_refused(run: Any) -> None:
 
 def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
-    with Held(run, lambda wait: run.record(10, progress=lambda _: wait())):
+    with Holder(run, lambda wait: run.record(10, progress=lambda _: wait())):
         check_refused(run)
     assert run.steps == 10
     for enter in entries(run).values():  # afterwards it is free
@@ -90,7 +90,7 @@ def test_recorded_scalar_run_belongs_to_one_thread(stepper: sc.Stepper) -> None:
 
 def test_advancing_array_run_belongs_to_one_thread(arrays: sc.IndexedStepper) -> None:
     run = arrays.start([1.0, 0.5], h=0.1)
-    with Held(run, lambda wait: run.advance(1, progress=lambda _: wait())):
+    with Holder(run, lambda wait: run.advance(1, progress=lambda _: wait())):
         check_refused(run)
     assert run.steps == 1
     for enter in entries(run).values():
@@ -99,7 +99,7 @@ def test_advancing_array_run_belongs_to_one_thread(arrays: sc.IndexedStepper) ->
 
 def test_run_recorded_into_a_folder_belongs_to_one_thread(stepper: sc.Stepper, tmp_path: Any) -> None:
     run = stepper.start([1.0], [0.0], h=0.1)
-    with Held(run, lambda wait: sc.record_run(run, tmp_path / "run", steps=10, progress=lambda _: wait())):
+    with Holder(run, lambda wait: sc.record_run(run, tmp_path / "run", steps=10, progress=lambda _: wait())):
         check_refused(run)
     assert len(sc.load_run(tmp_path / "run")) == 11
 

@@ -20,9 +20,9 @@ def stepper():
 
 def test_display_of_a_run_and_its_saved_states(stepper):
     run = stepper.start([1.0], [0.0], h=0.5)
-    kept = run.record(4)
+    saved = run.record(4)
     assert repr(run) == f"<Run {OF_FREE}; t = 2 after 4 steps of 0.5, solver fixed-point>"
-    assert repr(kept) == f"<Trajectory {OF_FREE}; 5 states from t = 0 to 2, 4 steps of 0.5>"
+    assert repr(saved) == f"<Trajectory {OF_FREE}; 5 states from t = 0 to 2, 4 steps of 0.5>"
     many = stepper.integrate_ensemble([[1.0], [2.0]], [[0.0], [0.0]], h=0.1, steps=3)
     assert repr(many).startswith("<EnsembleTrajectory of free, svi-2-gauss-legend..; 4 states of each of 2 ")
 
@@ -31,8 +31,8 @@ def test_display_of_adaptive_steps(stepper):
     run = stepper.start([1.0], [0.0], t_end=2.0)
     run.advance(1)
     assert repr(run).endswith("after 1 steps of adaptive size, t_end = 2, solver fixed-point>")
-    kept = stepper.integrate([1.0], [0.0], t_end=2.0)
-    assert repr(kept).endswith(f"{len(kept.t)} states from t = 0 to 2, {kept.steps} steps of adaptive size>")
+    saved = stepper.integrate([1.0], [0.0], t_end=2.0)
+    assert repr(saved).endswith(f"{len(saved.t)} states from t = 0 to 2, {saved.steps} steps of adaptive size>")
 
 
 def test_display_of_steps_in_tau():

@@ -115,10 +115,10 @@ def test_save_every_selects_states_of_the_same_run(kepler, save_every):
 
 
 def test_progress_receives_the_completed_steps(kepler):
-    told = []
-    kepler.integrate(*STATE, h=0.05, steps=3000, progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 3000
+    reported = []
+    kepler.integrate(*STATE, h=0.05, steps=3000, progress=reported.append)
+    assert reported == sorted(reported)
+    assert reported[-1] == 3000
 
 
 @pytest.mark.parametrize("method", SYMMETRIC, ids=lambda method: method.name)
@@ -296,13 +296,13 @@ def test_failing_run_returns_completed_states_and_ends_before_the_failing_step(c
     run = stepper.start(*state, h=0.05, options=SolverOptions(max_iterations=8))
     with pytest.raises(StepFailedError) as caught:
         run.record(400, save_every=2)
-    error, kept = caught.value, caught.value.trajectory
+    error, saved_states = caught.value, caught.value.trajectory
     assert 5 < error.step < 400
     assert error.step == run.steps
     assert error.t == run.t == pytest.approx(0.05 * error.step)
-    assert len(kept) == error.step // 2 + 1
+    assert len(saved_states) == error.step // 2 + 1
     again = stepper.integrate(*state, h=0.05, steps=error.step, save_every=2)
-    assert np.array_equal(kept.q, again.q)
+    assert np.array_equal(saved_states.q, again.q)
     before = run.checkpoint()
     with pytest.raises(StepFailedError) as repeated:
         run.record(1)

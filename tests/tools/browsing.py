@@ -73,9 +73,9 @@ def looked_at(browser: Any, size: str, scheme: str) -> Iterator[Any]:
     view = browser.new_page(color_scheme=scheme)
     phone = {"width": WIDTHS[size], "height": 844, "deviceScaleFactor": 2, "mobile": size == "phone"}
     view.context.new_cdp_session(view).send("Emulation.setDeviceMetricsOverride", phone)
-    view.asked, view.said, view.width = [], [], WIDTHS[size]
+    view.asked, view.console, view.width = [], [], WIDTHS[size]
     view.on("request", lambda request: view.asked.append(request.url))
-    view.on("console", lambda message: view.said.append(message.text))
+    view.on("console", lambda message: view.console.append(message.text))
     yield view
     view.close()
 
@@ -94,7 +94,7 @@ def opened(browser: Any, page: str, path: Path, size: str, scheme: str) -> Itera
 def assert_it_asks_for_nothing(view: Any) -> None:
     """No request leaves the page, and the browser complains of nothing."""
     assert [url for url in view.asked if not url.startswith("data:")] == [view.own]
-    assert view.said == []
+    assert view.console == []
 
 
 def assert_nothing_sticks_out(view: Any) -> None:

@@ -28,11 +28,11 @@ class Fmu:
 
 
 class Slave:
-    """An instance; calls give their status, ``said`` is what it logged."""
+    """An instance; calls give their status, ``log`` is what it logged."""
 
     def __init__(self, fmu: Fmu, *, token: bytes | None = None, events: bool = False, logging: bool = True) -> None:
-        self.fmu, self.said = fmu, []
-        self._log = LOG(lambda _, status, category, message: self.said.append((status, category, message.decode())))
+        self.fmu, self.log = fmu, []
+        self._log = LOG(lambda _, status, category, message: self.log.append((status, category, message.decode())))
         instantiate = fmu.library.fmi3InstantiateCoSimulation
         instantiate.restype = c_void_p
         token = fmu.token if token is None else token
@@ -61,7 +61,7 @@ class Slave:
 
     def get(self, *names: str) -> list[float]:
         values = (c_double * len(names))()
-        assert self._variables("GetFloat64", names, values) == OK, self.said
+        assert self._variables("GetFloat64", names, values) == OK, self.log
         return list(values)
 
     def _variables(self, call: str, names: object, values: ctypes.Array) -> int:
@@ -69,7 +69,7 @@ class Slave:
         count = c_size_t(len(references))
         return self.call(call, (c_uint32 * len(references))(*references), count, values, count)
 
-    def kept(self) -> c_void_p:
+    def saved_state(self) -> c_void_p:
         state = c_void_p()
         assert self.call("GetFMUState", byref(state)) == OK
         return state

@@ -16,7 +16,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["FRAGMENT", "RETIRED_NAMES", "RETIRED_PHRASES", "Text", "docstrings", "identifiers", "messages", "prose"]
+__all__ = [
+    "FRAGMENT",
+    "RETIRED_NAMES",
+    "RETIRED_NAMES_OF_TESTS",
+    "RETIRED_PHRASES",
+    "Text",
+    "docstrings",
+    "identifiers",
+    "is_retired_in_tests",
+    "messages",
+    "names_in_tests",
+    "prose",
+]
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAGMENT = re.compile(
@@ -56,6 +68,16 @@ RETIRED_NAMES = frozenset(
     )
 )
 """Words of identifiers that have a standard term; see the glossary of the documentation."""
+RETIRED_NAMES_OF_TESTS = RETIRED_NAMES | frozenset(
+    re.findall(
+        r"\w+",
+        "say says saying tell tells kept keeps stray strays beside stands lender borrows promised nobody anew nought "
+        "whatever however wherever aloud goes gone",
+    )
+)
+"""Words that are not used in the names of tests and of their variables, either."""
+FRAGMENT_OF_TEST = re.compile(r"test_(what|of|where|it|its|they|there|who|nor|so|these|those)_")
+"""Beginning of a test name that refers to something outside the name instead of a property."""
 
 
 class Text(NamedTuple):
@@ -158,10 +180,26 @@ def identifiers() -> Iterator[Text]:
             yield Text(path, code.count("\n", 0, found.start()) + 1, found[0])
 
 
+def names_in_tests() -> Iterator[Text]:
+    """Names of functions, classes, arguments and variables that are defined in the tests."""
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Name(id=name, ctx=ast.Store()) | ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                    yield Text(path, node.lineno, name)
+                case ast.arg(arg=name):
+                    yield Text(path, node.lineno, name)
+
+
 def words_of(identifier: str) -> set[str]:
     """Words of a name in snake case or camel case, in lower case, and the whole of it."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", identifier)
     return {word.lower() for word in spaced.split("_") if word} | {identifier.lower()}
+
+
+def is_retired_in_tests(name: str) -> bool:
+    """Return whether a name defined in the tests has a retired word, or begins as a fragment."""
+    return bool(words_of(name) & RETIRED_NAMES_OF_TESTS or FRAGMENT_OF_TEST.match(name))
 
 
 def main() -> None:
@@ -174,6 +212,7 @@ def main() -> None:
         retired = re.compile("|".join(RETIRED_PHRASES), re.IGNORECASE)
         found = [text._replace(text=hit[0]) for text in prose() for hit in retired.finditer(text.text)]
         found += [text for text in identifiers() if words_of(text.text) & RETIRED_NAMES]
+        found += [text for text in names_in_tests() if is_retired_in_tests(text.text)]
     for path, line, text in found:
         print(f"{path.relative_to(ROOT)}:{line}: {' '.join(text.split())}")
     print(f"{len(found)} in all")

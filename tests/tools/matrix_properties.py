@@ -255,10 +255,10 @@ def between(case: Case) -> None:
         return
     times = np.sort(times)[:: -1 if case.given.back else 1]
     plan = {"t_end": float(run.t[-1])} if case.kind in ("slowed", "reversible") else {}
-    kept = case.integrate(t_eval=times, **plan)
-    assert kept.t.tolist() == times.tolist()
-    near(kept.q, case.truth.q(times), case.error)
-    near(kept.energy(), case.truth.energy(times), 10 * case.error)
+    saved_states = case.integrate(t_eval=times, **plan)
+    assert saved_states.t.tolist() == times.tolist()
+    near(saved_states.q, case.truth.q(times), case.error)
+    near(saved_states.energy(), case.truth.energy(times), 10 * case.error)
 
 
 def _as_array(case: Case, text: str) -> str:
@@ -300,19 +300,19 @@ def failure(case: Case) -> None:
     parameters = case.parameters(values)
     with pytest.raises(StepFailedError) as error:
         case.integrate(parameters=parameters, steps=steps, h=h)
-    failed, kept = error.value, error.value.trajectory
+    failed, saved_states = error.value, error.value.trajectory
     assert failed.status == "not finite"
     last = float(Fraction(case.given.t) + 512 * Fraction(h))
     assert (failed.step, failed.t) == (512, last)
-    kept = as_rows(kept) if case.kind == "array" else kept
-    assert len(kept.t) == 512 // case.given.save_every + 1
+    saved_states = as_rows(saved_states) if case.kind == "array" else saved_states
+    assert len(saved_states.t) == 512 // case.given.save_every + 1
     motion = truth_of(case.problem).motion(case.given.t, last, case.problem.q, case.problem.x, values)
-    near(kept.q, motion.q(kept.t), 1e-6)
+    near(saved_states.q, motion.q(saved_states.t), 1e-6)
     if case.kind != "array":
         others = [{**parameters, STOP: case.given.t + (k + 0.5) * h} for k in (3, 300, 10**6)]
-        crowd = ensemble_of(case, others, steps=steps, h=h)
-        assert crowd.steps.tolist() == [3, 300, steps]
-        assert crowd.status.tolist() == ["not finite", "not finite", "ok"]
+        ensemble_run = ensemble_of(case, others, steps=steps, h=h)
+        assert ensemble_run.steps.tolist() == [3, 300, steps]
+        assert ensemble_run.status.tolist() == ["not finite", "not finite", "ok"]
 
 
 def ensemble_of(case: Case, parameters: list[dict[str, Any]], **more: Any) -> Any:
@@ -342,7 +342,7 @@ def ensembles(case: Case) -> None:
     others = _others(case, 10)
     plans = case.given.t + case.span * (1.0 + 0.02 * np.arange(10))
     ways: list[dict[str, Any]] = [{"h": case.h, "steps": STEPS}]
-    if case.kind in ("plain", "driven") and _tells_errors(case):
+    if case.kind in ("plain", "driven") and _estimates_errors(case):
         ways.append({"t_end": plans, "tolerance": 1e-11})
     for way in ways:
         found = ensemble_of(case, others, save_every=case.given.save_every, **way)
@@ -551,10 +551,10 @@ def flows(case: Case) -> None:
     m, binding = len(case.problem.q), flow.library
     row = np.array([*run.q[0], *run.p[0], *run.parameters, case.given.t, case.h])
     x = np.array([1.001 * row, row])  # the second of two rows is what is compared
-    kept, given = steps // save_every + 1, len(row)
+    saved_states, given = steps // save_every + 1, len(row)
     change, partials = (
         np.random.default_rng(5).normal(size=(2, given)),
-        np.random.default_rng(6).normal(size=(2, kept, 2 * m)),
+        np.random.default_rng(6).normal(size=(2, saved_states, 2 * m)),
     )
 
     def call(part: int, count: int, what: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -563,10 +563,10 @@ def flows(case: Case) -> None:
         assert binding.function("flow_rows")(part, steps, save_every, count, 2, *pointers, report) == 0
         return found[1]
 
-    states = call(0, 0, x, (kept, 2 * m))
+    states = call(0, 0, x, (saved_states, 2 * m))
     near(states, np.concatenate([run.q, run.p], axis=1), 1e-12)
     near(states[:, :m], case.motion_to(steps).q(run.t), 10 * case.error)
-    near(call(1, 1, change, (kept, 2 * m)), run.tangent(change[1]), 1e-9)
+    near(call(1, 1, change, (saved_states, 2 * m)), run.tangent(change[1]), 1e-9)
     pulled = run.pullback(partials[1])
     wanted = np.concatenate([pulled.q, pulled.p, pulled.parameters, [pulled.t, pulled.h]])
     near(call(2, 1, partials, (given,)), wanted, 1e-9)
@@ -586,7 +586,7 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "work_and_impulses": (
         work_and_impulses,
         lambda case: (
-            case.problem.work and _keeps_account(case) and (case.kind != "reversible" or case.given.save_every == 1)
+            case.problem.work and _conserves_balance(case) and (case.kind != "reversible" or case.given.save_every == 1)
         ),
     ),
     "between": (between, lambda case: True),
@@ -598,7 +598,7 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
     "changes": (changes, lambda case: case.kind in ("plain", "array") and not case.problem.text.get("constraints")),
     "controlled": (
         controlled,
-        lambda case: case.kind in ("plain", "array", "driven") and case.error < LOW and _tells_errors(case),
+        lambda case: case.kind in ("plain", "array", "driven") and case.error < LOW and _estimates_errors(case),
     ),
     "derivatives": (derivatives, lambda case: case.kind == "plain" and not case.problem.text.get("constraints")),
     "hessians": (
@@ -612,13 +612,13 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
 }
 
 
-def _keeps_account(case: Case) -> bool:
+def _conserves_balance(case: Case) -> bool:
     """Whether the text has Newton's iteration, by which steps are taken again, along a curve."""
     if case.problem.methods[case.method][1] == "fixed-point":
         return False
     return str(case.problem.methods[case.method][0]).startswith(("svi", "scvi", "gauss"))
 
 
-def _tells_errors(case: Case) -> bool:
+def _estimates_errors(case: Case) -> bool:
     """Whether steps choose their length: by a curve, and not of RATTLE."""
     return not isinstance(case.problem.methods[case.method][0], dict) and case.error < LOW

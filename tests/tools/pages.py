@@ -67,10 +67,10 @@ def run_command(command: str) -> None:
     assert result.returncode == 0, f"{command}\n{result.stdout}{result.stderr}"
 
 
-def agree(said: str, printed: str) -> None:
+def agree(message: str, printed: str) -> None:
     """Check equal words and equal numbers: to two units of the last printed digit, magnitudes to a factor of 10."""
-    assert NUMBER.sub("#", said).split() == NUMBER.sub("#", printed).split(), f"said\n{said}\nprinted\n{printed}"
-    for one, other in zip(NUMBER.findall(said), NUMBER.findall(printed), strict=True):
+    assert NUMBER.sub("#", message).split() == NUMBER.sub("#", printed).split(), f"said\n{message}\nprinted\n{printed}"
+    for one, other in zip(NUMBER.findall(message), NUMBER.findall(printed), strict=True):
         if MAGNITUDE.fullmatch(one):
             assert float(other) <= 10 * float(one), f"{one} is said, {other} printed"
         else:

@@ -23,9 +23,9 @@ from scvi_codegen.methods import ARGUMENTS
 from scvi_codegen.models import indexed_file, model_file
 from scvi_codegen.runtime import distributed
 
-__all__ = ["KEPT", "public"]
+__all__ = ["RECORDED", "public"]
 
-KEPT = Path(__file__).parents[1] / "corpus" / "public.txt"
+RECORDED = Path(__file__).parents[1] / "corpus" / "public.txt"
 PACKAGE = "scvi_codegen."
 METHOD = scvi_codegen.SVI(2, "gauss-lobatto:3")
 """Of headers: one that keeps constraints."""
@@ -86,8 +86,8 @@ def _signature(thing: Any) -> str:
         return ""  # of an exception that is as Python made it
     signature = inspect.signature(thing)
     bare = [p.replace(annotation=inspect.Parameter.empty) for p in signature.parameters.values()]
-    told = [p if p.default == () or isinstance(p.default, PLAIN) else p.replace(default=_Something()) for p in bare]
-    return str(signature.replace(parameters=told, return_annotation=inspect.Signature.empty))
+    reported = [p if p.default == () or isinstance(p.default, PLAIN) else p.replace(default=_Something()) for p in bare]
+    return str(signature.replace(parameters=reported, return_annotation=inspect.Signature.empty))
 
 
 def _command_line(command: click.Command, words: str) -> Iterator[str]:
@@ -144,9 +144,11 @@ def _fmus() -> Iterator[str]:
         given: dict[str, Any] = {started: (0.5,)}
         model = scvi_codegen.Model(system=pushed, method=METHOD, q=(1.0,), h=0.1, steps=1, **given)
         for variable in _variables(model):
-            told = {name: variable.attrib[name] for name in variable.attrib.keys() - {"valueReference", "description"}}
-            words = " ".join(f"{key}={value}" for key, value in sorted(told.items()) if key != "name")
-            yield f"in an FMU from {started}: {told['name']} {variable.tag} {words}"
+            reported = {
+                name: variable.attrib[name] for name in variable.attrib.keys() - {"valueReference", "description"}
+            }
+            words = " ".join(f"{key}={value}" for key, value in sorted(reported.items()) if key != "name")
+            yield f"in an FMU from {started}: {reported['name']} {variable.tag} {words}"
 
 
 def _variables(model: scvi_codegen.Model) -> list[ElementTree.Element]:
@@ -159,5 +161,5 @@ def _variables(model: scvi_codegen.Model) -> list[ElementTree.Element]:
 
 
 if __name__ == "__main__":
-    KEPT.write_text(public(), encoding="utf-8")
-    print(KEPT.relative_to(Path.cwd()) if KEPT.is_relative_to(Path.cwd()) else KEPT, file=sys.stderr)
+    RECORDED.write_text(public(), encoding="utf-8")
+    print(RECORDED.relative_to(Path.cwd()) if RECORDED.is_relative_to(Path.cwd()) else RECORDED, file=sys.stderr)

@@ -27,8 +27,8 @@ def remake(page: Path) -> None:
         for picture in Path(folder).glob("*.svg"):
             shutil.copy(picture, GALLERY)
             print(picture.name, picture.stat().st_size)
-    for said, printed in heard:
-        text = text.replace(f"```text\n{said}```", f"```text\n{printed}```", 1)
+    for message, printed in heard:
+        text = text.replace(f"```text\n{message}```", f"```text\n{printed}```", 1)
     page.write_text(text, encoding="utf-8")
 
 

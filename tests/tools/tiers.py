@@ -50,9 +50,9 @@ def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
     for found in tests.values():
         combinations = [tuple((name, id(value)) for name, value in item.callspec.params.items()) for item in found]
         (marker,) = found[0].iter_markers("covering")
-        kept = cover(combinations, *marker.args)
+        saved = cover(combinations, *marker.args)
         for item, combination in zip(found, combinations, strict=True):
-            if combination not in kept:
+            if combination not in saved:
                 item.add_marker(pytest.mark.full)
 
 

@@ -97,9 +97,9 @@ def test_constrained_systems_are_certified(name: str) -> None:
     certificate = certified(CASES[name])
     assert certificate.passed, certificate.to_text()
     assert not certificate.not_measured
-    kept = {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
-    assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= kept
-    assert ("symplecticity" in kept) == name.startswith("wire")
+    saved = {check.name for check in certificate.checks if check.outcome is Outcome.SATISFIED}
+    assert {"stage equations", "constraints", "multipliers", "reversal", "order"} <= saved
+    assert ("symplecticity" in saved) == name.startswith("wire")
 
 
 def test_inputs_are_certified_between_breakpoints() -> None:
@@ -258,15 +258,15 @@ def test_model_file_and_its_generated_folder_are_verified(tmp_path: Path) -> Non
 
 def test_certificate_reports_slow_checks_and_their_duration(quickly_compiled, monkeypatch, capsys):
     entry = problem("harmonic-oscillator")
-    said: list[str] = []
+    message: list[str] = []
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", 0.0)
     monkeypatch.setattr(system_under_test, "ANNOUNCED_SECONDS", 0.0)
     stepper = quickly_compiled(entry.system, SVI(1))
     given = system_under_test.State(np.array([1.0]), np.array([0.5]), 0.0, 0.1)
-    with announcements.announce_to(said.append):
+    with announcements.announce_to(message.append):
         next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
     assert capsys.readouterr().err == ""
     next(step_checks(system_under_test.SystemUnderTest(entry.system, SVI(1), stepper, None, given)))
     assert "which takes about" in capsys.readouterr().err  # which is no terminal
-    assert "measuring stage equations" in said
-    assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in said)
+    assert "measuring stage equations" in message
+    assert any("unknowns per step are solved in 60 digits, which takes about" in line for line in message)

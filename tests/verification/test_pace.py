@@ -15,7 +15,7 @@ from scvi_codegen.verification.certificate import Check, Outcome
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 from scvi_codegen.verification.variable_steps import VariableSteps, at_fixed_energy, variable_step_checks
 
-PACES = {
+STEP_CHECKS = {
     "transformed": (case("slowed/svi-3"), {"steps of tau", "time", "final time", "reversal in tau"}),
     "controlled": (CONTROLLED, {"adaptive steps", "local error", "angular momentum, adaptive steps"}),
     "reversible": (
@@ -38,18 +38,18 @@ def checks_of(given: Case) -> Iterator[Check]:
     return variable_step_checks(VariableSteps(tested, runs, own, given.system, given.tolerance))
 
 
-@pytest.mark.parametrize("name", PACES)
+@pytest.mark.parametrize("name", STEP_CHECKS)
 def test_local_error_of_run_steps_is_measured(name: str) -> None:
-    given, promises = PACES[name]
+    given, claims = STEP_CHECKS[name]
     checks = list(checks_of(given))
     assert all(check.outcome is Outcome.SATISFIED for check in checks), "\n".join(map(str, checks))
-    assert {check.name for check in checks} == promises
+    assert {check.name for check in checks} == claims
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", PACES)
+@pytest.mark.parametrize("name", STEP_CHECKS)
 def test_certificates_contain_the_local_error(name: str) -> None:
-    given, promises = PACES[name]
+    given, claims = STEP_CHECKS[name]
     stepper = compile_stepper(
         given.system, given.method(), flags=QUICK_FLAGS, time_transformation=given.time_transformation
     )
@@ -57,4 +57,4 @@ def test_certificates_contain_the_local_error(name: str) -> None:
         given.system, given.method(), given.q, given.p, h=given.h, stepper=stepper, tolerance=given.tolerance
     )
     assert certificate.passed, certificate.to_text()
-    assert promises <= {check.name for check in certificate.checks}
+    assert claims <= {check.name for check in certificate.checks}
