@@ -103,8 +103,10 @@ class Composition(Method):
 
     def __post_init__(self) -> None:
         check_sequence(self.sequence)
-        if checked_count(self.composition_order, "the order", least=2, error=MethodError) not in FIRST_HALVES:
-            raise MethodError(f"order must be 2, 8 or 10, not {self.composition_order!r}")
+        order = checked_count(self.composition_order, "the order", least=2, error=MethodError)
+        if order not in FIRST_HALVES:
+            raise MethodError(f"order must be 2, 8 or 10, not {order}")
+        object.__setattr__(self, "composition_order", order)
 
     @classmethod
     def of(cls, order: int, sequence: str = KICK_DRIFT_KICK) -> Composition:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.runtime import indexed_constraints
 from scvi_codegen.runtime.accuracy import warnings_wanted
 from scvi_codegen.runtime.constraints import projected
 from scvi_codegen.runtime.indexed_run import IndexedRun
@@ -161,10 +160,7 @@ class GrowthCheck:
         factors = _factors(len(q), nudge)
         q *= factors[0]
         p *= factors[1]
-        if isinstance(run, IndexedRun):
-            if run.interface.constraints:
-                indexed_constraints.project(run)
-        elif run.stepper.interface.constraints:
+        if isinstance(run, Memory) and run.stepper.interface.constraints:
             q[:], p[:], _ = projected(run.stepper, q.copy(), p.copy(), run.t, run.parameters)
 
     def _to(self, t: float) -> None:

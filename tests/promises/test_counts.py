@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sympy
 
+from scvi_codegen import methods
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.tables.quadrature import gauss_legendre
@@ -40,3 +41,20 @@ def test_numpy_integer_degree_is_equal():
     assert SVI(np.int64(3)) == SVI(3)
     assert repr(SVI(np.int64(3))) == repr(SVI(3))
     assert gauss_legendre(np.int32(4)) == gauss_legendre(4)
+
+
+COUNTED = (
+    *("SVI", "SCVI", "SpectralCollocation", "Gauss", "RadauIA", "RadauIIA", "LobattoIIIA", "ChebyshevGauss"),
+    *("ChebyshevLobatto", "Composition"),
+)
+
+
+@pytest.mark.parametrize("value", [True, 2.0, "2", None, 0, -1, 1000])
+@pytest.mark.parametrize("name", COUNTED)
+def test_numbers_of_stages_degrees_and_orders_are_checked_by_every_method(name, value):
+    method = getattr(methods, name)
+    with pytest.raises(MethodError, match=r"must be|there (is|are) no"):
+        method(value)
+    for number in (np.int64(2), sympy.Integer(2)):
+        assert method(number) == method(2)
+        assert repr(method(number)) == repr(method(2))

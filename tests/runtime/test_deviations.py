@@ -327,6 +327,32 @@ def test_last_step_of_an_event_run_is_not_changed(galaxy):
     assert run.chaos_indicators(1).log_norms[-1, 0] == pytest.approx(np.log(np.linalg.norm(moved)), abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"h": 0.1, "steps": 300},
+        {"t_end": 38.5},
+        {"t_end": 38.5, "tolerance": 1e-5},
+        {"h": 0.1, "steps": 300, "save_every": 60},
+        {"h": 0.2, "steps": 300, "events": Event("y", terminal=True, direction=1)},
+    ],
+    ids=["fixed", "adaptive", "coarse", "sparse", "ended by an event"],
+)
+def test_megno_is_the_trapezoidal_sum_over_steps_of_any_size(galaxy, given):
+    """The sums are formed from the lengths at all steps and their times, from t = 2.5."""
+    run = galaxy.integrate(*CHAOTIC, t=2.5, **given)
+    found = run.chaos_indicators(2)
+    assert_array_equal(found.t, run.t)
+    whole = galaxy.integrate(*CHAOTIC, t=2.5, **(given | {"save_every": 1})).chaos_indicators(2)
+    times = whole.t[:, np.newaxis] - 2.5
+    moments = np.cumsum((times[1:] + times[:-1]) / 2 * np.diff(whole.lengths, axis=0), axis=0)
+    rates = np.concatenate([np.zeros((1, 2)), 2 * moments / times[1:]])
+    means = np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times, axis=0), axis=0) / times[1:]
+    here = np.searchsorted(whole.t, found.t[1:])
+    assert_allclose(found.rates[1:], rates[here], rtol=1e-9, atol=1e-9)
+    assert_allclose(found.mean_rates[1:], means[here - 1], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.full
 def test_regular_and_chaotic_planets_agree_with_rebound():
     """Two of a thousandth of their star; its MEGNO by the variational equations of IAS15, of another change."""

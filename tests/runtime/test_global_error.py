@@ -6,6 +6,7 @@ import json
 import math
 import re
 import warnings
+from itertools import combinations
 
 import mpmath
 import numpy as np
@@ -15,6 +16,7 @@ from extrapolation import Real, integrated
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
+from scvi_codegen.runtime.global_error import _nudged as perturbed
 
 MASSES = np.array([3, 4, 5], dtype=Real)
 
@@ -606,3 +608,23 @@ def test_global_errors_of_linear_systems_are_scale_invariant(power):
     one, other = (stepper.integrate([size], [0.0], t_end=3.0, error=1e-8) for size in (1.0, 2.0**power))
     assert other.confirmation.confirmed
     assert other.global_error == pytest.approx(one.global_error, rel=0.5)
+
+
+@pytest.mark.parametrize("power", [-660, 0, 660])
+def test_growth_check_of_linear_systems_is_scale_invariant(power):
+    """A saddle amplifies errors of a motion that tends to rest by exp(t), an oscillator does not."""
+    saddle = sc.compile_stepper(made("saddle", ["q"], "q_dot**2/2 + k*q**2/2", parameters={"k": 1.0}), "svi:4")
+    start = {"q": [2.0**power], "p": [-(2.0**power)], "t": 3.0, "t_end": 43.0}
+    with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
+        saddle.integrate(**start, check_growth=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        saddle.integrate(**start, parameters={"k": -1.0}, check_growth=True)
+
+
+def test_runs_for_comparison_start_from_states_that_differ_in_the_last_place():
+    """The errors of runs from equal initial states could be equal."""
+    for x in np.random.default_rng(3).uniform(1.0, 2.0, size=50) * 2.0 ** np.arange(-25, 25):
+        several = [perturbed([x, x, x], number) for number in range(4)]
+        assert all(0.0 < abs(perturbed([x], number)[0] - x) <= 2.0 * np.spacing(x) for number in range(4))
+        assert all((one != other).any() for one, other in combinations(several, 2))

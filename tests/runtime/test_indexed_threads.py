@@ -371,10 +371,48 @@ int main(void)
   for (int i = 0; i < N; i++)
     run.q[i] = 0.3 * (i * 37 % 101) / 101.0;
   shared_inverse_masses(&given, run.inverse_mass);
-  run.h = 0.01, run.threads = 3;
-  return shared_advance(&run, &given, 4, 0, 0);
+  run.h = 0.01, run.threads = {threads};
+  return shared_advance(&run, &given, {steps}, 0, 0);
 }}
 """
+COUNTED = """
+#include <pthread.h>
+#include <stdio.h>
+static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*go)(void *), void *given)
+{
+  putchar('.');
+  return pthread_create(thread, attributes, go, given);
+}
+#define pthread_create create
+#include "shared.c"
+"""
+
+
+def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
+    """Write the source of a run with threads, and the C program that makes it."""
+    source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")
+    for path, text in source.files.items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_text(text)
+    sizes = {"N": CASES[name].shape[0], "B": len(BONDS)}
+    texts = {
+        "count": sizes["N"],
+        "bonds": ", ".join(map(str, BONDS.reshape(-1))),
+        "sizes": ", ".join(str(sizes[size]) for size in interface.sizes),
+    }
+    (folder / "main.c").write_text(RACES.format(**texts, **numbers))
+
+
+def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
+    """The caller is one of them; the largest number is that of the table of threads."""
+    (tmp_path / "counted.c").write_text(COUNTED)
+    flags = ["-std=gnu99", "-O0", "-DSCVI_THREADS", "-pthread", "-w"]
+    for threads in (1, 2, 5, 64):
+        program("ring", "stoermer-verlet", "fixed-point", tmp_path, threads=threads, steps=1)
+        command = [*find_compiler(), *flags, "main.c", "counted.c", "-lm", "-o", "main"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True)
+        assert done.stdout == "." * (threads - 1)
 
 
 @pytest.mark.full
@@ -386,17 +424,7 @@ int main(void)
 def test_threads_have_no_data_races(name: str, method: str, solver: str, tmp_path: Path) -> None:
     """By the thread sanitizer, where the compiler has it."""
     needs("setarch")
-    source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")
-    for path, text in source.files.items():
-        (tmp_path / path).parent.mkdir(exist_ok=True)
-        (tmp_path / path).write_text(text)
-    sizes = {"N": CASES[name].shape[0], "B": len(BONDS)}
-    numbers = {
-        "count": sizes["N"],
-        "bonds": ", ".join(map(str, BONDS.reshape(-1))),
-        "sizes": ", ".join(str(sizes[size]) for size in interface.sizes),
-    }
-    (tmp_path / "main.c").write_text(RACES.format(**numbers))
+    program(name, method, solver, tmp_path, threads=3, steps=4)
     flags = ["-std=c99", "-O1", "-g", "-fsanitize=thread", "-DSCVI_THREADS", "-pthread", "-Wno-psabi"]
     command = [*find_compiler(), *flags, "main.c", "shared.c", "-lm", "-o", "main"]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

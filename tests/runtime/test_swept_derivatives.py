@@ -31,6 +31,8 @@ CASES = {
     "chain": (problem("fput-chain:10").system, Gauss(2), 0.2),
     "tangle": (tangle(), SVI(2), 0.02),
     "rubbed": (RUBBED, SVI(5), 0.1),
+    "rubbed, several vectors of points": (RUBBED, SVI(9), 0.2),
+    "whirl, several vectors of points": (WHIRL, SVI(2, "gauss-lobatto:9"), 0.2),
 }
 STEPS = 70
 """More than are solved before vectors are carried over them."""

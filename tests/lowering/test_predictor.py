@@ -1,0 +1,55 @@
+"""Predictor of fixed-point iterations: exact where the motion is a polynomial of the degree of the method's curves."""
+
+from __future__ import annotations
+
+import pytest
+from numpy.polynomial import Polynomial
+
+import scvi_codegen as sc
+
+ENERGIES = {
+    "separable": ("x_dot**2/2", "x**2/2", "x", 1.0),
+    "coupled": ("(x_dot**2 + y_dot**2)/2 + x_dot*y_dot/3", "(x**2 + y**2)/2", "x + y", 4 / 3),
+    "hamiltonian": ("p_x**2/2", "x**2/2", "x", 1.0),
+    "array": ("sum(i in N, x_dot[i]**2/2)", "sum(i in N, x[i]**2/2)", "sum(i in N, x[i])", 1.0),
+    "array hamiltonian": ("sum(i in N, p_x[i]**2/2)", "sum(i in N, x[i]**2/2)", "sum(i in N, x[i])", 1.0),
+}
+"""Kinetic energy, potential, sum of the coordinates, and mass of the motion in which all coordinates are equal."""
+STEPS, MOST = 6, 3
+
+
+def motion(degree):
+    return Polynomial([0.3, 0.7, *(0.4 / k for k in range(1, degree))])
+
+
+def stepper(kind, method, degree):
+    """Return a stepper for oscillators with a force for which the polynomial is the solution."""
+    kinetic, potential, coordinates, mass = ENERGIES[kind]
+    force = motion(degree) + mass * motion(degree).deriv(2)
+    pushed = "(" + " + ".join(f"{float(c)!r}*t**{k}" for k, c in enumerate(force.coef)) + f")*({coordinates})"
+    if "hamiltonian" in kind:
+        family, given = sc.HamiltonianSystem, {"hamiltonian": f"{kinetic} + {potential} - {pushed}"}
+    else:
+        family, given = sc.LagrangianSystem, {"lagrangian": f"{kinetic} - {potential} + {pushed}"}
+    if "array" in kind:
+        system = sc.IndexedSystem.from_text(name=kind, coordinates=["x[N]"], **given)
+        return sc.compile_indexed(system, method, solver="fixed-point"), [mass] * 3
+    names = ["x", "y"] if "y" in coordinates else ["x"]
+    system = family.from_text(name=kind, coordinates=names, **given)
+    return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * len(names)
+
+
+@pytest.mark.parametrize("degree", [3, 9], ids=["one vector of points", "several"])
+@pytest.mark.parametrize("kind", ENERGIES)
+def test_polynomial_motions_need_no_iterations_after_the_first_step(kind, degree):
+    made, masses = stepper(kind, f"svi:{degree}", degree)
+    exact = motion(degree)
+    run = made.start([exact(0.0)] * len(masses), [mass * exact.deriv()(0.0) for mass in masses], h=0.2)
+    counts = []
+    for _ in range(STEPS):
+        before = run.iterations
+        run.advance(1)
+        counts.append(run.iterations - before)
+    assert counts[0] > MOST >= max(counts[1:])
+    q = run.q["x"] if "array" in kind else run.q
+    assert q == pytest.approx([exact(STEPS * 0.2)] * len(masses), rel=1e-14)

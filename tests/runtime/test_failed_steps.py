@@ -1,0 +1,59 @@
+"""Time and number of a failed step, in every kind of run: the force is undefined after t = stop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.errors import StepFailedError
+
+START, H, STOP = 1.25, 0.125, 2.05
+"""The seventh step, from t = 2 to t = 2.125, contains the end of the domain."""
+PARAMETERS = {"stop": 1e9, "k": 1.0, "sign": 1.0}
+POTENTIAL = "k*{x}**2/2 + {x}*sqrt(sign*(stop - t))/8"
+SCALAR = {
+    "svi:3": "auto",
+    "svi:4": "newton",
+    "gauss:2": "newton",
+    "stoermer-verlet": "auto",
+    "scvi:3": "newton",
+}
+ARRAY = {
+    "svi:3": "fixed-point",
+    "svi:2": "newton",
+    "gauss:2": "fixed-point",
+    "stoermer-verlet": "fixed-point",
+}
+
+
+def stepper(kind: str, method: str):
+    given = {"name": f"{kind} that ends", "parameters": PARAMETERS}
+    if kind == "scalar":
+        text = f"x_dot**2/2 - {POTENTIAL.format(x='x')}"
+        system = sc.LagrangianSystem.from_text(coordinates=["x"], lagrangian=text, **given)
+        return sc.compile_stepper(system, method, solver=SCALAR[method])
+    text = f"sum(i in N, q_dot[i]**2/2 - {POTENTIAL.format(x='q[i]')})"
+    system = sc.IndexedSystem.from_text(coordinates=["q[N]"], lagrangian=text, **given)
+    return sc.compile_indexed(system, method, solver=ARRAY[method])
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])
+@pytest.mark.parametrize(
+    ("kind", "method"), [*(("scalar", method) for method in SCALAR), *(("array", method) for method in ARRAY)]
+)
+def test_failed_step_reports_its_number_and_the_time_at_which_it_started(kind, method, sign):
+    made = stepper(kind, method)
+    given = {"t": START, "parameters": {"stop": START + sign * (STOP - START), "k": 1.3, "sign": sign}}
+    q, p = np.array([0.4]), np.array([0.2])
+    for steps_before in ((), (2, 3)):
+        run = made.start(q, p, h=sign * H, **given)
+        for steps in steps_before:
+            run.advance(steps)
+        with pytest.raises(StepFailedError) as failed:
+            run.advance(100)
+        assert (failed.value.t, failed.value.step) == (START + sign * 6 * H, 6)
+        assert (run.t, run.steps) == (START + sign * 6 * H, 6)
+    with pytest.raises(StepFailedError) as failed:
+        made.integrate(q, p, h=sign * H, steps=100, save_every=4, **given)
+    assert (failed.value.t, failed.value.step) == (START + sign * 6 * H, 6)
