@@ -4,7 +4,7 @@
       -> discretise  StageSystem   points, kernel and tables: the equations of one step
                                    (:mod:`scvi_codegen.methods.discretise`)
       -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
-                                   (:mod:`scvi_codegen.lowering.solvers.choice`)
+                                   (:mod:`scvi_codegen.lowering.solvers.selection`)
       -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
       -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
       -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);
@@ -35,14 +35,14 @@ from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.density import density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.program import lower
 from scvi_codegen.lowering.rolled import with_sums
-from scvi_codegen.lowering.solvers.choice import check_solver, iteration_of
 from scvi_codegen.lowering.solvers.predictor_tables import control_of
 from scvi_codegen.lowering.solvers.rattle import rattle_of
+from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.lowering.step_density import density_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem

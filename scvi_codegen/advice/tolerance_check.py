@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
+from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.runtime.trajectory import Trajectory

@@ -1,28 +1,30 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases         problems, eight initial states each, accelerations derived by hand
-    references    their final states in extended precision, independent of the package's steppers
-    ours          steppers of this package, at the step sizes that advise() recommends
-    peers         REBOUND, CyRK, JiTCODE, SciPy and (in taylor) heyoka at several tolerances
-    measuring     timing of all of them in turn, in one process
-    racing        the above for one case, or for an ensemble of 64 trajectories
-    forced_cases  problems with friction and driving forces;  constrained_cases: with constraints (peers: in angles)
-    curves        time at equal error, by interpolation
-    report        table and JSON of these;  picture: the work-precision plot
-    adaptive      adaptive step size, on adaptive_cases; step_lengths: plot of the step sizes
-    drift         the energy over ten million steps
-    paper_tables  Tables 6 and 7 of the paper
-    compositions  SVI and explicit composition methods
-    hand_written  generated C and hand-written C
-    start_up      time from text to the first step
-    compile_times the same for larger systems (in compile_systems), broken down
-    mechanisms    from SymPy's bodies and loads to a trajectory; lambdify and PyDy (in multibody)
-    held          constrained bodies; MuJoCo (in held_bodies): energies and lengths at equal time
-    samples       cost of a control step, and of the bare C function
-    sums          indexed systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
-    large_cases   the indexed systems;  shared_steps: their steps with several threads
-    long_sums     their energies over a hundred thousand steps;  cluster: a thousand bodies; REBOUND
-    builds        the same source with several compilers, and for several processors
+    cases               problems, eight initial states each, accelerations derived by hand
+    references          their final states in extended precision, independent of the package's steppers
+    contenders          steppers of this package, at the step sizes that advise() recommends; its peers: REBOUND, CyRK,
+                        JiTCODE, SciPy and heyoka at several tolerances
+    timing              timing of all of them in turn, in one process
+    comparison          the above for one case, or for an ensemble of 64 trajectories
+    forced_cases        problems with friction and driving forces
+    constrained_cases   problems with constraints (peers: in angles)
+    work_precision      time at equal error, by interpolation
+    report              table and JSON of these; picture: the work-precision plot
+    adaptive            adaptive step size, on adaptive_cases; step_size_plot: plot of the step sizes
+    drift               the energy over ten million steps
+    paper_tables        Tables 6 and 7 of the paper
+    compositions        SVI and explicit composition methods
+    hand_written        generated C and hand-written C
+    cold_start          time from text to the first step
+    compile_times       the same for larger systems (in compile_systems), broken down
+    mechanisms          from SymPy's bodies and loads to a trajectory; lambdify and PyDy
+    constrained_bodies  energies and lengths at equal time; MuJoCo
+    control_loop        cost of a control step, and of the bare C function
+    lattices            indexed systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
+    large_cases         the indexed systems; threads: their steps with several threads
+    indexed_energies    their energies over a hundred thousand steps
+    thousand_bodies     a thousand bodies; REBOUND
+    compilers           the same source with several compilers, and for several processors
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
@@ -39,28 +41,28 @@ from typing import Any
 
 from scvi_codegen.benchmark.adaptive import run_adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
-from scvi_codegen.benchmark.builds import run_builds
 from scvi_codegen.benchmark.cases import CASES
-from scvi_codegen.benchmark.cluster import run_cluster
+from scvi_codegen.benchmark.cold_start import run_cold_start
 from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
 from scvi_codegen.benchmark.compile_times import run_compile_times
+from scvi_codegen.benchmark.compilers import run_compilers
 from scvi_codegen.benchmark.compositions import run_compositions
 from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders.peers import PEERS
+from scvi_codegen.benchmark.control_loop import run_control_loop
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hand_written import run_hand_written
 from scvi_codegen.benchmark.indexed_energies import run_energies
+from scvi_codegen.benchmark.lattices import run_growth, run_lattices
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms
 from scvi_codegen.benchmark.paper_tables import run_paper_tables
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
-from scvi_codegen.benchmark.samples import run_samples
-from scvi_codegen.benchmark.start_up import run_start_up
-from scvi_codegen.benchmark.sums import run_growth, run_sums
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.thousand_bodies import run_thousand_bodies
 from scvi_codegen.benchmark.threads import run_threads
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_atomically
@@ -80,17 +82,17 @@ SECTIONS: Mapping[str, Callable[[Plan, ReportActivity], CaseResult | ResultTable
     "tables": run_paper_tables,
     "compositions": run_compositions,
     "hand-written": run_hand_written,
-    "start-up": run_start_up,
+    "cold-start": run_cold_start,
     "compile": run_compile_times,
     "mechanisms": run_mechanisms,
-    "held": run_constrained_bodies,
-    "samples": run_samples,
-    "sums": run_sums,
+    "constrained-bodies": run_constrained_bodies,
+    "control-loop": run_control_loop,
+    "lattices": run_lattices,
     "growth": run_growth,
     "threads": run_threads,
     "energies": run_energies,
-    "cluster": run_cluster,
-    "builds": run_builds,
+    "thousand-bodies": run_thousand_bodies,
+    "c-compilers": run_compilers,
 }
 """Sections of the benchmark: name on the command line -> function that measures it."""
 

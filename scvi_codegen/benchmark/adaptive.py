@@ -20,7 +20,6 @@ from scvi_codegen.benchmark.comparison import Makers, race
 from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
 from scvi_codegen.benchmark.contenders.ours import compiled, momenta_of
 from scvi_codegen.benchmark.contenders.peers import peer_contenders
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import (
     Extended,
     Field,
@@ -32,6 +31,7 @@ from scvi_codegen.benchmark.references import (
     two_doubles,
 )
 from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.reparametrisation import reparametrise

@@ -15,10 +15,10 @@ from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
-from scvi_codegen.benchmark.measuring import PEER_ERRORS, measure
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import Reference, reference
 from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
+from scvi_codegen.benchmark.timing import PEER_ERRORS, measure
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_constrained", "run_ensemble", "run_forced"]

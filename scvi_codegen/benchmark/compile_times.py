@@ -22,7 +22,7 @@ from scvi_codegen.benchmark.compile_systems import (
     links,
     post_newtonian,
 )
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import Case, case
 from scvi_codegen.benchmark.contenders.ours import momenta_of
-from scvi_codegen.benchmark.curves import Point, time_at
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.work_precision import Point, time_at
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import StoermerVerlet

@@ -17,9 +17,9 @@ from scvi_codegen.benchmark.contenders.constrained_contenders import (
     our_motion,
 )
 from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.curves import FLOOR, Point, error_at
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.work_precision import FLOOR, Point, error_at
 
 __all__ = ["run_constrained_bodies"]
 
@@ -50,7 +50,7 @@ def run_constrained_bodies(plan: Plan, report_activity: ReportActivity) -> Resul
         result = [row | _beside(row, curves) for row in theirs] or [{"by": "MuJoCo", "why_not": "pip install mujoco"}]
         rows += [{"bodies": name} | row for row in (*own, *angles, *result)]
     return ResultTable(
-        name="held",
+        name="constrained-bodies",
         title="constrained bodies: errors of energy and rod lengths over ten seconds",
         columns={
             "bodies": "",

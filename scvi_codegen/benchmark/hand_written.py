@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Array, Case, case
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI

@@ -11,7 +11,7 @@ import numpy as np
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.drift import fitted_rate
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, breather, cloth, field, ring, waves
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.curves import Point, time_at
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.work_precision import Point, time_at
 from scvi_codegen.native import building
 
 __all__ = ["CONTENDERS", "LINKS", "run_mechanisms"]

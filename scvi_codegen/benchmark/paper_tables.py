@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Case, case
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
 from scvi_codegen.benchmark.references import Reference, reference, rms_error
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import Gauss, SpectralCollocation

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, time_at
-from scvi_codegen.benchmark.measuring import Measurement
 from scvi_codegen.benchmark.tables import finite, lines_of
+from scvi_codegen.benchmark.timing import Measurement
+from scvi_codegen.benchmark.work_precision import FLOOR, Point, common_error, time_at
 
 __all__ = ["LEGEND", "CaseResult", "ReportRow", "header_lines", "rows"]
 

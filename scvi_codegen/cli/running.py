@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scvi_codegen.advice.known_digits import SECOND_RUN, Known, known_digits
+from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
 from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import sympy
 
-from scvi_codegen.mechanics.forms import accelerations, forms_of
+from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
 from scvi_codegen.tables.basis import differentiation_matrix

@@ -16,8 +16,8 @@ from functools import lru_cache
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, Floats, Solve, inverse, largest, newton, scaled, solver
+from scvi_codegen.exact.solution import ExactMotion
 from scvi_codegen.tables.basis import cardinal_integrals
 from scvi_codegen.tables.precision import Number, mp
 from scvi_codegen.tables.quadrature import gauss_legendre

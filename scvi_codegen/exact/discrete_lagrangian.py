@@ -17,8 +17,8 @@ import numpy as np
 
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.exact.curve import Curve, Grid
-from scvi_codegen.exact.motion import ExactMotion
 from scvi_codegen.exact.newton import Array, NotConvergedError, largest
+from scvi_codegen.exact.solution import ExactMotion
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.precision import Number, Vector, mp

@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import Numbers, exact_motion, numbers
 from scvi_codegen.exact.newton import NotConvergedError, Solve, newton
+from scvi_codegen.exact.solution import Numbers, exact_motion, numbers
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise, paper_equations
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 from scvi_codegen.tables.precision import Number, mp
 

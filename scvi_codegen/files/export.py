@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import replaced
-from scvi_codegen.files.labelled import CHUNK_BYTES, Labelled, imported, missing, write_hdf5, write_zarr
+from scvi_codegen.files.labelled_arrays import CHUNK_BYTES, Labelled, imported, missing, write_hdf5, write_zarr
 
 if TYPE_CHECKING:
     import pandas

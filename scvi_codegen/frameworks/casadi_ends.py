@@ -15,7 +15,7 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 from scvi_codegen.mechanics.constraints import constraint_rates, holonomic_expressions
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["EndConditions", "numeric", "own_parameters", "read"]

@@ -10,7 +10,7 @@ from scvi_codegen.mechanics.constraints import (
     holonomic_expressions,
     time_derivatives,
 )
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["lowered_constraints"]

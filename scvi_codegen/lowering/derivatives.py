@@ -12,7 +12,7 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.point_derivatives import point_derivatives_of
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 

@@ -23,8 +23,8 @@ from scvi_codegen.lowering.indexed_kernels import constants_of, kernel_of
 from scvi_codegen.lowering.lattices import reach_of
 from scvi_codegen.lowering.program import comment_text, notes_of
 from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.choice import iteration_of
 from scvi_codegen.lowering.solvers.predictor_tables import control_of_iteration
+from scvi_codegen.lowering.solvers.selection import iteration_of
 from scvi_codegen.lowering.solvers.separable import separable_iteration
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem

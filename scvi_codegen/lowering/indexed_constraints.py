@@ -35,7 +35,7 @@ from scvi_codegen.mechanics.indexed.constraints import (
 )
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.precision import Vector, mp
 

@@ -11,7 +11,7 @@ from scvi_codegen.ir.derivatives import InputDerivatives, PointDerivatives
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.mechanics.forms import Entries, forms_of
+from scvi_codegen.mechanics.derived_expressions import Entries, forms_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -15,19 +15,19 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
 from scvi_codegen.ir.stage_groups import LoweredStageGroup
+from scvi_codegen.lowering.bandwidth_ordering import bandwidth, places
 from scvi_codegen.lowering.constraints import lowered_constraints
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
-from scvi_codegen.lowering.ordering import bandwidth, places
 from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
 from scvi_codegen.lowering.stage_groups import has_action, lowered_stage_group
 from scvi_codegen.lowering.unknown_layout import layout_of
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.work_and_impulse import exchanges
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
-from scvi_codegen.methods.shapes import Accelerations, PrintedCurve, ShotCurve, Velocities
+from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional
 from scvi_codegen.tables.precision import Matrix, Vector, mp
@@ -53,7 +53,8 @@ def lower(
         system, method: the system and the method.
         stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
-        iteration: the fixed-point iteration to try first (:func:`scvi_codegen.lowering.solvers.choice.iteration_of`).
+        iteration: the fixed-point iteration to try first
+            (:func:`scvi_codegen.lowering.solvers.selection.iteration_of`).
         splitting: the explicit solver that replaces both
             (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
         newton: whether Newton's method is included; with it the discrete Legendre transforms.

@@ -14,7 +14,7 @@ from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.ir.stage_groups import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.unknown_layout import UnknownLayout
-from scvi_codegen.mechanics.forms import auxiliary_multipliers, curve_rates, multipliers
+from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.work_and_impulse import exchanges

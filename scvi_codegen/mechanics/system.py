@@ -11,9 +11,9 @@ unknowns at every point where the function is evaluated; the action is stationar
 
 A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem` with the properties ``lagrangian``
 and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
-use nothing else, and expressions derived from them only through :func:`~scvi_codegen.mechanics.forms.forms_of`.
-Matrix-free solvers also use an equivalent Lagrangian, if one is known
-(:func:`~scvi_codegen.mechanics.hamiltonian.equivalent_lagrangian`).
+use nothing else, and expressions derived from them only through
+:func:`~scvi_codegen.mechanics.derived_expressions.forms_of`. Matrix-free solvers also use an equivalent Lagrangian, if
+one is known (:func:`~scvi_codegen.mechanics.hamiltonian.equivalent_lagrangian`).
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ class MechanicalSystem(ABC):
         parameters: the symbols that stay adjustable in the compiled integrator; one may be absent from the function.
         defaults: their default values, parallel to ``parameters``.
         clock: time transformation, if any.
-        forces: m generalised forces in addition to the function (:mod:`scvi_codegen.mechanics.forms`), in (q, v, t) for
-            a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
+        forces: m generalised forces in addition to the function (:mod:`scvi_codegen.mechanics.derived_expressions`), in
+            (q, v, t) for a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
         damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
             (:mod:`scvi_codegen.mechanics.damping`).
         inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).

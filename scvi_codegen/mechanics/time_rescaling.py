@@ -25,7 +25,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient, hessian
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.legendre import positive_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem
 

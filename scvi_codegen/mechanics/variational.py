@@ -15,7 +15,7 @@ from sympy import Expr
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.symbols import DOT, symbol
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import sympy
 from sympy import Expr
 
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 

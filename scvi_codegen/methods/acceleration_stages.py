@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from scvi_codegen.mechanics.forms import accelerations, forms_of
+from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shapes import Accelerations
+from scvi_codegen.methods.stage_structure import Accelerations
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from scvi_codegen.display.number_tables import Part
-from scvi_codegen.mechanics.forms import accelerations, forms_of
+from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import VELOCITY_BLOCK, position_system, residual_group, single_point
-from scvi_codegen.methods.choices import resolve_nodes
+from scvi_codegen.methods.arguments import resolve_nodes
 from scvi_codegen.methods.galerkin_stages import position_block
 from scvi_codegen.methods.method import Method, Specification, degree_count
 from scvi_codegen.methods.runge_kutta import check_form, phase_space_system

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.exactness import Exactness

@@ -40,9 +40,9 @@ from scvi_codegen.mechanics.constraints import (
     nonholonomic_expressions,
     with_constraint_forces,
 )
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.precision import Matrix, Vector, mp

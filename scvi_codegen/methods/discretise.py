@@ -9,7 +9,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.constraints import with_constraints
 from scvi_codegen.methods.method import Method, check_regular
 from scvi_codegen.methods.phase_space import with_auxiliaries
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 
 __all__ = ["discretise", "paper_equations"]

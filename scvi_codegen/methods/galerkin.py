@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.choices import (
+from scvi_codegen.methods.arguments import (
     resolve_nodes,
     resolve_quadrature,
     resolve_space,

@@ -11,10 +11,10 @@ from dataclasses import replace
 from fractions import Fraction
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import curve_rates, forms_of
+from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import unit_sum
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,

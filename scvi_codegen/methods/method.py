@@ -20,7 +20,7 @@ from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.mechanics.constraints import nonholonomic_expressions
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.exactness import Exactness

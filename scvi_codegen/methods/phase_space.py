@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import sympy
 
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.mechanics.forms import auxiliary_multipliers, forms_of
+from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
 from scvi_codegen.tables.basis import identity_matrix, next_step

@@ -25,7 +25,7 @@ from scvi_codegen.methods.acceleration_stages import position_system
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin_stages import galerkin_system
 from scvi_codegen.methods.method import Method, Specification, lagrangian_scatters
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,

@@ -22,7 +22,7 @@ from typing import Any
 from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.choices import resolve_nodes, resolve_quadrature
+from scvi_codegen.methods.arguments import resolve_nodes, resolve_quadrature
 from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method, Specification, degree_count

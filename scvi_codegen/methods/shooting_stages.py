@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.forms import curve_rates, forms_of, multipliers
+from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.acceleration_stages import (
     acceleration_extrapolation,
@@ -17,7 +17,7 @@ from scvi_codegen.methods.acceleration_stages import (
 from scvi_codegen.methods.collocation import nodal_blocks, nodal_gathers
 from scvi_codegen.methods.galerkin_stages import action_groups, nodal_quadrature_group
 from scvi_codegen.methods.method import lagrangian_scatters, unit_sum
-from scvi_codegen.methods.shapes import PrintedCurve, ShotCurve
+from scvi_codegen.methods.stage_structure import PrintedCurve, ShotCurve
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,

@@ -194,7 +194,7 @@ class StageGroup:
 
 
 class Shape:
-    """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.shapes`."""
+    """Base class of the structure used by matrix-free solvers: :mod:`scvi_codegen.methods.stage_structure`."""
 
     __slots__ = ()
 

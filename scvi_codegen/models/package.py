@@ -256,7 +256,7 @@ def _chosen_by(model: Model) -> float:
 def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
     """Return the (m,) initial momenta from the velocities, in 60 digits, so that no C compiler is required."""
     from scvi_codegen.formulas.tape import evaluate
-    from scvi_codegen.mechanics.forms import forms_of
+    from scvi_codegen.mechanics.derived_expressions import forms_of
     from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
     from scvi_codegen.tables.precision import mp
 

@@ -14,8 +14,8 @@ import numpy as np
 from scvi_codegen.errors import PlotError, StateError
 from scvi_codegen.files.atomic import replaced
 from scvi_codegen.pictures.canvas import check_plot_path, color, plain, style
-from scvi_codegen.pictures.motion import MOTION, Array, DrawnMotion
 from scvi_codegen.pictures.shapes import MovingPoints, shape_of
+from scvi_codegen.pictures.trajectory_interface import MOTION, Array, DrawnMotion
 from scvi_codegen.representation import summary
 from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, checks_arguments
 

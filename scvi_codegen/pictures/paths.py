@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.mechanics.symmetry.bodies import AXES, Body, bodies
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
+from scvi_codegen.pictures.trajectory_interface import MOTION, MOTIONS, Array, DrawnMotion, Motions, column, several
 from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:

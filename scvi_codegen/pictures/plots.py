@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from scvi_codegen.pictures.conserved import plot_energy, plot_momentum_maps
-from scvi_codegen.pictures.motion import DrawnMotion
 from scvi_codegen.pictures.overview import plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion, plot_phase
 from scvi_codegen.pictures.section import plot_section
+from scvi_codegen.pictures.trajectory_interface import DrawnMotion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.pictures.canvas import color, panel, plain
-from scvi_codegen.pictures.motion import MOTIONS, Array, DrawnMotion, Motions, column, several
+from scvi_codegen.pictures.trajectory_interface import MOTIONS, Array, DrawnMotion, Motions, column, several
 from scvi_codegen.validation.argument_types import CANVAS, NAMES, PATH, checks_arguments
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.symmetry.bodies import bodies
-from scvi_codegen.pictures.motion import Array, DrawnMotion
+from scvi_codegen.pictures.trajectory_interface import Array, DrawnMotion
 
 __all__ = ["MovingPoints", "shape_of"]
 

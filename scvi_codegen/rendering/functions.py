@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel
 from scvi_codegen.ir.kernel_parts import Part, parts
-from scvi_codegen.rendering.lanes import Lanes
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
+from scvi_codegen.rendering.simd import Lanes
 from scvi_codegen.rendering.target import DOUBLE, Target
 
 __all__ = ["kernel_text", "lane_kernel_text", "lane_mass_text"]

@@ -13,14 +13,14 @@ from scvi_codegen.rendering.convergence import MAX_ITERATIONS
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
 from scvi_codegen.rendering.indexed_constraints import constraint_context
-from scvi_codegen.rendering.lanes import LIBRARY, POINTS, IterationSource, iteration_source
 from scvi_codegen.rendering.lattices import lattice_context, roots_per_coordinate
 from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
 from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
+from scvi_codegen.rendering.simd import LIBRARY, POINTS, IterationSource, iteration_source
 from scvi_codegen.rendering.sizes import product_text, sizes_text
 from scvi_codegen.rendering.source import Source, included
 from scvi_codegen.rendering.target import DOUBLE
-from scvi_codegen.rendering.thread_sharing import MOST_THREADS, Sharing, sharing_of, sharing_text
+from scvi_codegen.rendering.thread_partition import MOST_THREADS, Sharing, sharing_of, sharing_text
 
 __all__ = ["render_indexed", "render_indexed_example"]
 

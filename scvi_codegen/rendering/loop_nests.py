@@ -15,7 +15,7 @@ from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
-from scvi_codegen.rendering.thread_sharing import Sharing
+from scvi_codegen.rendering.thread_partition import Sharing
 
 __all__ = ["DIRECTION", "Lines", "Nest"]
 

@@ -22,8 +22,8 @@ from scvi_codegen.rendering.control import predictor_text
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.fallback import Fallback
-from scvi_codegen.rendering.lanes import POINTS, TRAJECTORIES, iteration_source
 from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
+from scvi_codegen.rendering.simd import POINTS, TRAJECTORIES, iteration_source
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 from scvi_codegen.rendering.unrolled_equations import unrolled_equations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.export import LABELLED, check_format, write_whole
-from scvi_codegen.files.labelled import Labelled, checked_units, to_dataset
+from scvi_codegen.files.labelled_arrays import Labelled, checked_units, to_dataset
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.descriptions import short_title
 from scvi_codegen.runtime.inputs import Array

@@ -15,7 +15,7 @@ from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.rendering.thread_sharing import MOST_THREADS
+from scvi_codegen.rendering.thread_partition import MOST_THREADS
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.accuracy import FIXED_STEP_REMEDY, GROSS_ERROR, warn_of_energies, warn_of_large_steps
 from scvi_codegen.runtime.compiled_method import no_source

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
 from scvi_codegen.errors import EventError, StateError, StepFailedError
 from scvi_codegen.files.export import States, to_dataframe, write_states
-from scvi_codegen.files.labelled import checked_units, to_dataset
+from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
 from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR
 from scvi_codegen.runtime.constraints import constraint_values, multipliers
 from scvi_codegen.runtime.dense_output import checked_times, states_at

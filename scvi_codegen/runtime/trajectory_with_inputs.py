@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.files.export import States, to_dataframe, write_states
-from scvi_codegen.files.labelled import to_dataset
+from scvi_codegen.files.labelled_arrays import to_dataset
 from scvi_codegen.runtime.dense_output import checked_times, within
 from scvi_codegen.runtime.derivatives_with_inputs import DerivativesWithInputs
 from scvi_codegen.runtime.descriptions import describe_states

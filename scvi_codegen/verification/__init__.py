@@ -2,7 +2,7 @@
 
 Three independent computations are compared. The *compiled* step is compared with the paper's equations solved in 60
 digits (:mod:`scvi_codegen.exact.step`) and, for its structure, with finite differences of itself. *These digits* are
-compared with the exact motion, computed from the formula of L or H alone (:mod:`scvi_codegen.exact.motion`), and with
+compared with the exact motion, computed from the formula of L or H alone (:mod:`scvi_codegen.exact.solution`), and with
 other methods that are the same map. An error in the printed C, the tables, a kernel or a solver shows in the first
 comparison; an error in the derivation, which both sides share, in the second.
 

@@ -9,9 +9,9 @@ from functools import partial, singledispatch
 import numpy as np
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import exact_motion, numbers
+from scvi_codegen.exact.solution import exact_motion, numbers
 from scvi_codegen.exact.step import derived_step
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem

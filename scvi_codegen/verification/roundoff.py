@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import numbers
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.exact.solution import numbers
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.methods import SCVI
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact.motion import Numbers, numbers
+from scvi_codegen.exact.solution import Numbers, numbers
 from scvi_codegen.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.stepper import Stepper

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.exact.motion import ExactMotion, exact_motion
+from scvi_codegen.exact.solution import ExactMotion, exact_motion
 from scvi_codegen.exact.step import DerivedStep, SolvedStep, derived_step
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method

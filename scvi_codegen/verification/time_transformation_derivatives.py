@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.exact.motion import exact_motion
+from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.runtime.linearised import Starts

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.exact.motion import ExactMotion, exact_motion, numbers
+from scvi_codegen.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function

@@ -16,31 +16,31 @@ from scipy.integrate import solve_ivp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import (
-    builds,
     cases,
+    cold_start,
     compile_systems,
     compile_times,
+    compilers,
     compositions,
     constrained_bodies,
+    control_loop,
     hand_written,
-    measuring,
     mechanisms,
     paper_tables,
     report,
-    samples,
-    start_up,
+    timing,
 )
 from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders import constrained_contenders, ours, peers
 from scvi_codegen.benchmark.contenders.contenders import Contender
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
-from scvi_codegen.benchmark.curves import FLOOR, Point, common_error, frontier, time_at
 from scvi_codegen.benchmark.drift import drift_rows, fitted_rate
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hanging_rods import angles_of, rod_accelerations
 from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.work_precision import FLOOR, Point, common_error, frontier, time_at
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
@@ -266,7 +266,7 @@ class TestCurves:
 
 def measurement(method, seconds, error, **changes):
     entries = {"setting": "h=1", "options": "", "compile_seconds": 0.1, "fastest": seconds, "repeats": 3} | changes
-    return measuring.Measurement(method=method, seconds=seconds, error=error, **entries)
+    return timing.Measurement(method=method, seconds=seconds, error=error, **entries)
 
 
 def result_of(*found, **skipped):
@@ -355,7 +355,7 @@ class TestMeasuring:
 
         high = np.arange(8.0)[:, None]
         exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
-        good, bad, last = measuring.measure(
+        good, bad, last = timing.measure(
             [contender("one"), contender("bad"), contender("two")], lambda _: exact, repeats=2
         )
         assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
@@ -369,7 +369,7 @@ class TestMeasuring:
             method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
         )
         exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
-        (found,) = measuring.measure([ensemble], lambda _: exact, repeats=2)
+        (found,) = timing.measure([ensemble], lambda _: exact, repeats=2)
         assert found.error == 0.0
         assert found.seconds < 1e-3
 
@@ -604,16 +604,16 @@ class TestTables:
 
     @pytest.mark.full
     def test_compilers_and_processors_are_measured(self, monkeypatch):
-        monkeypatch.setattr(builds, "PROBLEMS", ("kepler",))
+        monkeypatch.setattr(compilers, "PROBLEMS", ("kepler",))
         monkeypatch.setenv("CC", "cc")
-        table = builds.run_builds(bench.Plan(quick=True), lambda text: None)
+        table = compilers.run_compilers(bench.Plan(quick=True), lambda text: None)
         assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",)}
         assert all(0.0 < row[f"kepler, SVI({degree})"] < 1e3 for row in table.rows for degree in (4, 8))
         assert os.environ["CC"] == "cc"
 
     @pytest.mark.parametrize("name", ["pendulum", "cart-pole"])
     def test_a_sample_is_the_step_of_c_called_bare(self, name):
-        sampling = samples.Sampling(samples.SYSTEMS[name], "svi:2")
+        sampling = control_loop.Sampling(control_loop.SYSTEMS[name], "svi:2")
         for call in [sampling.calls[each] for each in ("assign", "hold", "bare", "advance", "sample")] * 50:
             call()
         q = sampling.states()
@@ -621,12 +621,12 @@ class TestTables:
         assert next(part.tolist() for part in sampling.calls["look"]()) == q[0]
 
     def test_samples_are_measured(self):
-        rows = samples.run_samples(bench.Plan(quick=True), lambda text: None).rows
+        rows = control_loop.run_control_loop(bench.Plan(quick=True), lambda text: None).rows
         assert [row["system"] for row in rows] == ["pendulum"] * 2 + ["cart-pole"] * 2
         assert all(row[name] > 0.0 for row in rows for name in ("bare", "assign", "hold", "advance", "sample", "look"))
 
     def test_start_up_time_is_measured(self):
-        cold, cached = start_up.run_start_up(bench.Plan(repeats=1), lambda text: None).rows
+        cold, cached = cold_start.run_cold_start(bench.Plan(repeats=1), lambda text: None).rows
         assert (cold["cache"], cached["cache"]) == ("cold", "cached")
         assert cold["sympy_by_import"] == "False"
         assert cached["first_step_ms"] < cold["first_step_ms"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import cluster, indexed_energies, sums, threads
+from scvi_codegen.benchmark import indexed_energies, lattices, thousand_bodies, threads
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
 from scvi_codegen.indexed_compiler import compile_indexed
@@ -20,7 +20,9 @@ def quiet(text):
 @pytest.mark.parametrize("lattice", [ring(8, 1.0), field(6, 0.2)], ids=lambda lattice: lattice.name)
 def test_lattices_by_hand_move_as_generated_ones(lattice):
     steps = 10
-    by_hand, ours = (run() for run in (sums._by_hand(lattice, 8, steps), sums._ours(lattice, Composition(8), steps)))
+    by_hand, ours = (
+        run() for run in (lattices._by_hand(lattice, 8, steps), lattices._ours(lattice, Composition(8), steps))
+    )
     assert np.abs(by_hand - ours).max() < 1e-14
     assert np.abs(ours - lattice.q).max() > 0.01
 
@@ -44,8 +46,8 @@ def test_accelerations_by_numpy_are_those_of_the_formula(each):
 def test_openmm_makes_the_steps_of_leapfrog(name):
     pytest.importorskip("openmm", reason="needs the extra 'bench'")
     crystal, steps = atoms(1, 0.5), 50
-    theirs = sums._openmm(name, crystal, steps)()
-    ours = sums._ours(crystal, "stoermer-verlet", steps)()
+    theirs = lattices._openmm(name, crystal, steps)()
+    ours = lattices._ours(crystal, "stoermer-verlet", steps)()
     rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
     assert np.abs(theirs - ours).max() < rounding
     assert np.abs(ours - crystal.q).max() > 0.1
@@ -55,15 +57,15 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
 def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
-    ours, theirs = cluster._ours(each, "svi:8", 32)(), cluster._rebound(each, "ias15", None)()
+    ours, theirs = thousand_bodies._ours(each, "svi:8", 32)(), thousand_bodies._rebound(each, "ias15", None)()
     assert max(np.abs(one - other).max() for one, other in zip(ours, theirs, strict=True)) < 1e-14
 
 
 @pytest.mark.full
 def test_array_systems_are_measured_at_equal_error(monkeypatch):
-    monkeypatch.setattr(sums, "lattices", lambda plan: (ring(32, 2.0), bodies(4, 0.5)))
-    rows = sums.run_sums(QUICK, quiet).rows
-    assert [row["error"] for row in rows] == [*sums.ERRORS, *sums.ERRORS]
+    monkeypatch.setattr(lattices, "lattices", lambda plan: (ring(32, 2.0), bodies(4, 0.5)))
+    rows = lattices.run_lattices(QUICK, quiet).rows
+    assert [row["error"] for row in rows] == [*lattices.ERRORS, *lattices.ERRORS]
     assert all(row["doubt"] < 1e-13 and row["DOP853"] > 0.0 and row["composition"] > 0.0 for row in rows)
     assert "leapfrog" in rows[0]
     assert "leapfrog" not in rows[-1]
@@ -71,8 +73,8 @@ def test_array_systems_are_measured_at_equal_error(monkeypatch):
 
 @pytest.mark.full
 def test_growth_is_measured(monkeypatch):
-    monkeypatch.setattr(sums, "GROWTH", (100, 100_000))
-    rows = sums.run_growth(QUICK, quiet).rows
+    monkeypatch.setattr(lattices, "GROWTH", (100, 100_000))
+    rows = lattices.run_growth(QUICK, quiet).rows
     assert [row["coordinates"] for row in rows] == [100, 100_000, 256] * 3
     assert all(row["memory_mb"] > before["memory_mb"] for before, row in zip(rows[::3], rows[1::3], strict=True))
     assert all(row["gigabytes_s"] > 0.0 for row in rows)
@@ -94,8 +96,8 @@ def test_energies_stay_at_rounding():
 
 @pytest.mark.full
 def test_errors_of_a_cluster_shrink_with_its_steps():
-    rows = cluster.run_cluster(QUICK, quiet).rows
-    for name, counts in cluster.OURS_BY.items():
+    rows = thousand_bodies.run_thousand_bodies(QUICK, quiet).rows
+    for name, counts in thousand_bodies.OURS_BY.items():
         errors = [row["error"] for row in rows if row["by"].endswith(name)]
         assert len(errors) == len(counts)
         assert errors == sorted(errors, reverse=True)

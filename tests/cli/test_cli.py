@@ -24,8 +24,8 @@ from click.shell_completion import ShellComplete
 from click.testing import CliRunner, Result
 
 from scvi_codegen.cli import ABOUT, main
-from scvi_codegen.cli.choices import ModelOptions, read_model
 from scvi_codegen.cli.conservation import energy_report
+from scvi_codegen.cli.model_options import ModelOptions, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from scvi_codegen.cli import equipment, main
+from scvi_codegen.cli import diagnostics, main
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
@@ -36,7 +36,7 @@ def findings(status: int = 0) -> dict[str, dict[str, Any]]:
 def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is of no account."""
     monkeypatch.setattr(
-        equipment, "_trial", lambda folder: equipment.CheckResult(name="trial", status="lacks", found="")
+        diagnostics, "_trial", lambda folder: diagnostics.CheckResult(name="trial", status="lacks", found="")
     )
 
 
@@ -138,7 +138,7 @@ def test_extras_are_listed_with_missing_packages(monkeypatch):
             raise importlib.metadata.PackageNotFoundError(name)
         return found
 
-    monkeypatch.setattr(equipment, "version", version)
+    monkeypatch.setattr(diagnostics, "version", version)
     found = findings()
     assert found["extra plot"]["status"] == "lacks"
     assert found["extra plot"]["remedy"] == "missing matplotlib >= 3.8: pip install 'scvi-codegen[plot]'"

@@ -10,7 +10,7 @@ from sabotage import changed_property, changed_result
 from scvi_codegen.lowering import constraints as lowered_constraints
 from scvi_codegen.lowering import derivatives as lowered_derivatives
 from scvi_codegen.lowering import stage_groups
-from scvi_codegen.mechanics import forms as mechanics
+from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.methods import constraints as constrained_stages
 from scvi_codegen.tables.quadrature import gauss_lobatto
 

@@ -40,7 +40,7 @@ from scvi_codegen.ir import arithmetic, numbers
 from scvi_codegen.lowering import stage_groups
 from scvi_codegen.lowering.solvers import collocation as collocation_iteration
 from scvi_codegen.lowering.solvers import separable
-from scvi_codegen.mechanics import forms as mechanics
+from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import (
     acceleration_stages,

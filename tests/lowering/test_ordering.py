@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from scvi_codegen.lowering.ordering import bandwidth, places
+from scvi_codegen.lowering.bandwidth_ordering import bandwidth, places
 
 
 def ring(count: int) -> list[tuple[int, int]]:

@@ -16,7 +16,7 @@ from scvi_codegen import (
     problem,
     variational_system,
 )
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 
 

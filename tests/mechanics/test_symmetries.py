@@ -16,7 +16,7 @@ from sympy import Symbol
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.symmetry import invariants

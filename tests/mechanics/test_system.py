@@ -16,7 +16,7 @@ from sympy.physics.mechanics import LagrangesMethod, Particle, Point, ReferenceF
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError, SystemDefinitionWarning
 from scvi_codegen.formulas.symbols import C_KEYWORDS
-from scvi_codegen.mechanics.forms import curve_rates, forms_of
+from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 T = dynamicsymbols._t

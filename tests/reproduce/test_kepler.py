@@ -18,9 +18,9 @@ from scvi_codegen.reproduce.correction.example import (
 )
 from scvi_codegen.reproduce.kepler import figures_13_to_20 as kepler
 from scvi_codegen.reproduce.kepler import figures_23_to_30 as kepler_shooting
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, exact_flow, off_ellipse, perihelion, revolutions
 from scvi_codegen.reproduce.kepler.forms import PRINTED, STEP, VARIATIONAL, orbit_of, shooting
 from scvi_codegen.reproduce.kepler.many_points import SPAN
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, exact_flow, off_ellipse, perihelion, revolutions
 from scvi_codegen.reproduce.kepler.one_step import one_step, orders
 from scvi_codegen.reproduce.kepler.step import STATE
 from scvi_codegen.reproduce.laboratory.experiment import Verdict

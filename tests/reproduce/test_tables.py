@@ -11,7 +11,7 @@ import sympy
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.rendering import outline as c_outline
 from scvi_codegen.reproduce import claims
-from scvi_codegen.reproduce.kepler import motion
+from scvi_codegen.reproduce.kepler import exact_flow
 from scvi_codegen.reproduce.laboratory import full_newton, picard, readings, running
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Result, Verdict
 from scvi_codegen.reproduce.oscillators import two_point_pendulum as two_point
@@ -104,7 +104,7 @@ def test_the_printed_iterations_are_those_of_the_paper():
 
 
 def test_full_newton_needs_four_iterations_a_step():
-    used = full_newton.newton_counts(motion.SYSTEM, SVI(5), *motion.perihelion(0.2), h=0.5, steps=200)
+    used = full_newton.newton_counts(exact_flow.SYSTEM, SVI(5), *exact_flow.perihelion(0.2), h=0.5, steps=200)
     assert (max(used), sum(used)) == (4, 800)
 
 
@@ -134,7 +134,7 @@ def test_picard_iteration_fails_where_the_tables_have_dashes(number, cells, by_p
 @pytest.mark.parametrize("degree", [1, 4, 9, 19])
 def test_picard_iteration_converges_to_the_compiled_step(degree):
     """The exact force of Kepler's problem; independent of the project's solvers but for the tables."""
-    (q, v), rule = map(np.array, motion.perihelion(0.2)), f"gauss-legendre:{degree + 1}"
+    (q, v), rule = map(np.array, exact_flow.perihelion(0.2)), f"gauss-legendre:{degree + 1}"
     pairs = (
         (picard.spectral_collocation(degree), SpectralCollocation(degree)),
         (picard.galerkin(degree, degree + 1), SVI(degree, rule)),
@@ -143,12 +143,12 @@ def test_picard_iteration_converges_to_the_compiled_step(degree):
         ends = picard.picard_step(
             equations, iteration_counts.attraction, q, v, h=0.3, tolerance=1e-14, max_iterations=99
         )
-        step = running.stepper_of(motion.SYSTEM, method).step(q, v, 0.3)
+        step = running.stepper_of(exact_flow.SYSTEM, method).step(q, v, 0.3)
         assert np.abs(np.array(ends[:2]) - step).max() < 1e-13
 
 
 def test_diverging_picard_iteration_is_reported():
-    q, v = map(np.array, motion.perihelion(0.2))
+    q, v = map(np.array, exact_flow.perihelion(0.2))
     with pytest.raises(picard.NotSolvedError):
         picard.picard_step(
             picard.galerkin(1, 2), iteration_counts.attraction, q, v, h=5.0, tolerance=1e-14, max_iterations=1000

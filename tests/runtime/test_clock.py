@@ -11,7 +11,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.exact.motion import ExactMotion
+from scvi_codegen.exact.solution import ExactMotion
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.runtime.time_transformation import part_of_step
 from scvi_codegen.tables.precision import mp

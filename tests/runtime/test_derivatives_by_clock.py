@@ -21,7 +21,7 @@ from scvi_codegen import (
     problem,
     reparametrise,
 )
-from scvi_codegen.exact.motion import exact_motion
+from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.methods.method import is_symplectic

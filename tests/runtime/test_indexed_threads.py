@@ -21,7 +21,7 @@ from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.thread_sharing import Sharing, sharing_of
+from scvi_codegen.rendering.thread_partition import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)
 THREADS = (1, 2, 3, 5)

@@ -22,7 +22,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import StateError
-from scvi_codegen.exact.motion import exact_motion
+from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.formulas.tape import evaluate
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

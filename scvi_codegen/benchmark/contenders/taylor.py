@@ -24,7 +24,7 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Array, Case, Formulation
 from scvi_codegen.benchmark.contenders.contenders import Contender
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 
 __all__ = ["heyoka_contenders", "heyoka_ensembles", "heyoka_states"]
 

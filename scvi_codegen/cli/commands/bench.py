@@ -45,15 +45,15 @@ def bench(
       tables                    Tables 6 and 7 of the paper
       compositions              explicit composition methods
       hand-written              hand-written C
-      start-up, compile         time from text to the first step; for larger systems
+      cold-start, compile       time from text to the first step; for larger systems
       mechanisms                SymPy mechanisms; lambdify and PyDy
-      held                      constrained bodies; MuJoCo
-      samples                   cost of a control step
-      sums, growth              indexed systems (lattices, fields, bodies); scaling with size
+      constrained-bodies        constrained bodies; MuJoCo
+      control-loop              cost of a control step
+      lattices, growth          indexed systems (lattices, fields, bodies); scaling with size
       threads                   steps with several threads
       energies                  energy of indexed systems over 100,000 steps
-      cluster                   a thousand bodies; REBOUND
-      builds                    compilers and processors
+      thousand-bodies           a thousand bodies; REBOUND
+      c-compilers               compilers and processors
 
     Install the peers with 'scvi-codegen[bench]'. Each section is printed, and written to the JSON file, when it is
     complete; after Ctrl-C, --resume continues.

@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.choices import ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.command_group import check_writable, emit, reporting
+from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import reject_options
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.equations import StepEquations

@@ -7,7 +7,7 @@ from dataclasses import asdict
 import click
 
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, reporting, tell
-from scvi_codegen.cli.equipment import FAILED, CheckResult, run_checks
+from scvi_codegen.cli.diagnostics import FAILED, CheckResult, run_checks
 
 __all__ = ["doctor"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from scvi_codegen.cli.command_group import check_writable, reporting, tell
-from scvi_codegen.cli.numbers import recorded_numbers
+from scvi_codegen.cli.json_documents import recorded_numbers
 from scvi_codegen.cli.recording import check_format, describe_progress
 from scvi_codegen.results.recording import load_run
 

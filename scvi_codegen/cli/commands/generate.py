@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
-from scvi_codegen.cli.choices import SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.command_group import reporting, tell
+from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import reject_options, with_solver
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel

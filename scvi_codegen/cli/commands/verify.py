@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from scvi_codegen import verification
-from scvi_codegen.cli.choices import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
+from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel

@@ -13,7 +13,7 @@ from scvi_codegen.derivation.page.elision import MOST_FORMULAS, formulas, lines,
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, SideBySide, TableBlock
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
-from scvi_codegen.mechanics.forms import auxiliary_multipliers, multipliers
+from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, multipliers
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.outline import Function
 

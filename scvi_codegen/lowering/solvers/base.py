@@ -1,14 +1,14 @@
 """Common interface of the fixed-point solvers: a function from a problem to an iteration, or ``None``.
 
 A solver is a module in this folder with such a function, a line in ``FIXED_POINTS``
-(:mod:`scvi_codegen.lowering.solvers.choice`), and a subclass of
+(:mod:`scvi_codegen.lowering.solvers.selection`), and a subclass of
 :class:`~scvi_codegen.ir.iteration.FixedPointIteration`, plain data,
-which declares the tables and the support headers from which :mod:`scvi_codegen.rendering.lanes` renders C. Solvers
+which declares the tables and the support headers from which :mod:`scvi_codegen.rendering.simd` renders C. Solvers
 share only the problem. They may rely on the following:
 
 * the tables of a shape are numbers of the method in 60 digits, also in the iteration; they are rounded when they are
   printed, as double-double numbers if one rounding is not accurate enough;
-* the tables of an iteration are padded to its lanes (:mod:`scvi_codegen.lowering.solvers.padding`);
+* the tables of an iteration are padded to its lanes (:mod:`scvi_codegen.lowering.solvers.simd_padding`);
 * an iteration that does not converge costs time, not correctness: Newton's method follows it.
 """
 

@@ -15,10 +15,10 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.curve_tables import node_tables, point_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_vector, predictor_tables_of
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.lowering.solvers.simd_padding import MOST_LANES, lane_count, pad_vector, predictor_tables_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.shapes import Accelerations, PrintedCurve
+from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve
 from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values
 from scvi_codegen.tables.precision import Number
 from scvi_codegen.tables.quadrature import Quadrature

@@ -23,9 +23,15 @@ from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.ir.iterations import CoupledIteration
 from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector, predictor_tables_of
+from scvi_codegen.lowering.solvers.simd_padding import (
+    MOST_LANES,
+    lane_count,
+    pad_matrix,
+    pad_vector,
+    predictor_tables_of,
+)
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, resolved_degree, velocity_tables
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.tables.basis import transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp

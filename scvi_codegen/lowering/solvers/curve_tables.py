@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from scvi_codegen.ir.curve_iterations import NodeTables, PointTables
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.solvers.padding import pad_matrix, pad_vector
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.lowering.solvers.simd_padding import pad_matrix, pad_vector
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.basis import cardinal_integrals, cardinal_values
 from scvi_codegen.tables.precision import mp

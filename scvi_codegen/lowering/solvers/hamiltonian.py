@@ -12,9 +12,15 @@ from scvi_codegen.ir.iterations import HamiltonianIteration
 from scvi_codegen.lowering.kernels import integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
 from scvi_codegen.lowering.solvers.coupled import over, weighted_tables
-from scvi_codegen.lowering.solvers.padding import MOST_LANES, lane_count, pad_matrix, pad_vector, predictor_tables_of
+from scvi_codegen.lowering.solvers.simd_padding import (
+    MOST_LANES,
+    lane_count,
+    pad_matrix,
+    pad_vector,
+    predictor_tables_of,
+)
 from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 
 __all__ = ["hamiltonian_iteration"]
 

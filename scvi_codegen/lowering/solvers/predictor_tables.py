@@ -1,7 +1,7 @@
 """Tables for adaptive step sizes on the grid h = 2^(k/4).
 
 The stored values of the last step, or of the last two, are extrapolated into the next by least-squares polynomials
-(:mod:`scvi_codegen.lowering.solvers.padding`); the grid has few ratios of step sizes, each with its own table. As
+(:mod:`scvi_codegen.lowering.solvers.simd_padding`); the grid has few ratios of step sizes, each with its own table. As
 predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section
 2.2), in sums that round the same on all platforms.
 """
@@ -15,7 +15,7 @@ from scvi_codegen.ir.control import AdaptivePredictor, Control
 from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.solvers.padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
+from scvi_codegen.lowering.solvers.simd_padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
 __all__ = ["control_of", "control_of_iteration", "predictor_of"]
 

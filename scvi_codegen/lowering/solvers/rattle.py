@@ -20,7 +20,7 @@ from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
 from scvi_codegen.mechanics.constraints import constraint_jacobian, nonholonomic_expressions
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import matrix_product, transpose

@@ -14,7 +14,7 @@ from __future__ import annotations
 from scvi_codegen.ir.iterations import SeparableIteration
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.padding import (
+from scvi_codegen.lowering.solvers.simd_padding import (
     MOST_LANES,
     lane_count,
     pad_matrix,
@@ -22,9 +22,9 @@ from scvi_codegen.lowering.solvers.padding import (
     predictor_tables_of,
 )
 from scvi_codegen.lowering.solvers.velocity_tables import VelocityTables, tableau_tables, velocity_tables
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.methods.shapes import Accelerations, Velocities
+from scvi_codegen.methods.stage_structure import Accelerations, Velocities
 from scvi_codegen.tables.basis import matrix_product
 from scvi_codegen.tables.precision import mp
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.numbers import lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.composition import kicks_and_drifts

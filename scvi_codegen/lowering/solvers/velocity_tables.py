@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.methods.shapes import Velocities
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Shape
 from scvi_codegen.tables.basis import legendre_functional, matrix_product, transpose
 from scvi_codegen.tables.precision import Matrix, Vector, mp

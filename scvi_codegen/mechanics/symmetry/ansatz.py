@@ -14,7 +14,7 @@ import numpy as np
 import sympy
 from sympy import Expr, prime
 
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.bodies import Body, bodies
 from scvi_codegen.mechanics.symmetry.invariants import Column, Monomial, Polynomial
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -12,7 +12,7 @@ from scvi_codegen.formulas.canonical import evaluated, unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.mechanics.constraints import with_constraint_forces
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.ansatz import combined, gauge_columns, polynomial_in
 from scvi_codegen.mechanics.symmetry.gauge import integrated, is_total_derivative
 from scvi_codegen.mechanics.symmetry.invariants import conserved

@@ -23,7 +23,7 @@ from sympy import Expr, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.subexpressions import parts
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.group_forces import array_value
 from scvi_codegen.mechanics.symmetry.sampling import Rates, Sample, drawn_parameters
 from scvi_codegen.mechanics.system import MechanicalSystem

@@ -22,7 +22,7 @@ from sympy import Expr, Symbol
 from scvi_codegen.formulas.subexpressions import parts
 from scvi_codegen.formulas.tape import Tape, evaluate
 from scvi_codegen.mechanics.constraints import constraint_multipliers, with_constraint_forces
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.group_forces import LARGEST, array_forces, array_value, exact_forces
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import TermGroup

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scvi_codegen.reproduce.kepler.motion import ellipse
+from scvi_codegen.reproduce.kepler.exact_flow import ellipse
 from scvi_codegen.reproduce.laboratory.drawing import COLORS
 
 if TYPE_CHECKING:

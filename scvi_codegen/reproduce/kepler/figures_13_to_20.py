@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scvi_codegen.methods import SVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler import more_points, smaller_steps
 from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
-from scvi_codegen.reproduce.kepler.motion import (
+from scvi_codegen.reproduce.kepler.exact_flow import (
     SYSTEM,
     angular_momentum,
     exact_flow,

@@ -19,7 +19,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI, SpectralCollocation
 from scvi_codegen.reproduce.kepler import many_points, phase_plane
 from scvi_codegen.reproduce.kepler.drawing import draw_ellipse, draw_states
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, perihelion, perihelion_turn, revolutions
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, perihelion, perihelion_turn, revolutions
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory

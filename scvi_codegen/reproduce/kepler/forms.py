@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SCVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, perihelion, perihelion_turn
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, perihelion, perihelion_turn
 from scvi_codegen.reproduce.kepler.step import structure_of
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods import SVI, Gauss, SpectralCollocation
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, exact_flow, perihelion
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, exact_flow, perihelion
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Verdict, holds
 from scvi_codegen.reproduce.laboratory.running import stepper_of
 from scvi_codegen.tables.precision import DIGITS, Number, mp

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.methods import Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.methods.method import Method
+from scvi_codegen.reproduce.kepler.exact_flow import ellipse
 from scvi_codegen.reproduce.kepler.forms import (
     ECCENTRICITY,
     FORMS,
@@ -26,7 +27,6 @@ from scvi_codegen.reproduce.kepler.forms import (
     structure_check,
     structure_table,
 )
-from scvi_codegen.reproduce.kepler.motion import ellipse
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.method import Method
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, angular_momentum, exact_flow
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, exact_flow
 from scvi_codegen.reproduce.laboratory.running import stepper_of
 from scvi_codegen.runtime.stepper import Stepper
 

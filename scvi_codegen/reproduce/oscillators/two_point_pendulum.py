@@ -10,7 +10,7 @@ import sympy
 from sympy import Rational, Symbol, cos, sin, sqrt
 
 from scvi_codegen.derivation.equations import derive
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.shooting import SCVI

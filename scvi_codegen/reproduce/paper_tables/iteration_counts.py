@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, perihelion
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, perihelion
 from scvi_codegen.reproduce.laboratory.picard import (
     Equations,
     NotSolvedError,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.reproduce.kepler.motion import SYSTEM, perihelion
+from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, perihelion
 from scvi_codegen.reproduce.laboratory.drawing import panels
 from scvi_codegen.reproduce.laboratory.experiment import (
     Comparison,

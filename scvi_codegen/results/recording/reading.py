@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from scvi_codegen.errors import RecordingError
 from scvi_codegen.files.export import COLUMNS, Piece, States, write_states
-from scvi_codegen.files.labelled import checked_units
+from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest

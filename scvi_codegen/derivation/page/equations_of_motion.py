@@ -11,7 +11,7 @@ from scvi_codegen.derivation.page.elision import formulas
 from scvi_codegen.display.page.blocks import Content, Formula, Paragraph, Section, TableBlock
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.mechanics.constraints import with_constraint_forces
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["motion_section", "system_section"]

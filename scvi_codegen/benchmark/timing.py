@@ -15,8 +15,8 @@ import numpy as np
 
 from scvi_codegen.benchmark.cases import STATES, Array
 from scvi_codegen.benchmark.contenders.contenders import Contender
-from scvi_codegen.benchmark.curves import Point
 from scvi_codegen.benchmark.references import Reference, rms_error
+from scvi_codegen.benchmark.work_precision import Point
 from scvi_codegen.errors import ScviCodegenError
 
 __all__ = ["PEER_ERRORS", "Measurement", "measure"]

@@ -11,11 +11,11 @@ import tempfile
 import time
 from typing import Any
 
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.native import building
 
-__all__ = ["run_start_up"]
+__all__ = ["run_cold_start"]
 
 FIRST_STEP = """
 import json, sys, time
@@ -36,17 +36,17 @@ print(json.dumps([imported - began, done - imported, symbolic, "sympy" in sys.mo
 """
 
 
-def run_start_up(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+def run_cold_start(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure medians, without and with cache in turn."""
     result: dict[str, list[dict[str, Any]]] = {"cold": [], "cached": []}
     for number in range(plan.rounds):
-        report_activity(f"start-up: round {number + 1}")
+        report_activity(f"cold start: round {number + 1}")
         with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
             for kind, rows in result.items():
                 rows.append(_first_step(folder) | {"cache": kind})
     formats = {"cache": "", "import_ms": ".0f", "first_step_ms": ".0f", "process_ms": ".0f"}
     return ResultTable(
-        name="start-up",
+        name="cold-start",
         title="from the text of Kepler's Lagrangian to the first step, in a fresh process",
         columns=formats | {"sympy_by_import": "", "sympy_by_step": ""},
         rows=tuple(_medians(rows) for rows in result.values()),

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.runtime.stepper import Stepper
 
-__all__ = ["Sampling", "run_samples"]
+__all__ = ["Sampling", "run_control_loop"]
 
 CALLS = 20_000
 """Number of calls of each kind in a round."""
@@ -79,7 +79,7 @@ class Sampling:
         return [self.advanced.q.tolist(), self.held.q.tolist(), list(self._memory.q)]
 
 
-def run_samples(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+def run_control_loop(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure microseconds per call: minima of processor time, all in turn, round after round."""
     rows = []
     for name, system in SYSTEMS.items():
@@ -89,7 +89,7 @@ def run_samples(plan: Plan, report_activity: ReportActivity) -> ResultTable:
             over = {"hold_over": times["hold"] - times["assign"], "advance_over": times["advance"] - times["bare"]}
             rows.append({"system": name, "by": method} | times | over)
     return ResultTable(
-        name="samples",
+        name="control-loop",
         title="microseconds per control step",
         columns={"system": "", "by": ""}
         | dict.fromkeys([key for key in rows[0] if key not in ("system", "by")], ".2f"),

@@ -13,14 +13,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.building import PORTABLE_FLAGS, TUNED_FLAGS
 
-__all__ = ["run_builds"]
+__all__ = ["run_compilers"]
 
 PROBLEMS = ("kepler", "outer-solar-system")
 DEGREES = (4, 8)
@@ -35,7 +35,7 @@ LEVELS: Mapping[str, tuple[str, str]] = {
 Step = Callable[[], object]
 
 
-def run_builds(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+def run_compilers(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure microseconds per step: minima of processor time, all builds in turn, round after round."""
     steps = max(1, int(STEPS * plan.share))
     builds = _builds()
@@ -49,7 +49,7 @@ def run_builds(plan: Plan, report_activity: ReportActivity) -> ResultTable:
                 rows[build][column] = 1e6 * seconds / steps
     columns = [key for key in next(iter(rows.values()), {}) if key != "build"]
     return ResultTable(
-        name="builds",
+        name="c-compilers",
         title="microseconds per step, by compiler and flags",
         columns={"build": ""} | dict.fromkeys(columns, ".2f"),
         rows=tuple(rows.values()),

@@ -9,13 +9,13 @@ from importlib.util import find_spec
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.large_cases import Lattice, bodies
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
-from scvi_codegen.benchmark.sums import reference_of, rms
+from scvi_codegen.benchmark.lattices import reference_of, rms
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
-__all__ = ["run_cluster"]
+__all__ = ["run_thousand_bodies"]
 
 State = tuple[Array, Array]
 """Final positions and velocities."""
@@ -27,7 +27,7 @@ OURS_BY = {"svi:2": (16, 32), "svi:4": (4, 8, 16), "svi:8": (2, 4, 8, 16), "comp
 
 
 @without_accuracy_warnings()
-def run_cluster(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+def run_thousand_bodies(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure every contender at several numbers of steps, each twice."""
     each = bodies(QUICK_COUNT if plan.quick else COUNT, SPAN)
     reference, doubt = reference_of(each)
@@ -40,7 +40,7 @@ def run_cluster(plan: Plan, report_activity: ReportActivity) -> ResultTable:
         errors = {"error": rms(end[0], reference), "energy_error": abs(energy(end) / before - 1.0)}
         rows.append({"by": name, "steps": steps, "ms": 1e3 * seconds, **errors})
     return ResultTable(
-        name="cluster",
+        name="thousand-bodies",
         title=f"{len(each.q)} bodies, direct sum, softened, to t = {SPAN:g}",
         columns={"by": "", "steps": "d", "ms": ".0f", "error": ".1e", "energy_error": ".1e"},
         rows=tuple(rows),

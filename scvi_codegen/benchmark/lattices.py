@@ -18,18 +18,18 @@ from scipy.integrate import solve_ivp
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS, openmm_run
-from scvi_codegen.benchmark.curves import Point, time_at
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, field, ring
 from scvi_codegen.benchmark.machine_limits import machine_limits
-from scvi_codegen.benchmark.plan import Plan, ReportActivity
+from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.work_precision import Point, time_at
 from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
-__all__ = ["reference_of", "rms", "run_growth", "run_sums"]
+__all__ = ["reference_of", "rms", "run_growth", "run_lattices"]
 
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
@@ -54,7 +54,7 @@ def lattices(plan: Plan) -> tuple[Lattice, ...]:
 
 
 @without_accuracy_warnings()
-def run_sums(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+def run_lattices(plan: Plan, report_activity: ReportActivity) -> ResultTable:
     """Measure the times of every contender at equal error."""
     rows: list[dict[str, Any]] = []
     for each in lattices(plan):
@@ -64,7 +64,7 @@ def run_sums(plan: Plan, report_activity: ReportActivity) -> ResultTable:
         rows += [_row(each, error, curves, doubt) for error in ERRORS]
     names = (OWN, "leapfrog", "order_8", "DOP853", "IAS15", "REBOUND_leapfrog", *PLATFORMS)
     return ResultTable(
-        name="sums",
+        name="lattices",
         title="time at equal error, and ratios of other methods",
         columns={"problem": "", "coordinates": "d", "error": ".0e", "ours_ms": ".2f", "by": ""}
         | dict.fromkeys(names, ".2f")

@@ -13,7 +13,7 @@ from sympy import Expr
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.ir.control import Control
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.mechanics.forms import forms_of
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 
