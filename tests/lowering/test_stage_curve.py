@@ -42,7 +42,7 @@ def test_leading_displacements_are_legendre_coefficients_of_the_acceleration(nam
     velocity = Legendre(np.random.default_rng(7).normal(size=degree + 1), domain=[0, 1])
     z = unknowns(system, method, degree, velocity)
     highest, following, whole, half = (
-        float(np.array(line[: len(z)], dtype=float) @ z) for line in (curve.highest, curve.next, *curve.bends)
+        float(np.array(line[: len(z)], dtype=float) @ z) for line in (curve.highest, curve.next, *curve.curvatures)
     )
     coefficients = [0.0, *velocity.deriv().coef]
     assert highest == pytest.approx(coefficients[-1], rel=1e-13)
