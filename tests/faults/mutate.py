@@ -1,13 +1,15 @@
 """Small faults put into the package and its templates, drawn at random: which are caught, and by what.
 
-    python tests/faults/mutate.py --count 150 --seed 1 --results results.jsonl
+    python tests/faults/reach.py reach.json
+    python tests/faults/mutate.py --count 150 --seed 1 --reach reach.json --results results.jsonl
 
 A fault is put into a copy of the checkout, in a folder of its own. ``verify`` is asked first, of systems by methods
-whose code the faulty file is part of, then the test files nearest to the file, one after the other; the first that
-notices ends it. Faults that do not compile or import are not counted. A fault on which more than ``--seconds`` of
-processor time were spent without a notice counts as one that survives, and its line says so. The results, a line a
-fault, say where to go on: those that stand there are not tried again, survivors are with ``--again``. The faults that
-were drawn stand in ``results.plan``, each with the text around it, so that they are found again in files that changed.
+whose code the faulty file is part of, then the test files that reach the line (``reach.py``), one after the other; the
+first that notices ends it. Faults that do not compile or import are not counted. A fault on which more than
+``--seconds`` of processor time were spent without a notice counts as one that survives, and its line says so. The
+results, a line a fault, say where to go on: those that stand there are not tried again, survivors are with ``--again``.
+The faults that were drawn stand in ``results.plan``, each with the text around it, so that they are found again in
+files that changed.
 """
 
 from __future__ import annotations
@@ -26,8 +28,8 @@ from functools import partial
 from pathlib import Path
 
 from checkout import ROOT, copied, run
-from near import near
 from operators import Place, places
+from reach import Reach
 
 PACKAGE = (
     *("ir", "lowering", "rendering", "methods", "runtime", "native", "mechanics", "files", "formulas", "tables"),
@@ -103,7 +105,7 @@ def planned(plan: Path, count: int, seed: int, only: str) -> list[tuple[str, Pla
     return found
 
 
-def noticed(copy: Path, place: Place, unfit: list[str], seconds: float) -> tuple[str, str]:
+def noticed(copy: Path, place: Place, reach: Reach, unfit: list[str], seconds: float) -> tuple[str, str]:
     """What noticed a fault, and in which words; ``""`` if nothing did. Tests that fail without it join the unfit."""
     end = _spent() + seconds
     path = copy / place.path
@@ -117,7 +119,7 @@ def noticed(copy: Path, place: Place, unfit: list[str], seconds: float) -> tuple
             code, words = certify()
         if code:
             return "stillborn" if code == 3 else "certificate", words
-        tests, failing = near(place.path), 0
+        tests, failing = reach.tests(place.path, text.count("\n", 0, place.start) + 1), 0
         while tests and _spent() < end:
             code, words = run(copy, *PYTEST, *(f"--deselect={test}" for test in unfit), tests[0])
             test = _failed(words)
@@ -175,6 +177,7 @@ def main() -> None:
     options.add_argument("--only", default="", help="beginning of the paths of files")
     options.add_argument("--seconds", type=float, default=600.0, help="of processor time for a fault")
     options.add_argument("--again", action="store_true", help="try once more what survived")
+    options.add_argument("--reach", type=Path, required=True, help="result of reach.py")
     options.add_argument("--results", type=Path, required=True)
     given = options.parse_args()
     lines = given.results.read_text().splitlines() if given.results.exists() else []
@@ -186,7 +189,7 @@ def main() -> None:
         for fault, place in planned(plan, given.count, given.seed, given.only):
             if fault in known and (known[fault] or not given.again):
                 continue
-            by, words = noticed(copy, place, unfit, given.seconds)
+            by, words = noticed(copy, place, Reach(given.reach), unfit, given.seconds)
             known[fault] = by
             with given.results.open("a") as results:
                 results.write(json.dumps({"fault": fault, "caught by": by, "words": words[:MOST_WORDS]}) + "\n")

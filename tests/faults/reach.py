@@ -1,4 +1,4 @@
-"""Which tests of the default tier reach which lines of the package and which templates, and how long they take.
+"""Tests of the default tier by the lines of the package and the templates that they reach, and how long they take.
 
     python tests/faults/reach.py reach.json
 
@@ -11,6 +11,7 @@ written after every file, is used by ``mutate.py``.
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import resource
@@ -18,6 +19,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from difflib import SequenceMatcher
 from pathlib import Path
 
 from checkout import ROOT
@@ -45,6 +47,9 @@ if FOLDER:
     atexit.register(write)
 '''
 """Contents of ``sitecustomize.py`` of all processes."""
+GOLDEN = "tests/golden/test_golden.py"
+NOT_GENERATING = ("runtime", "native", "files", "advice", "cli", "derivation", "exact", "models", "results")
+"""Folders of the package that no generated source depends on."""
 LONGEST = 900
 """Seconds after which a test file is ended; what it reached until then is lost."""
 
@@ -94,6 +99,48 @@ class Reach:
             self.texts.update({path: (ROOT / path).read_text() for path in self.lines[test]})
             self.templates[test] = sorted({name for names in opened for name in names})
         print(f"{self.seconds[test]:8.1f} s  status {code}  {test}", flush=True)
+
+    def tests(self, path: str, line: int) -> list[str]:
+        """Return the test files to show a fault in a line to, the most promising first.
+
+        Those named like the file come first, then those of its folder that reach it, then golden results, then others
+        by their time for each line of the file that they reach. Files may have changed or been renamed since.
+        """
+        room, stem = Path(path).parts[1], Path(path).stem
+        if path.startswith("templates"):
+            reached = {test: 1 for test in self.seconds if path in self.templates[test]}
+        else:
+            old = path if path in self.texts else self._former(path)
+            lines = self._former_lines(path, old, line)
+            reached = {test: len(own) for test in self.seconds if lines & {*(own := self.lines[test].get(old, ()))}}
+        named = sorted(str(file.relative_to(ROOT)) for file in ROOT.glob(f"tests/*/test_{stem}.py"))
+        order = sorted(reached, key=lambda test: self.seconds[test] / reached[test])
+        near = [test for test in order if test.startswith(f"tests/{room}/")]
+        unknown = sorted(str(file.relative_to(ROOT)) for file in ROOT.glob(f"tests/{room}/test_*.py"))
+        golden = [] if room in NOT_GENERATING else [GOLDEN]
+        found = [*named, *near, *golden, *order, *(test for test in unknown if test not in self.seconds)]
+        return [test for test in dict.fromkeys(found) if (ROOT / test).exists()]
+
+    def _former(self, path: str) -> str:
+        """Return the recorded file with most lines in common."""
+        now = {*(ROOT / path).read_text().splitlines()}
+        return max(self.texts, key=lambda old: len(now & {*self.texts[old].splitlines()}), default="")
+
+    def _former_lines(self, path: str, old: str, line: int) -> set[int]:
+        """Return the recorded numbers of the lines of the innermost statement at a line, without its body."""
+        text = (ROOT / path).read_text()
+        span = line, line
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or line):
+                body = getattr(node, "body", None)
+                last = body[0].lineno - 1 if body else node.end_lineno or line
+                if line <= last:
+                    span = node.lineno, last
+        blocks = SequenceMatcher(
+            None, text.splitlines(), self.texts[old].splitlines(), autojunk=False
+        ).get_matching_blocks()
+        moved = {a + k + 1: b + k + 1 for a, b, size in blocks for k in range(size)}
+        return {moved[number] for number in range(span[0], span[1] + 1) if number in moved}
 
 
 def _spent() -> float:
