@@ -36,8 +36,8 @@ from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.rolled import with_sums
 from scvi_codegen.lowering.solvers.predictor_tables import control_of
 from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of
@@ -352,19 +352,19 @@ def describe(
         notes=program.notes,
         system=system.name,
         method=method.name,
-        coordinates=program.coordinate_names,
-        parameters=program.parameter_names,
-        defaults=program.parameter_defaults,
-        unknowns=program.unknowns,
+        coordinates=program.layout.names,
+        parameters=program.layout.parameters,
+        defaults=program.layout.defaults,
+        unknowns=program.equations.unknowns,
         workspace=workspace_size(program),
-        has_action=program.action or (uses_fallback_library and program.acts),
-        map_names=tuple(each.name for each in program.momentum_maps),
-        map_formulas=tuple(each.formula for each in program.momentum_maps),
-        map_exact=tuple(each.exact for each in program.momentum_maps),
+        has_action=program.action or (uses_fallback_library and program.equations.acts),
+        map_names=tuple(each.name for each in program.quantities.momentum_maps),
+        map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
+        map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
         has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         time_transformation="" if g is None else str(g),
-        exchange_names=program.exchanges,
+        exchange_names=program.quantities.exchanges,
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,

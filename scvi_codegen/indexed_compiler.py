@@ -1,8 +1,8 @@
 """Compilation pipeline of indexed systems: from a Lagrangian in index notation to an integrator of any size.
 
     IndexedSystem  x  Method
-      -> lower       IndexedProgram  kernels of terms, tables of one coordinate (:mod:`scvi_codegen.lowering.indexed`)
-      -> render      Source          loops around kernels (:mod:`scvi_codegen.rendering.indexed`)
+      -> lower       Program  kernels of terms, tables of one coordinate (:mod:`scvi_codegen.lowering.arrays`)
+      -> render      Source          loops around kernels (:mod:`scvi_codegen.rendering.loops`)
       -> IndexedStepper              runs over arrays (:mod:`scvi_codegen.runtime.indexed_stepper`)
 
 Neither the length of the C source nor its compile time depends on the number of coordinates.
@@ -15,15 +15,16 @@ from dataclasses import replace
 from functools import cached_property
 
 from scvi_codegen.compiler import c_identifier
-from scvi_codegen.ir.indexed import IndexedProgram
-from scvi_codegen.lowering.indexed import check_solver, lower_indexed, one_coordinate, with_control
+from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.arrays import check_solver, lower_arrays, one_coordinate
+from scvi_codegen.lowering.solvers.predictor_tables import control_of
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.rendering.indexed import render_indexed
+from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.rendering.source_cache import cached_source
 from scvi_codegen.runtime.indexed_interface import IndexedInterface
@@ -87,23 +88,23 @@ class _IndexedSources:
         )
 
     @cached_property
-    def program(self) -> IndexedProgram:
+    def program(self) -> Program:
         """Lowered program with fixed step size."""
         with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-            return lower_indexed(self.system, self.method, self.prefix, newton=self.solver == "newton")
+            return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
 
     @cached_property
     def plain(self) -> Source:
         """C source with fixed step size."""
-        return Source.from_json(self._remembered("indexed", lambda: render_indexed(self.program).to_json()))
+        return Source.from_json(self._remembered("indexed", lambda: render(self.program).to_json()))
 
     @cached_property
     def controlled(self) -> Source | None:
         """C source with adaptive steps; ``None`` if the method has no error estimate."""
 
         def text() -> str:
-            program = with_control(self.program)
-            return render_indexed(program).to_json() if program else ""
+            control = control_of(self.program)
+            return render(self.program, control).to_json() if control else ""
 
         found = self._remembered("indexed controlled", text)
         return Source.from_json(found) if found else None

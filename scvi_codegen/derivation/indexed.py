@@ -8,10 +8,11 @@ from sympy import Expr, latex
 
 from scvi_codegen.formulas.indexed_latex import latex_entry, latex_sums
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.ir.indexed import ConstrainedSteps, IndexedProgram
+from scvi_codegen.ir.constraints import ConstrainedSteps
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
-from scvi_codegen.lowering.indexed import lower_indexed
+from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.arrays import lower_arrays
 from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms, constraint_text
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
@@ -28,7 +29,7 @@ def derive_sums(system: IndexedSystem, method: Method, *, as_latex: bool = False
     Raises:
         MethodError: for a method without fixed-point iteration.
     """
-    program = lower_indexed(system, method, "derived")
+    program = lower_arrays(system, method, "derived")
     if as_latex:
         return "\n".join(_latex(system))
     return "\n".join([*_text(system), "", *_step(program, method)])
@@ -72,15 +73,15 @@ def _latex(system: IndexedSystem) -> Iterator[str]:
             yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)} \]"
 
 
-def _step(program: IndexedProgram, method: Method) -> Iterator[str]:
+def _step(program: Program, method: Method) -> Iterator[str]:
     yield f"A step of h by {method.title}, from q, p to q', p', the same for every coordinate"
-    if program.held:
-        yield from _held(program.held)
+    if program.loops.constrained:
+        yield from _held(program.loops.constrained)
     elif program.splitting:
         yield from _splitting(program.splitting)
     elif isinstance(program.fixed_point, SeparableIteration):
         yield from _separable(program.fixed_point)
-    elif program.fixed_point:
+    elif isinstance(program.fixed_point, HamiltonianIteration):
         yield from _hamiltonian(program.fixed_point)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = ["Constraints", "Rattle"]
+__all__ = ["ConstrainedSteps", "Constraints", "Rattle"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,3 +59,18 @@ class Constraints:
     def count(self) -> int:
         """Number of constraints."""
         return len(self.formulas)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConstrainedSteps:
+    """Constrained steps by RATTLE.
+
+    Attributes:
+        conditions: g, g_t and the derivatives of g with respect to each slot, at every element.
+        curvatures: d^2 g / dt^2 at constant velocities.
+        parts: fractions of a step, each of which is a RATTLE step.
+    """
+
+    conditions: tuple[LoopedKernel, ...]
+    curvatures: tuple[LoopedKernel, ...]
+    parts: tuple[Number, ...]

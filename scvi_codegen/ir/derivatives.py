@@ -94,7 +94,7 @@ class Derivatives:
     def families(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
         """Stage groups with the derivatives of their kernels, and second derivatives, if requested and nonzero."""
         curvatures = self.curvatures or (None,) * len(self.by_given)
-        return tuple(zip(self.program.families, self.by_given, curvatures, strict=True))
+        return tuple(zip(self.program.equations.families, self.by_given, curvatures, strict=True))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -119,7 +119,7 @@ class Derivatives:
     @property
     def given(self) -> int:
         """Number of inputs of a step: q0, p0, parameters, t and h."""
-        return 2 * self.program.dimension + len(self.program.parameter_names) + 2
+        return 2 * self.program.dimension + len(self.program.layout.parameters) + 2
 
     @property
     def partials(self) -> int:
@@ -140,17 +140,23 @@ class Derivatives:
     def at_points(self) -> int:
         """Largest number of arguments and results at the points of a stage group."""
         return max(
-            family.points * (family.derivative.arguments + family.derivative.values) for family in self.program.families
+            family.points * (family.derivative.arguments + family.derivative.values)
+            for family in self.program.equations.families
         )
 
     @property
     def memory(self) -> int:
         """Doubles besides those of a step: derivatives; vectors of inputs, of unknowns (twice), of rows and points."""
         program = self.program
-        wide = self.given + 2 * program.unknowns + program.sites * (program.blocks + 1) + self.at_points
+        wide = (
+            self.given
+            + 2 * program.equations.unknowns
+            + program.equations.sites * (program.equations.blocks + 1)
+            + self.at_points
+        )
         wide += bool(self.damping)  # vectors of gamma h
         if self.curvatures:
-            wide += 4 * self.given + 2 * program.unknowns + 3 * self.at_points
+            wide += 4 * self.given + 2 * program.equations.unknowns + 3 * self.at_points
         return self.partials + wide * self.lanes + self.places
 
     @property
@@ -166,5 +172,5 @@ class Derivatives:
     @property
     def places(self) -> int:
         """Largest number of arguments of all points of a stage group, if second derivatives are requested."""
-        wanted = self.program.families if self.curvatures else ()
+        wanted = self.program.equations.families if self.curvatures else ()
         return max((family.points * family.derivative.arguments for family in wanted), default=0)

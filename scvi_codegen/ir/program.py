@@ -11,14 +11,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scvi_codegen.ir.constraints import Constraints, Rattle
+from scvi_codegen.indices import Array
+from scvi_codegen.ir.constraints import ConstrainedSteps, Constraints, Rattle
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.iterations import Splitting
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.stage_groups import LoweredStageGroup
 
-__all__ = ["FEW_UNKNOWNS", "Integrals", "MomentumMap", "Program"]
+__all__ = [
+    "FEW_UNKNOWNS",
+    "Integrals",
+    "Layout",
+    "LoopedTerms",
+    "MomentumMap",
+    "Program",
+    "Quantities",
+    "StageCurve",
+    "StageEquations",
+]
 
 LEAST_REUSED_UNKNOWNS = 32
 """Number of unknowns from which on factors of the Newton matrix are reused in later steps.
@@ -71,17 +82,43 @@ class StageCurve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Program:
-    """Intermediate representation of an integrator.
+class Layout:
+    """Arrays and parameters of a system; a named coordinate is an array without axes.
 
     Attributes:
-        prefix: C identifier that begins every exported name.
-        title: one line, the system and the method.
-        notes: lines for the header's comment: order, symmetry, symplecticity.
-        coordinate_names, parameter_names, parameter_defaults: for comments and for Python.
+        coordinates: arrays of coordinates.
+        momenta: of a Hamiltonian of arrays, after the coordinates in the state.
+        velocities: on which forces depend, after the coordinates at the points.
+        fields, tables: arrays of parameters and of indices.
+        sizes: names of the sizes of arrays.
+        parameters, defaults: names and default values of the numbers.
+        inputs: index of the first of the five parameters of each tabulated input, by name.
+    """
+
+    coordinates: tuple[Array, ...]
+    momenta: tuple[Array, ...] = ()
+    velocities: tuple[Array, ...] = ()
+    fields: tuple[Array, ...] = ()
+    tables: tuple[Array, ...] = ()
+    sizes: tuple[str, ...] = ()
+    parameters: tuple[str, ...]
+    defaults: tuple[float, ...]
+    inputs: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return tuple(array.name for array in self.coordinates)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageEquations:
+    """Unknowns and equations of a step of named coordinates, which Newton's method solves.
+
+    Attributes:
         sites: the coordinates, then the components of unknowns of other sizes.
         blocks: number of unknowns B at each site.
-        families: stage groups of the equations that Newton's method solves; none without it.
+        families: stage groups of the equations; none without Newton's method.
         places: (sites,) position of each site in matrices, in a bandwidth-reducing ordering.
         mass_positions: (m,) the same for the coordinates alone.
         bandwidth: largest distance of coupled sites in that ordering.
@@ -92,6 +129,38 @@ class Program:
         moving_blocks: (B,) 1 if h times the block is a displacement; convergence is tested with these.
         extrapolation: (B, B) predictor of the next step, sum_c table[c][b] z_c; below it the same for multipliers, if
             any.
+        acts: whether the equations are those of a discrete Lagrangian, which Newton's method evaluates.
+        stage_curve: error estimate from the unknowns, or ``None``.
+        numbers: equation numbers of the paper for a few unknowns, and for q1 and p1; ``""`` if it has none.
+    """
+
+    sites: int = 0
+    blocks: int = 0
+    families: tuple[LoweredStageGroup, ...] = ()
+    places: tuple[int, ...] = ()
+    mass_positions: tuple[int, ...] = ()
+    bandwidth: int = 0
+    momentum_rows: tuple[Number, ...] = ()
+    end_position: tuple[Number, ...] = ()
+    straight: tuple[int, ...] = ()
+    momentum_blocks: tuple[int, ...] = ()
+    moving_blocks: tuple[int, ...] = ()
+    extrapolation: NumberTable = ()
+    acts: bool = False
+    stage_curve: StageCurve | None = None
+    numbers: tuple[str, str, str] = ("", "", "")
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns: B per site."""
+        return self.blocks * self.sites
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quantities:
+    """Functions of the state of named coordinates that a run evaluates or integrates.
+
+    Attributes:
         legendre: p and dp/dv at (q, v); for a Hamiltonian, v and dv/dp at (q, p).
         mass_entries: (i, j) of the derivatives of ``legendre``.
         energy: L at (q, v), which with ``legendre`` gives the energy; for a Hamiltonian, H at (q, p).
@@ -99,70 +168,94 @@ class Program:
         momentum_maps: first integrals from symmetries.
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
             none.
-        iteration: the fixed-point iteration tried first, or ``None`` for Newton's method alone.
-        splitting: the explicit sequence that replaces both, or ``None``.
-        newton: whether Newton's method is included.
-        acts: whether the equations are those of a discrete Lagrangian, which Newton's method evaluates.
-        order: of the method; the number of its points if none is claimed.
-        polynomial_curves: whether the leading coefficient of a curve is an error estimate.
-        stage_curve: error estimate from the unknowns of Newton's method, or ``None``.
-        numbers: equation numbers of the paper for a few unknowns, and for q1 and p1; ``""`` if it has none.
         integrals: functions integrated along a run, or ``None``; the first one gives the time.
         exchanges: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
+    """
+
+    legendre: Kernel | None = None
+    mass_entries: tuple[tuple[int, int], ...] = ()
+    energy: Kernel | None = None
+    hamiltonian: bool = False
+    momentum_maps: tuple[MomentumMap, ...] = ()
+    momentum_kernel: Kernel | None = None
+    integrals: Integrals | None = None
+    exchanges: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopedTerms:
+    """Terms of a system of arrays, each in its loops.
+
+    Attributes:
+        forces, masses: of the equations of motion.
+        constants: terms of L, or of -H, without coordinates and momenta, which the energy needs.
+        constrained: constrained steps, instead of an iteration or a splitting.
+        products, diagonals: the Jacobian of the forces times a direction, and its diagonal, if Newton's method replaces
+            the fixed-point iteration.
+        reach: largest distance of lattice places that these couple; 0 if none, or if distances are not constant.
+    """
+
+    forces: tuple[LoopedKernel, ...] = ()
+    masses: tuple[LoopedKernel, ...] = ()
+    constants: tuple[LoopedKernel, ...] = ()
+    constrained: ConstrainedSteps | None = None
+    products: tuple[LoopedKernel, ...] = ()
+    diagonals: tuple[LoopedKernel, ...] = ()
+    reach: int = 0
+
+    @property
+    def applied(self) -> tuple[LoopedKernel, ...]:
+        """Terms that are evaluated at the points of a step."""
+        return (*self.forces, *self.products, *self.diagonals)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Program:
+    """Intermediate representation of an integrator.
+
+    Attributes:
+        prefix: C identifier that begins every exported name.
+        title: one line, the system and the method.
+        notes: lines for the header's comment: order, symmetry, symplecticity.
+        order: of the method; the number of its points if none is claimed.
+        layout: arrays and parameters.
+        fixed_point: the fixed-point iteration tried first, or ``None``; of a system of arrays that of one coordinate,
+            whose tables serve all.
+        splitting: the explicit sequence that replaces iterations, or ``None``.
+        newton: whether Newton's method for the stage equations is included.
+        polynomial_curves: whether the leading coefficient of a curve is an error estimate.
+        equations, quantities: of named coordinates.
         constraints: their kernels, or ``None``.
-        damping: the rate of a uniform damping, if there is one.
         rattle: tables of RATTLE, which is tried before Newton's method if applicable.
-        inputs: index of the first of the five parameters of each tabulated input, by name.
+        damping: the rate of a uniform damping, if there is one.
+        loops: of a system of arrays.
     """
 
     prefix: str
     title: str
     notes: tuple[str, ...]
-    coordinate_names: tuple[str, ...]
-    parameter_names: tuple[str, ...]
-    parameter_defaults: tuple[float, ...]
-    sites: int
-    blocks: int
-    families: tuple[LoweredStageGroup, ...]
-    places: tuple[int, ...]
-    mass_positions: tuple[int, ...]
-    bandwidth: int
-    momentum_rows: tuple[Number, ...]
-    end_position: tuple[Number, ...]
-    straight: tuple[int, ...]
-    momentum_blocks: tuple[int, ...]
-    moving_blocks: tuple[int, ...]
-    extrapolation: NumberTable
-    legendre: Kernel
-    mass_entries: tuple[tuple[int, int], ...]
-    energy: Kernel
-    hamiltonian: bool
-    momentum_maps: tuple[MomentumMap, ...]
-    momentum_kernel: Kernel | None
-    fixed_point: FixedPointIteration | None
-    splitting: Splitting | None
-    newton: bool
-    acts: bool
     order: int
-    polynomial_curves: bool
-    stage_curve: StageCurve | None
-    numbers: tuple[str, str, str]
-    integrals: Integrals | None = None
-    exchanges: tuple[str, ...] = ()
+    layout: Layout
+    fixed_point: FixedPointIteration | None = None
+    splitting: Splitting | None = None
+    newton: bool = False
+    polynomial_curves: bool = True
+    equations: StageEquations = StageEquations()
+    quantities: Quantities = Quantities()
     constraints: Constraints | None = None
-    inputs: tuple[tuple[str, int], ...] = ()
-    damping: Kernel | None = None
     rattle: Rattle | None = None
+    damping: Kernel | None = None
+    loops: LoopedTerms = LoopedTerms()
 
     @property
     def dimension(self) -> int:
-        """Degrees of freedom m."""
-        return len(self.coordinate_names)
+        """Degrees of freedom m of named coordinates."""
+        return len(self.layout.coordinates)
 
     @property
-    def unknowns(self) -> int:
-        """Number of unknowns: B per site."""
-        return self.blocks * self.sites
+    def in_loops(self) -> bool:
+        """True for a system of arrays."""
+        return bool(self.loops.forces or self.loops.masses)
 
     @property
     def error_power(self) -> int:
@@ -171,27 +264,25 @@ class Program:
             return 0
         if self.fixed_point:
             return self.fixed_point.error_power
-        return self.stage_curve.power if self.stage_curve else 0
+        return self.equations.stage_curve.power if self.equations.stage_curve else 0
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """All kernels, in the order of emission."""
-        pairs = (
-            [kernel for family in self.families for kernel in (family.value, family.derivative)] if self.newton else []
+        families, found = self.equations.families, self.quantities
+        constraints, rattle, integrals = self.constraints, self.rattle, found.integrals
+        kernels = (
+            *(kernel for family in families for kernel in (family.value, family.derivative)),
+            *(found.legendre, found.energy, *(family.integrand for family in families), found.momentum_kernel),
+            *(integrals.kernel if integrals else None, constraints and constraints.kernel),
+            *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
         )
-        along = [family.integrand for family in self.families if self.newton and family.integrand]
-        sums = {kernel.name: kernel for kernel in along}
-        maps = (self.momentum_kernel,) if self.momentum_kernel else ()
-        integrands = (self.integrals.kernel,) if self.integrals else ()
-        bound: tuple[Kernel, ...] = (self.constraints.kernel, self.constraints.motion) if self.constraints else ()
-        bound += (self.damping,) if self.damping else ()
-        bound += (self.rattle.force, self.rattle.mass) if self.rattle else ()
-        return (*pairs, self.legendre, *({self.energy.name: self.energy} | sums).values(), *maps, *integrands, *bound)
+        return tuple({kernel.name: kernel for kernel in kernels if kernel}.values())
 
     @property
     def constraint_positions(self) -> tuple[int, ...]:
         """Position of each constraint among the constraints, in the order of the sites."""
-        own = self.places[self.dimension :]
+        own = self.equations.places[self.dimension :]
         return tuple(sorted(own).index(place) for place in own)
 
     @property
@@ -205,14 +296,14 @@ class Program:
         """True if there is a discrete Lagrangian."""
         if self.splitting:
             return self.splitting.acts
-        return self.newton and self.acts
+        return self.newton and self.equations.acts
 
     @property
     def sums(self) -> int:
         """Number of sums along a curve of Newton's method: the action, or work and impulses."""
         if not self.newton:
             return 0
-        return len(self.exchanges) if self.exchanges else int(self.action)
+        return len(self.quantities.exchanges) if self.quantities.exchanges else int(self.action)
 
     @property
     def memory(self) -> int:
@@ -220,7 +311,7 @@ class Program:
         if self.splitting:
             return self.dimension
         points = self.fixed_point.memory(self.dimension) if self.fixed_point else 0
-        return max(points, self.unknowns + self.point if self.newton else 0)
+        return max(points, self.equations.unknowns + self.point if self.newton else 0)
 
     @property
     def reuses_factors(self) -> bool:
@@ -229,26 +320,27 @@ class Program:
         Nor with constraints, whose derivatives rotate with the motion: old factors then reduce the residual only
         tenfold per iteration.
         """
-        worth = self.unknowns >= LEAST_REUSED_UNKNOWNS and not self.constraints
+        worth = self.equations.unknowns >= LEAST_REUSED_UNKNOWNS and not self.constraints
         return self.newton and not self.splitting and worth
 
     @property
     def point(self) -> int:
         """Numbers that describe where the factors were computed: time, q0 with its compensation, unknowns."""
-        return 1 + 2 * self.dimension + self.unknowns if self.reuses_factors else 0
+        return 1 + 2 * self.dimension + self.equations.unknowns if self.reuses_factors else 0
 
     def matrix_size(self, sites: int, blocks: int) -> int:
         """Return the size of a matrix with ``blocks`` unknowns per site: its band with fill-in, or all of it."""
-        rows, reach = sites * blocks, (self.bandwidth + 1) * blocks - 1
+        rows, reach = sites * blocks, (self.equations.bandwidth + 1) * blocks - 1
         return rows * min(rows, 3 * reach + 1)
 
     def __str__(self) -> str:
         """Return readable text of the whole program."""
+        equations = self.equations
         head = [
             f"program {self.prefix}: {self.title}",
-            f"  {self.blocks} blocks of {self.sites} unknowns, bandwidth {self.bandwidth}",
+            f"  {equations.blocks} blocks of {equations.sites} unknowns, bandwidth {equations.bandwidth}",
         ]
-        for family in self.families:
+        for family in equations.families:
             head.append(f"  family {family.name}: {family.points} points")
             head += [
                 f"    gather  {loop.name}: {'q0 + ' * loop.from_state}h^{loop.power} sum_b {loop.name}[n][b] z[b]"

@@ -1,17 +1,22 @@
-"""Kernels of a system, as functions of its time and parameters."""
+"""Kernels of a system, as functions of its time and parameters, and loops around kernels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from sympy import Expr, Symbol
 
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
-from scvi_codegen.ir.kernel import Kernel
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel
+from scvi_codegen.mechanics.indexed.masses import MassTerm
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["damping_kernel", "integrand_kernel", "system_kernel"]
+__all__ = ["comment_text", "damping_kernel", "integrand_kernel", "looped_kernel", "system_kernel"]
 
 
 def integrand_kernel(system: MechanicalSystem, name: str, of: Iterable[Symbol]) -> Kernel | None:
@@ -57,3 +62,51 @@ def system_kernel(
         partials=tuple(partials),
     )
     return replace(kernel, purpose=purpose)
+
+
+def looped_kernel(
+    system: IndexedSystem,
+    name: str,
+    values: Iterable[Expr],
+    of: IndexedTerm | IndexedForce | MassTerm,
+    u: Sequence[tuple[Symbol, Access]] = (),
+    *,
+    along: Sequence[Symbol] = (),
+    targets: Sequence[Access] | None = None,
+    text: str,
+    purpose: str,
+) -> LoopedKernel:
+    """Return the kernel ``name`` in the loops of a term.
+
+    Args:
+        system, name, values, purpose: as of :func:`system_kernel`.
+        of: the term, whose other entries are the last parameters.
+        u: entries that are arguments.
+        along: further arguments, the components of a direction by these entries.
+        targets: entries that the values are added to; by default ``u``.
+        text: formula for the comment.
+    """
+    symbols, accesses = [slot for slot, _ in u], tuple(access for _, access in u)
+    given = [(slot, access) for slot, access in of.slots if slot not in symbols]
+    kernel = lower_kernel(
+        name,
+        arguments=(*symbols, *along),
+        time=system.time,
+        parameters=(*system.parameters, *(slot for slot, _ in given)),
+        values=tuple(values),
+    )
+    return LoopedKernel(
+        kernel=replace(kernel, purpose=purpose),
+        loops=of.loops,
+        slots=accesses * (2 if along else 1),
+        targets=accesses if targets is None else tuple(targets),
+        given=tuple(access for _, access in given),
+        text=comment_text(text),
+        along=len(along),
+    )
+
+
+def comment_text(text: str) -> str:
+    """Return one printable line that neither ends nor begins a C comment."""
+    line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
+    return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")

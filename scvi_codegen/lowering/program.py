@@ -8,16 +8,26 @@ import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
+from scvi_codegen.indices import Array
 from scvi_codegen.ir.constraints import Rattle
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
-from scvi_codegen.ir.program import FEW_UNKNOWNS, Integrals, MomentumMap, Program, StageCurve
+from scvi_codegen.ir.program import (
+    FEW_UNKNOWNS,
+    Integrals,
+    Layout,
+    MomentumMap,
+    Program,
+    Quantities,
+    StageCurve,
+    StageEquations,
+)
 from scvi_codegen.ir.stage_groups import LoweredStageGroup
 from scvi_codegen.lowering.bandwidth_ordering import bandwidth, places
 from scvi_codegen.lowering.constraints import lowered_constraints
-from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
+from scvi_codegen.lowering.kernels import comment_text, damping_kernel, integrand_kernel, system_kernel
 from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
 from scvi_codegen.lowering.stage_groups import has_action, lowered_stage_group
 from scvi_codegen.lowering.unknown_layout import layout_of
@@ -53,7 +63,7 @@ def lower(
         system, method: the system and the method.
         stages: its equations (:func:`scvi_codegen.methods.discretise.discretise`).
         prefix: a C identifier.
-        iteration: the fixed-point iteration to try first
+        fixed_point: the fixed-point iteration to try first
             (:func:`scvi_codegen.lowering.solvers.selection.iteration_of`).
         splitting: the explicit solver that replaces both
             (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
@@ -65,17 +75,16 @@ def lower(
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
     mass = forms_of(system).legendre_jacobian
     families = tuple(lowered_stage_group(system, family, sites) for family in stages.families) if newton else ()
-    constraints = lowered_constraints(system)
     coupled = [*mass, *_coupled_coordinates(families)]
     order = places(coupled, sites.count)
     polynomial = method.exactness.curve != 0
-    return Program(
-        prefix=prefix,
-        title=comment_text(f"{system.name}: {method.title}"),
-        notes=notes_of(method, system),
-        coordinate_names=tuple(q.name for q in system.coordinates),
-        parameter_names=tuple(parameter.name for parameter in system.parameters),
-        parameter_defaults=system.defaults,
+    layout = Layout(
+        coordinates=tuple(Array(q.name, ()) for q in system.coordinates),
+        parameters=tuple(parameter.name for parameter in system.parameters),
+        defaults=system.defaults,
+        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
+    )
+    equations = StageEquations(
         sites=sites.count,
         blocks=len(blocks),
         families=families,
@@ -90,26 +99,35 @@ def lower(
         extrapolation=lower_matrix(
             tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
         ),
+        acts=sites.count == m and has_action(system) and any(family.in_action for family in stages.families),
+        stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
+        numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
+    )
+    quantities = Quantities(
         legendre=_legendre_kernel(system),
         mass_entries=tuple(mass),
         energy=_energy_kernel(system),
         hamiltonian=bool(system.auxiliaries),
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
+        integrals=_integrals(system, method, stages),
+        exchanges=_exchanges(system, stages),
+    )
+    return Program(
+        prefix=prefix,
+        title=comment_text(f"{system.name}: {method.title}"),
+        notes=notes_of(method, system),
+        order=method.order or len(stages.blocks),
+        layout=layout,
         fixed_point=fixed_point,
         splitting=splitting,
         newton=newton,
-        acts=sites.count == m and has_action(system) and any(family.in_action for family in stages.families),
-        order=method.order or len(stages.blocks),
         polynomial_curves=polynomial,
-        stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
-        integrals=_integrals(system, method, stages),
-        exchanges=_exchanges(system, stages),
-        constraints=constraints,
-        damping=damping_kernel(system),
+        equations=equations,
+        quantities=quantities,
+        constraints=lowered_constraints(system),
         rattle=rattle,
-        inputs=tuple((name, system.parameters.index(symbol(f"{name}_0"))) for name in system.inputs),
-        numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
+        damping=damping_kernel(system),
     )
 
 
@@ -238,12 +256,6 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
 def _coupled_coordinates(families: Sequence[LoweredStageGroup]) -> list[tuple[int, int]]:
     """Return the pairs of coordinates with a nonzero derivative."""
     return [pair for family in families for block in family.blocks for pair in block.entries]
-
-
-def comment_text(text: str) -> str:
-    """Return one printable line that neither ends nor begins a C comment."""
-    line = "".join(character if character.isprintable() else "?" for character in " ".join(text.split()))
-    return line.replace("*/", "* /").replace("/*", "/ *").replace("??/", "? ? /")
 
 
 def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ import numpy as np
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.indexed import parse_array
 from scvi_codegen.indices import Array
-from scvi_codegen.lowering.indexed import SOLVERS, one_coordinate
+from scvi_codegen.lowering.arrays import SOLVERS, one_coordinate
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.array_values import is_filled, read_array

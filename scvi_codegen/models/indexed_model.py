@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.lowering.indexed import SOLVERS, check_solver
+from scvi_codegen.lowering.arrays import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import (

@@ -21,7 +21,7 @@ from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folde
 from scvi_codegen.models.indexed_document import model_texts
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.package import prefix_of, source_in
-from scvi_codegen.rendering.indexed import render_indexed_example
+from scvi_codegen.rendering.program_source import render_array_example
 from scvi_codegen.runtime.indexed_interface import read_arrays, read_state, table_limits
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, checks_arguments, of
@@ -47,7 +47,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         arrays[moving] = _flat(read_state(interface, given, moving))
     arrays |= {f"field_{name}": values for name, values in problem.fields.items()}
     arrays |= {f"table_{name}": values for name, values in problem.places.items()}
-    example = render_indexed_example(
+    example = render_array_example(
         source.prefix,
         title=interface.title,
         momenta=bool(interface.momenta),

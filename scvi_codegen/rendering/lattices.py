@@ -6,17 +6,17 @@ from math import prod
 from typing import Any
 
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
 
 __all__ = ["lattice_context", "roots_per_coordinate"]
 
 
-def lattice_context(program: IndexedProgram) -> dict[str, Any]:
+def lattice_context(program: Program) -> dict[str, Any]:
     """Return the template's context for lattices."""
     before: list[str] = []
     lines: list[str] = []
-    for array in program.coordinates:
+    for array in program.layout.coordinates:
         sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
         first = " + ".join(before) or "0"
         lines.append(
@@ -25,15 +25,15 @@ def lattice_context(program: IndexedProgram) -> dict[str, Any]:
         before.append(product_text(array))
     return {
         "lattices": lines,
-        "axes": max(map(_axes, program.coordinates)),
-        "components": sum(map(_components, program.coordinates)),
+        "axes": max(map(_axes, program.layout.coordinates)),
+        "components": sum(map(_components, program.layout.coordinates)),
         "sizes": list(sizes_text(program, " ".join(lines))),
     }
 
 
-def roots_per_coordinate(program: IndexedProgram) -> int:
+def roots_per_coordinate(program: Program) -> int:
     """Return the doubles per coordinate that suffice for the roots of unity of every axis."""
-    return 2 * max(map(_axes, program.coordinates))
+    return 2 * max(map(_axes, program.layout.coordinates))
 
 
 def _axes(array: Array) -> int:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 from scvi_codegen.indices import Access, Loop, Place
-from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.kernel import LoopedKernel
+from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.layout import wrapped, wrapped_comment
 from scvi_codegen.rendering.sizes import product_text, size_text, sizes_text
 from scvi_codegen.rendering.thread_partition import Sharing
@@ -26,10 +26,10 @@ Lines: TypeAlias = Callable[[int], list[str]]
 """Function that returns the lines of a slot, by its number."""
 
 
-def _starts(program: IndexedProgram) -> Iterator[tuple[str, str]]:
+def _starts(program: Program) -> Iterator[tuple[str, str]]:
     """Yield the offset of each array in the state: coordinates, then momenta of a Hamiltonian, or velocities."""
     sizes: list[str] = []
-    for array in (*program.coordinates, *program.momenta, *program.velocities):
+    for array in (*program.layout.coordinates, *program.layout.momenta, *program.layout.velocities):
         yield array.name, " + ".join(sizes) or "0"
         sizes.append(product_text(array))
 
@@ -52,7 +52,7 @@ class Nest:
 
     def __init__(
         self,
-        program: IndexedProgram,
+        program: Program,
         looped: LoopedKernel,
         scalar: str,
         source: str,
@@ -64,7 +64,7 @@ class Nest:
         self.chunked, self.sharing = chunked, sharing
         self.levels = {loop.index: depth for depth, loop in enumerate(looped.loops, 1)}
         self.loops = {loop.index: loop for loop in looped.loops}
-        self.scalars = len(program.parameter_names)
+        self.scalars = len(program.layout.parameters)
 
     def depth_of(self, access: Access) -> int:
         """Return the depth of the innermost loop on whose index an entry depends."""
@@ -197,7 +197,7 @@ class Nest:
     def index(self, place: Place) -> str:
         """Return an index on an axis."""
         if place.table:
-            columns = next(table for table in self.program.tables if table.name == place.table).axes[1].number
+            columns = next(table for table in self.program.layout.tables if table.name == place.table).axes[1].number
             return f"table_{place.table}[index_{place.index} * {columns} + {place.column}]"
         if not place.index:
             return size_text(place.base)
@@ -238,7 +238,10 @@ class Nest:
         for name, start in _starts(self.program):
             if re.search(rf"\bstart_{name}\b", text):
                 yield f"const long long start_{name} = {start};"
-        for kind, arrays, number in (("field", self.program.fields, "double"), ("table", self.program.tables, "int")):
+        for kind, arrays, number in (
+            ("field", self.program.layout.fields, "double"),
+            ("table", self.program.layout.tables, "int"),
+        ):
             for k, array in enumerate(arrays):
                 if f"{kind}_{array.name}[" in text:
                     yield f"const {number} *{kind}_{array.name} = given->{kind}[{k}];"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias
 
 from scvi_codegen.ir.iteration import FixedPointIteration
@@ -15,6 +15,7 @@ __all__ = [
     "ARRAYS",
     "INVERSE_ROOT",
     "constants",
+    "inverse_roots",
     "lane_functions",
     "print_expression",
     "print_lane_statements",
@@ -82,6 +83,12 @@ def lane_functions(kernel: Kernel, sources: Sources) -> set[str]:
 def scalar_functions(kernel: Kernel) -> set[str]:
     """Return all functions that occur in a kernel."""
     return set().union(*(_functions(part, lambda expression: True) for part in _every_part(kernel)))
+
+
+def inverse_roots(kernels: Iterable[Kernel]) -> list[int]:
+    """Return the k of all ``inverse_root_k`` that occur in kernels."""
+    names = set().union(*map(scalar_functions, kernels))
+    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in names if name.startswith(INVERSE_ROOT))
 
 
 def constants(kernel: Kernel) -> Iterator[Number]:

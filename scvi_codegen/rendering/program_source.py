@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Literal, NamedTuple, TypeAlias, cast, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.derivatives import Derivatives
@@ -22,7 +22,8 @@ from scvi_codegen.rendering.control import predictor_text
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.fallback import Fallback
-from scvi_codegen.rendering.printer import INVERSE_ROOT, constants, scalar_functions
+from scvi_codegen.rendering.loops import loop_context
+from scvi_codegen.rendering.printer import constants, inverse_roots
 from scvi_codegen.rendering.simd import POINTS, TRAJECTORIES, iteration_source
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
@@ -34,6 +35,7 @@ __all__ = [
     "EventSearch",
     "ExampleRun",
     "render",
+    "render_array_example",
     "render_derivatives",
     "render_embedded",
     "render_events",
@@ -51,6 +53,7 @@ DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
+    "indexed": "parts/indexed_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -133,6 +136,8 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
 
     If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
     """
+    if program.in_loops:
+        return _render(program.prefix, loop_context(program) | _control_context(program, control), "indexed")
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
@@ -150,7 +155,7 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
         MethodError: for a number outside the range of single precision.
     """
     target = TARGETS[precision]
-    target.check((*program.parameter_defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
+    target.check((*program.layout.defaults, *chain(*map(constants, _scalar_kernels(program, control)))))
     bound = f"{program.prefix.upper()}_MAX_ITERATIONS"
     bounded = {"embedded": True, "longest": MAX_ITERATIONS, "max_iterations": bound, "most_iterations": bound}
     return _render(program.prefix, _context(program, target, control) | bounded).amalgamated()
@@ -183,7 +188,7 @@ def render_ensemble(program: Program) -> Source | None:
     Also ``None`` with integrals: with a time transformation, trajectories have no common times.
     """
     fixed_point = program.fixed_point
-    if fixed_point is None or not fixed_point.serves_many or program.integrals:
+    if fixed_point is None or not fixed_point.serves_many or program.quantities.integrals:
         return None
     prefix = f"{program.prefix}_ensemble"
     context = {
@@ -210,7 +215,7 @@ def render_events(search: EventSearch) -> Source:
         "real": DOUBLE.scalar,
         "kernel": search.kernel,
         "cut": is_divided((search.kernel,)),
-        "inverse_roots": _inverse_roots(scalar_functions(search.kernel)),
+        "inverse_roots": inverse_roots((search.kernel,)),
     }
     return _render(f"{search.prefix}_events", context, "events")
 
@@ -234,6 +239,19 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
     return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
 
 
+def render_array_example(prefix: str, **start: Any) -> dict[str, str]:
+    """Return ``main.c`` and ``Makefile`` that run the integrator from arrays in files of the same folder.
+
+    Args:
+        prefix: of the C names.
+        start: title, momenta (whether the system is Hamiltonian), numbers, sizes, fields and tables with their lengths,
+            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
+    """
+    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
+    templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
+    return {name: environment.get_template(template).render(context) for name, template in templates.items()}
+
+
 def workspace_size(program: Program) -> int:
     """Return the doubles of workspace: scratch, memory; unknowns, point, update, pivots, rows, Jacobian of Newton.
 
@@ -241,15 +259,15 @@ def workspace_size(program: Program) -> int:
     """
     if not program.newton:
         return scratch_size(program) + program.memory + 1
-    rows = program.unknowns + program.sites
-    jacobian = program.matrix_size(program.sites, program.blocks + (1 if program.action else 0))
-    return scratch_size(program) + program.memory + program.unknowns + program.point + 3 * rows + jacobian
+    rows = program.equations.unknowns + program.equations.sites
+    jacobian = program.matrix_size(program.equations.sites, program.equations.blocks + (1 if program.action else 0))
+    return scratch_size(program) + program.memory + program.equations.unknowns + program.point + 3 * rows + jacobian
 
 
 def scratch_size(program: Program) -> int:
     """Return the doubles for the kernels of one stage group, or for the mass matrix with its derivatives."""
-    mass = program.matrix_size(program.dimension, 1) + len(program.mass_entries)
-    return max(mass, *(family.scratch for family in program.families)) if program.newton else mass
+    mass = program.matrix_size(program.dimension, 1) + len(program.quantities.mass_entries)
+    return max(mass, *(family.scratch for family in program.equations.families)) if program.newton else mass
 
 
 def _context(
@@ -271,7 +289,7 @@ def _context(
         "real": target.scalar,
         "kernels": kernels,
         "cut": is_divided((*scalars, *(program.fixed_point.kernels if program.fixed_point else ()), *lanes)),
-        "inverse_roots": _inverse_roots(set().union(*map(scalar_functions, scalars))),
+        "inverse_roots": inverse_roots(scalars),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
         "max_iterations": MAX_ITERATIONS,
@@ -307,8 +325,3 @@ def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]
 def _size(fixed_point: FixedPointIteration) -> int:
     """Return the number of operations of all kernels on lanes."""
     return sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
-
-
-def _inverse_roots(functions: set[str]) -> list[int]:
-    """Return the k of all ``inverse_root_k``."""
-    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in functions if name.startswith(INVERSE_ROOT))

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from scvi_codegen.indices import Array, Loop, Size
-from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.program import Program
 
 __all__ = ["count_text", "product_text", "size_text", "sizes_text"]
 
@@ -33,8 +33,8 @@ def size_text(size: Size) -> str:
     return f"size_{size.name}{f' {number[0]} {number[1:]}' if size.number else ''}" if size.name else str(size.number)
 
 
-def sizes_text(program: IndexedProgram, text: str) -> Iterator[str]:
+def sizes_text(program: Program, text: str) -> Iterator[str]:
     """Yield declarations of the sizes that occur in a source."""
-    for k, name in enumerate(program.sizes):
+    for k, name in enumerate(program.layout.sizes):
         if re.search(rf"\bsize_{name}\b", text):
             yield f"const long long size_{name} = given->size[{k}];"

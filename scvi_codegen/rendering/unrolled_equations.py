@@ -54,7 +54,7 @@ class UnrolledEquations:
 
 def unrolled_equations(program: Program, target: Target) -> UnrolledEquations | None:
     """Return the unrolled equations, ``None`` if loops over tables are shorter."""
-    if not program.newton or program.unknowns > FEW_UNKNOWNS or program.damping:
+    if not program.newton or program.equations.unknowns > FEW_UNKNOWNS or program.damping:
         return None
     writer = _Statements(program, target)
     entries = writer.entries()
@@ -68,7 +68,7 @@ class _Statements:
 
     def __init__(self, program: Program, target: Target) -> None:
         self.program, self.target = program, target
-        families = program.families
+        families = program.equations.families
         self.u = list(accumulate((each.points * each.value.arguments for each in families), initial=0))
         self.value = list(accumulate((each.points * each.value.values for each in families), initial=0))
         self.partials = [len(each.derivative.results) - each.derivative.values for each in families]
@@ -77,10 +77,10 @@ class _Statements:
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> UnrolledEquations:
         """Return all statements, with the given entries of the Jacobian."""
-        program, blocks = self.program, self.program.blocks
-        sites = range(program.sites)
+        program, blocks = self.program, self.program.equations.blocks
+        sites = range(program.equations.sites)
         return UnrolledEquations(
-            families=tuple(self._family(k, family) for k, family in enumerate(program.families)),
+            families=tuple(self._family(k, family) for k, family in enumerate(program.equations.families)),
             sizes=(self.u[-1], self.value[-1], self.derivative[-1]),
             residuals=tuple(
                 _statement(f"rows[{s * (blocks + 1) + r}] = {self._sum(self._row(s, r))};")
@@ -112,7 +112,10 @@ class _Statements:
         for n in range(family.points):
             for loop in family.gathers:
                 for i in range(loop.sites):
-                    unknowns = [f"z[{(loop.first + i) * self.program.blocks + b}]" for b in range(self.program.blocks)]
+                    unknowns = [
+                        f"z[{(loop.first + i) * self.program.equations.blocks + b}]"
+                        for b in range(self.program.equations.blocks)
+                    ]
                     terms = list(zip(loop.table[n], unknowns, strict=True))
                     text = _scaled(loop.power, self._sum(terms))
                     if loop.from_state:
@@ -122,9 +125,9 @@ class _Statements:
     def _row(self, site: int, row: int) -> list[Term]:
         """Return the terms of row ``row`` of a site, the last row that of p1."""
         program = self.program
-        begins = row < program.blocks and site < program.dimension
-        terms = [(program.momentum_rows[row], f"step->p0[{site}]")] if begins else []
-        for k, family in enumerate(program.families):
+        begins = row < program.equations.blocks and site < program.dimension
+        terms = [(program.equations.momentum_rows[row], f"step->p0[{site}]")] if begins else []
+        for k, family in enumerate(program.equations.families):
             for loop in family.scatters:
                 if loop.first <= site < loop.first + loop.sites:
                     for n, weight in enumerate(family.weights):
@@ -135,14 +138,14 @@ class _Statements:
     def _magnitudes(self) -> Iterator[str]:
         """Yield the statements of the magnitudes of p1, then of q1: sums of absolute values."""
         program = self.program
-        for s in range(program.sites):
+        for s in range(program.equations.sites):
             own = [f"step->p0[{s}]"] if s < program.dimension else []
-            terms = [*own, *(self._sum([term]) for term in self._row(s, program.blocks) if term[0])]
+            terms = [*own, *(self._sum([term]) for term in self._row(s, program.equations.blocks) if term[0])]
             yield f"size_p[{s}] = {_magnitude(terms)};"
         for i in range(program.dimension):
             moves = [
-                self._product(end, 1, f"z[{i * program.blocks + b}]", first=True)
-                for b, end in enumerate(program.end_position)
+                self._product(end, 1, f"z[{i * program.equations.blocks + b}]", first=True)
+                for b, end in enumerate(program.equations.end_position)
                 if end
             ]
             yield f"size_q[{i}] = {_magnitude([f'step->q0[{i}]', *moves])};"
@@ -150,16 +153,16 @@ class _Statements:
     def entries(self) -> dict[tuple[int, int, int, int], list[list[Term]]]:
         """Return the sums by row (i, r) and column (j, b) of the Jacobian, one sum per pair of tables."""
         entries: dict[tuple[int, int, int, int], list[list[Term]]] = {}
-        for k, family in enumerate(self.program.families):
+        for k, family in enumerate(self.program.equations.families):
             for block in family.blocks:
                 row, column = family.scatters[block.scatter], family.gathers[block.gather]
                 for e, (i, j) in enumerate(block.entries):
-                    for b in range(self.program.blocks):
+                    for b in range(self.program.equations.blocks):
                         factors = [
                             self._derivative_factor(k, n, block.first + e, row.power + column.power, column.table[n][b])
                             for n in range(family.points)
                         ]
-                        for r in range(self.program.blocks):
+                        for r in range(self.program.equations.blocks):
                             coefficients = [line[r] for line in row.table]
                             terms = [(c, text) for c, text in zip(coefficients, factors, strict=True) if c and text]
                             if terms:
@@ -171,7 +174,7 @@ class _Statements:
         if not coefficient:
             return ""
         derivative = f"derivative[{self.derivative[k] + n * self.partials[k] + e}]"
-        product = self._product(self.program.families[k].weights[n], power, derivative)
+        product = self._product(self.program.equations.families[k].weights[n], power, derivative)
         return product if coefficient == 1 else f"{product} * {self._signed(coefficient)}"
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:

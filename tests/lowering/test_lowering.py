@@ -140,7 +140,7 @@ def test_kernels_have_the_values_and_derivatives_of_their_formulas(name, method)
     system = problem(name).system
     program = lowered(system, method)
     points = random.Random(name)
-    for family, own in zip(method.stage_system(system).families, program.families, strict=True):
+    for family, own in zip(method.stage_system(system).families, program.equations.families, strict=True):
         symbols = (*family.arguments, system.time, *system.parameters)
         point = {symbol: sympy.Rational(points.randint(1, 30), 64) for symbol in symbols}
         point |= {symbol: 1 + value for symbol, value in point.items() if symbol in system.parameters}
@@ -219,7 +219,7 @@ def test_integer_powers_are_products_and_others_are_calls():
 def test_symbolic_cost_does_not_grow_with_the_degree(family, system):
     small, large = (lowered(system, family(degree)) for degree in (2, 12))
     assert large.kernels == small.kernels
-    assert large.blocks > small.blocks
+    assert large.equations.blocks > small.equations.blocks
 
 
 def test_a_chain_of_256_masses_lowers_without_recursion():

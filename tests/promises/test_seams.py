@@ -96,7 +96,8 @@ from scvi_codegen.compiler import program_of
 assert scvi_codegen.__file__.startswith(sys.path[0])
 system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
 own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
-print(own.families == gauss.families, own.fixed_point == gauss.fixed_point, *(each.exact for each in own.momentum_maps))
+same = own.equations.families == gauss.equations.families, own.fixed_point == gauss.fixed_point
+print(*same, *(each.exact for each in own.quantities.momentum_maps))
 """
     assert run(extended, script).split() == ["True", "True", "True"]
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 from style import check_style
 
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate, with_control
+from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
+from scvi_codegen.lowering.solvers.predictor_tables import control_of
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.indexed import render_indexed
+from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Wno-psabi", "-Werror"]
@@ -56,10 +57,10 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
         tables=["bonds[B, 2]"],
         forces=FORCES.get(name),
     )
-    program = lower_indexed(system, as_method(method, one_coordinate(system)), "indexed", newton=newton)
-    controlled = with_control(program)
-    assert controlled is not None or method == "stoermer-verlet"
-    return render_indexed(controlled or program)
+    program = lower_arrays(system, as_method(method, one_coordinate(system)), "indexed", newton=newton)
+    control = control_of(program)
+    assert control is not None or method == "stoermer-verlet"
+    return render(program, control)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from programs import needs
 import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.indexed_compiler import generate_indexed
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.thread_partition import Sharing, sharing_of
@@ -140,8 +140,8 @@ def bits(run: Any) -> tuple[Any, ...]:
 @pytest.mark.parametrize("name", CASES)
 def test_terms_are_distributed_over_threads(name: str) -> None:
     system = system_of(CASES[name])
-    program = lower_indexed(system, as_method("svi:2", one_coordinate(system)), "shared")
-    assert {sharing_of(looped) for looped in program.forces} == {CASES[name].shared}
+    program = lower_arrays(system, as_method("svi:2", one_coordinate(system)), "shared")
+    assert {sharing_of(looped) for looped in program.loops.forces} == {CASES[name].shared}
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -20,7 +20,7 @@ from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_d
 
 from scvi_codegen.compiler import _Sources, generate_source
 from scvi_codegen.indexed_compiler import _IndexedSources
-from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

@@ -16,8 +16,9 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen import indexed_compiler
 from scvi_codegen.cli import main
-from scvi_codegen.ir.indexed import IndexedProgram
-from scvi_codegen.rendering.indexed import render_indexed
+from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.program import Program
+from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source
 
 RANDOM = np.random.default_rng(3)
@@ -138,13 +139,13 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     name, method, pattern, replacement = FAULTS[fault]
     edits = 0
 
-    def rendered(program: IndexedProgram) -> Source:
+    def rendered(program: Program, control: Control | None = None) -> Source:
         nonlocal edits
-        source = render_indexed(program).amalgamated()
+        source = render(program, control).amalgamated()
         code, edits = re.subn(pattern, replacement, source.code, count=1)
         return replace(source, code=code)
 
-    monkeypatch.setattr(indexed_compiler, "render_indexed", rendered)
+    monkeypatch.setattr(indexed_compiler, "render", rendered)
     monkeypatch.setattr(indexed_compiler, "cached_source", lambda *given: given[-1]())
     found = certificate(name, method)
     assert edits == 1

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from scvi_codegen.benchmark.large_cases import field, ring
 from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.ir.indexed import IndexedProgram
 from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.lowering.indexed import lower_indexed, one_coordinate
+from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.methods import as_method
 
 __all__: list[str] = []
@@ -36,23 +36,23 @@ def _one_size(method: str, name: str, size: int) -> str:
         run.advance(steps)
         best = min(best, (time.process_time() - start) / steps)
     iterations = (run.iterations - iterations_before) / (7 * steps)
-    program = lower_indexed(each.system, as_method(method, one_coordinate(each.system)), name)
+    program = lower_arrays(each.system, as_method(method, one_coordinate(each.system)), name)
     rates = [1e-9 * each * count / best for each in (_operations(program, iterations), _bytes(program, iterations))]
     numbers = (first, 1e9 * best / count, iterations, *rates, _most_memory())
     return " ".join(map(repr, numbers))
 
 
-def _operations(program: IndexedProgram, iterations_before: float) -> float:
+def _operations(program: Program, iterations_before: float) -> float:
     """Return arithmetic operations per coordinate and step: of kernels, and of the products with tables."""
-    force = sum(_counted(each.kernel) for each in program.forces)
+    force = sum(_counted(each.kernel) for each in program.loops.forces)
     if program.fixed_point is None:
         drifts = program.splitting.drifts if program.splitting is not None else ()
         return sum(map(bool, drifts)) * (force + 4)  # a kick and a drift are each a product and a sum
-    points = program.fixed_point.points
+    points = len(program.fixed_point.guess.abscissae)
     return (iterations_before + program.fixed_point.final_iterations) * points * (force + 2 * points)
 
 
-def _bytes(program: IndexedProgram, iterations_before: float) -> float:
+def _bytes(program: Program, iterations_before: float) -> float:
     """Return the bytes of arrays read and written per coordinate and step, every array once a loop.
 
     A fixed-point iteration clears and sums forces and reads positions, then reads forces, positions and state and

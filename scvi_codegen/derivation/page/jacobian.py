@@ -67,12 +67,13 @@ def jacobian_section(
     if derived is not None and pattern.size <= LARGEST_SHOWN:
         entries = derived.jacobian.todok().items()
         contents += formulas([Formula(value, Symbol(f"J_{i + 1}_{j + 1}")) for (i, j), value in entries], "entry")
+    equations = program.equations
     if program.newton:
         contents.append(
             Paragraph(
-                f"Compiled, the unknowns of Newton's method are {program.blocks} velocities or accelerations per "
-                f"coordinate, {program.unknowns} numbers. In the chosen ordering, coupled coordinates are at most "
-                f"{program.bandwidth} apart, and the matrix is banded, or full if that is smaller."
+                f"Compiled, the unknowns of Newton's method are {equations.blocks} velocities or accelerations per "
+                f"coordinate, {equations.unknowns} numbers. In the chosen ordering, coupled coordinates are at most "
+                f"{equations.bandwidth} apart, and the matrix is banded, or full if that is smaller."
             )
         )
     else:

@@ -105,7 +105,7 @@ def _pair(
     if kernel.uses_arguments:
         left.append(Formula(sympy.Tuple(*kernel.symbols).xreplace(names), Symbol("u")))
     if kernel.uses_parameters:
-        left.append(Formula(sympy.Tuple(*map(Symbol, program.parameter_names)), Symbol("parameters")))
+        left.append(Formula(sympy.Tuple(*map(Symbol, program.layout.parameters)), Symbol("parameters")))
     left += [*formulas(values, "value"), *formulas(partials, "derivative")]
     title = f"{kernel.name}({', '.join(function.arguments)})"
     return SideBySide(title=title, left=tuple(left), right=(lines(kernel_text(functions, kernel.name)),))

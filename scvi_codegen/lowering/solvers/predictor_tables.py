@@ -17,7 +17,7 @@ from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.solvers.simd_padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 
-__all__ = ["control_of", "control_of_iteration", "predictor_of"]
+__all__ = ["control_of", "predictor_of"]
 
 LEVELS_PER_BINADE, REACH = 4, 2
 """Levels per factor of two, and the largest change of level for which the predictor is available."""
@@ -31,18 +31,14 @@ leading digits, is the same in every orbit, and accumulates: 2e-17 to 7e-17 of t
 
 def control_of(program: Program) -> Control | None:
     """Return the adaptive step-size control of a program; ``None`` if its curves give no error estimate."""
-    if not program.error_power or program.integrals:
+    if not program.error_power or program.quantities.integrals:
         return None
+    stage_curve = program.equations.stage_curve
     return Control(
         mantissas=MANTISSAS,
         predictor=predictor_of(program.fixed_point) if program.fixed_point else None,
-        stage_growth=2.0 ** (program.stage_curve.power / LEVELS_PER_BINADE) if program.stage_curve else 0.0,
+        stage_growth=2.0 ** (stage_curve.power / LEVELS_PER_BINADE) if stage_curve else 0.0,
     )
-
-
-def control_of_iteration(fixed_point: FixedPointIteration) -> Control:
-    """Return the adaptive step-size control of a fixed-point iteration alone."""
-    return Control(mantissas=MANTISSAS, predictor=predictor_of(fixed_point))
 
 
 def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:

@@ -10,22 +10,51 @@ simplified Newton iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band matr
 factorised once per step. Changes of forces and derivatives with the positions are neglected, an error of order h^2 that
 the iteration removes. SVI(1) is RATTLE.
 
-Source: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983).
+Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
+derivatives of the constraints at its ends,
+
+    p = p0 + h/2 (F0 + G0^T lambda),  q1 = q0 + h M^-1 p  with  g(q1) = 0,
+    p1 = p + h/2 (F1 + G1^T mu)                           with  G1 M^-1 p1 + g_t = 0,
+
+symmetric and symplectic on the constrained phase space; compositions of such steps satisfy the constraints after each
+of them and attain their order. Both systems of multipliers are solved iteratively with G M^-1 G^T at the start or end
+of the step, a sparse matrix whose pattern is computed once per run.
+
+Sources: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983);
+S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
+Chem. 16 (1995), on the iteration.
 """
 
 from __future__ import annotations
 
-from scvi_codegen.ir.constraints import Rattle
+from collections.abc import Iterator
+from functools import partial
+
+from sympy import Symbol
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.constraints import ConstrainedSteps, Rattle
+from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
-from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
 from scvi_codegen.mechanics.constraints import constraint_jacobian, nonholonomic_expressions
 from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.indexed.constraints import (
+    constraint_gradient,
+    constraint_second_rate,
+    constraint_text,
+    coordinate_accesses,
+)
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["rattle_of"]
+__all__ = ["constrained_steps", "rattle_of"]
 
 
 def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
@@ -51,3 +80,47 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
         momentum=lower_matrix(transpose(momentum)),
         response=lower_matrix(transpose(matrix_product(position, momentum))),
     )
+
+
+def constrained_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
+    """Return the kernels and fractions of constrained steps.
+
+    Raises:
+        MethodError: for other methods, and for velocity-dependent forces.
+    """
+    if system.velocities:
+        raise MethodError(
+            "velocity-dependent forces are not supported for indexed systems with constraints: remove "
+            "the forces or the constraints"
+        )
+    pairs = list(_kernels(system))
+    conditions, curvatures = (tuple(kernels) for kernels in zip(*pairs, strict=True))
+    return ConstrainedSteps(conditions=conditions, curvatures=curvatures, parts=lower_vector(_parts(stages, method)))
+
+
+def _parts(stages: StageSystem, method: Method) -> Vector:
+    """Return the fractions of h of the RATTLE steps of which a step is composed."""
+    shape = stages.shape
+    if method.fractions and not getattr(method, "drifts_first", False):
+        return method.fractions
+    if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
+        return (mp.one,)
+    raise MethodError(
+        f"{method.name} does not support constraints of indexed systems: use 'stoermer-verlet', which is "
+        "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
+    )
+
+
+def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
+    """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
+    for number, term in enumerate(system.constraints):
+        u = coordinate_accesses(term, system.coordinates)
+        v = [Symbol(f"{slot.name} along", real=True) for slot, _ in u]
+        *partials, rate = constraint_gradient(term, system.coordinates, system.time)
+        second = constraint_second_rate(term, system.coordinates, system.time, v)
+        values, purpose = [term.formula, rate, *partials], "g, g_t, and the derivatives of g."
+        looped = partial(looped_kernel, system, of=term, u=u, text=constraint_text(term))
+        yield (
+            looped(f"condition_{number}", values, purpose=purpose),
+            looped(f"curvature_{number}", [second], along=v, purpose="d^2 g / dt^2 along v."),
+        )

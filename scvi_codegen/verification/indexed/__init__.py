@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.lowering.indexed import one_coordinate
+from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
 from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.methods import as_method

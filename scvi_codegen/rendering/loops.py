@@ -1,28 +1,27 @@
-"""Indexed systems as C: nested loops around kernels."""
+"""Systems of arrays as C: nested loops around kernels, and the template's context."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import accumulate
 from typing import Any
 
-from scvi_codegen.ir.indexed import IndexedProgram
+from scvi_codegen.ir.constraints import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.kernel_parts import is_divided
-from scvi_codegen.rendering.control import predictor_text
+from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.convergence import MAX_ITERATIONS
-from scvi_codegen.rendering.environment import support_text, template_environment
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.indexed_constraints import constraint_context
 from scvi_codegen.rendering.lattices import lattice_context, roots_per_coordinate
 from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
-from scvi_codegen.rendering.printer import INVERSE_ROOT, scalar_functions
+from scvi_codegen.rendering.printer import inverse_roots, scalar_functions
 from scvi_codegen.rendering.simd import LIBRARY, POINTS, IterationSource, iteration_source
-from scvi_codegen.rendering.sizes import product_text, sizes_text
-from scvi_codegen.rendering.source import Source, included
+from scvi_codegen.rendering.sizes import count_text, product_text, sizes_text
 from scvi_codegen.rendering.target import DOUBLE
 from scvi_codegen.rendering.thread_partition import MOST_THREADS, Sharing, sharing_of, sharing_text
 
-__all__ = ["render_indexed", "render_indexed_example"]
+__all__ = ["loop_context"]
 
 EXPLICIT_VECTORS, CONSTRAINED_VECTORS, ITERATION_VECTORS = 4, 7, 4
 """Number of vectors in ``work``.
@@ -36,102 +35,70 @@ FOURIER_VECTORS = 2
 """Further vectors: scratch of Fourier transforms (templates/support/fourier_preconditioner.h)."""
 HALVES_VECTORS = 7
 """Further vectors: the state at the start of a step and three increments (templates/support/indexed_halves.h)."""
+X = "const double *restrict X"
+CURSOR = "condition *now"
 
 
-def render_indexed(program: IndexedProgram) -> Source:
-    """Return header and source of a program. Equal programs give equal bytes."""
-    environment = template_environment()
-    terms = [(each, each.scalar) for each in program.forces if each.scalar]
-    terms += [(each, each.kernel) for each in program.constants]
-    scalars = [each.kernel for each in program.masses] + [scalar for _, scalar in terms]
+def loop_context(program: Program) -> dict[str, Any]:
+    """Return the template's context for the program of a system of arrays."""
+    loops, constrained = program.loops, program.loops.constrained
+    terms = [(each, each.scalar) for each in loops.forces if each.scalar]
+    terms += [(each, each.kernel) for each in loops.constants]
+    scalars = [each.kernel for each in loops.masses] + [scalar for _, scalar in terms]
     if program.fixed_point is None:
-        scalars += [each.kernel for each in program.forces]
-    if program.held:
-        scalars += [each.kernel for each in (*program.held.conditions, *program.held.curvatures)]
-    applied = (*program.forces, *program.products, *program.diagonals)
-    context = {
+        scalars += [each.kernel for each in loops.forces]
+    if constrained:
+        scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
+    return {
         "program": program,
         "prefix": program.prefix,
         "target": DOUBLE,
         "real": DOUBLE.scalar,
         "max_iterations": MAX_ITERATIONS,
-        "most_threads": 1 if program.held else MOST_THREADS,
-        "cut": is_divided((*scalars, *(each.kernel for each in applied))),
-        "forces": [_force_text(program, each) for each in applied],
+        "most_threads": 1 if constrained else MOST_THREADS,
+        "cut": is_divided((*scalars, *(each.kernel for each in loops.applied))),
+        "forces": [_force_text(program, each) for each in loops.applied],
         "energies": [_energy_text(program, each, scalar) for each, scalar in terms],
-        "masses": [_mass_text(program, each) for each in program.masses],
-        "force_names": [each.kernel.name for each in program.forces],
+        "masses": [_mass_text(program, each) for each in loops.masses],
+        "force_names": [each.kernel.name for each in loops.forces],
         "energy_names": [scalar.name for _, scalar in terms],
-        "mass_names": [each.kernel.name for each in program.masses],
+        "mass_names": [each.kernel.name for each in loops.masses],
         "scalar_kernels": [kernel_text(kernel, DOUBLE) for kernel in scalars],
-        "inverse_roots": _inverse_roots(scalars),
+        "inverse_roots": inverse_roots(scalars),
         "vector_functions": _vector_functions(program),
-        "coordinates": " + ".join(map(product_text, program.coordinates)),
+        "coordinates": " + ".join(map(product_text, program.layout.coordinates)),
         "fixed_point": _iteration_text(program),
         "work": _work(program),
         "iteration_vectors": ITERATION_VECTORS,
         "halves_vectors": HALVES_VECTORS,
         "hot": "static",
-        "waves": lattice_context(program) if program.reach else None,
-        **constraint_context(program),
+        "waves": lattice_context(program) if loops.reach else None,
+        **_constraint_context(program, constrained),
     }
-    code = environment.get_template("indexed.c.jinja").render(context)
-    control = program.control
-    own = (
-        {f"support/{program.prefix}_predictor.h": predictor_text(control.predictor)}
-        if control and control.predictor
-        else {}
-    )
-    return Source(
-        prefix=program.prefix,
-        header=environment.get_template("indexed.h.jinja").render(context),
-        code=code,
-        declarations=environment.get_template("parts/indexed_declarations.h.jinja").render(context),
-        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
-    )
 
 
-def render_indexed_example(prefix: str, **start: Any) -> dict[str, str]:
-    """Return ``main.c`` and ``Makefile`` that run the integrator from arrays in files of the same folder.
-
-    Args:
-        prefix: of the C names.
-        start: title, momenta (whether the system is Hamiltonian), numbers, sizes, fields and tables with their lengths,
-            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
-    """
-    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
-    templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
-    return {name: environment.get_template(template).render(context) for name, template in templates.items()}
-
-
-def _work(program: IndexedProgram) -> int:
+def _work(program: Program) -> int:
     """Return the number of doubles of ``work`` per coordinate."""
     if program.fixed_point is None:
-        return CONSTRAINED_VECTORS if program.held else EXPLICIT_VECTORS
-    own = 2 * ITERATION_VECTORS if program.momenta else ITERATION_VECTORS + bool(program.velocities)
-    linear = NEWTON_VECTORS + program.fixed_point.lanes if program.products else 0
-    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots_per_coordinate(program) if program.reach else 0
+        return CONSTRAINED_VECTORS if program.loops.constrained else EXPLICIT_VECTORS
+    own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
+    linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
+    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots_per_coordinate(program) if program.loops.reach else 0
     return (own + linear) * program.fixed_point.lanes + waves + HALVES_VECTORS
 
 
-def _iteration_text(program: IndexedProgram) -> IterationSource | None:
-    applied = (*program.forces, *program.products, *program.diagonals)
-    fixed_point, kernels = program.fixed_point, [each.kernel for each in applied]
+def _iteration_text(program: Program) -> IterationSource | None:
+    fixed_point, kernels = program.fixed_point, [each.kernel for each in program.loops.applied]
     return iteration_source(fixed_point, POINTS, fallback="none", kernels=kernels) if fixed_point else None
 
 
-def _vector_functions(program: IndexedProgram) -> list[str]:
+def _vector_functions(program: Program) -> list[str]:
     """Return the functions of the vector library that occur in the forces of an explicit method."""
-    kernels = [each.kernel for each in program.forces] if program.fixed_point is None else []
+    kernels = [each.kernel for each in program.loops.forces] if program.fixed_point is None else []
     return sorted(set(LIBRARY) & set().union(*map(scalar_functions, kernels)))
 
 
-def _inverse_roots(kernels: Sequence[Kernel]) -> list[int]:
-    names = set().union(*map(scalar_functions, kernels))
-    return sorted(int(name.removeprefix(INVERSE_ROOT)) for name in names if name.startswith(INVERSE_ROOT))
-
-
-def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
+def _force_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the forces; for an explicit method, with a factor."""
     explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
@@ -169,7 +136,7 @@ def _force_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     return f"{text}\n\n{_sharing_text(program, looped)}"
 
 
-def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
+def _sharing_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that describes how threads share a term group."""
     how = sharing_text(looped)
     known = [*sizes_text(program, how), *(f"(void){name};" for name in ("run", "given", "n"))]
@@ -178,7 +145,7 @@ def _sharing_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
 
 
-def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) -> str:
+def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
     """Return a function that computes the sum of the terms."""
     nest = Nest(program, looped, "double", "q")
     lines = nest.text(
@@ -190,7 +157,7 @@ def _energy_text(program: IndexedProgram, looped: LoopedKernel, kernel: Kernel) 
     return nest.function(f"static void sum_{kernel.name}", arguments, lines, values="double value[1]")
 
 
-def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
+def _mass_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the masses."""
     nest = Nest(program, looped, "", "")
     place = nest.place_of(looped.targets[0])
@@ -204,3 +171,63 @@ def _mass_text(program: IndexedProgram, looped: LoopedKernel) -> str:
     )
     arguments = ["const problem *given", "double *mass"]
     return nest.function(f"static void add_{looped.kernel.name}", arguments, lines, values="double value[1]")
+
+
+def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
+    """Return the template's context for constraints."""
+    if held is None:
+        return {"held": None}
+    counts = [count_text(each.loops) for each in held.conditions]
+    entries = [f"{count} * {len(each.slots)}" for count, each in zip(counts, held.conditions, strict=True)]
+    found = {
+        "functions": [text for pair in zip(*_texts(program, held), strict=True) for text in pair],
+        "conditions": [each.kernel.name for each in held.conditions],
+        "curvatures": [each.kernel.name for each in held.curvatures],
+        "sizes": list(sizes_text(program, " ".join(counts))),
+        "count": " + ".join(counts),
+        "entries": " + ".join(entries),
+    }
+    return {"held": found, "part_ends": list(accumulate(held.parts))}
+
+
+def _texts(program: Program, held: ConstrainedSteps) -> tuple[list[str], list[str], list[str]]:
+    """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
+    return (
+        [_condition(program, each) for each in held.conditions],
+        [_curvature(program, each) for each in held.curvatures],
+        [_places(program, each) for each in held.conditions],
+    )
+
+
+def _condition(program: Program, looped: LoopedKernel) -> str:
+    name, count = looped.kernel.name, len(looped.slots)
+    lines = [
+        f"{name}(u, t, parameters, value);",
+        "now->g[now->count] = value[0];",
+        "now->rate[now->count++] = value[1];",
+        *(f"now->derivative[now->entries++] = value[{k + 2}];" for k in range(count)),
+    ]
+    arguments = ["const problem *given", X, "double t", CURSOR]
+    return _function(Nest(program, looped, "double", "X"), f"find_{name}", arguments, lines, count + 2)
+
+
+def _curvature(program: Program, looped: LoopedKernel) -> str:
+    name = looped.kernel.name
+    lines = [f"{name}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
+    arguments = ["const problem *given", X, f"const double *restrict {DIRECTION}", "double t", CURSOR]
+    return _function(Nest(program, looped, "double", "X"), f"find_{name}", arguments, lines, 1)
+
+
+def _places(program: Program, looped: LoopedKernel) -> str:
+    bare = replace(looped, slots=(), given=())
+    nest = Nest(program, bare, "", "")
+    lines = [
+        "now->first[now->count++] = (int)now->entries;",
+        *(f"now->place[now->entries++] = (int)({nest.place_of(target)});" for target in looped.targets),
+    ]
+    return _function(nest, f"place_{looped.kernel.name}", ["const problem *given", CURSOR], lines, 0)
+
+
+def _function(nest: Nest, name: str, arguments: Sequence[str], lines: Sequence[str], values: int) -> str:
+    text = ["(void)given;", *nest.text(prepare=lambda k: [], innermost=lines, finish=lambda k: [])]
+    return nest.function(f"static void {name}", arguments, text, values=f"double value[{values}]" if values else "")

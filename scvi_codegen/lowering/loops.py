@@ -1,0 +1,172 @@
+"""Loops around kernels: the terms of systems of arrays, and the term groups of named coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+from sympy import Add, Expr, S, Symbol
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.ir.arithmetic import lower_kernel
+from scvi_codegen.ir.constraints import ConstrainedSteps
+from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel
+from scvi_codegen.ir.numbers import exact_number
+from scvi_codegen.ir.program import LoopedTerms, Program
+from scvi_codegen.lowering.kernels import looped_kernel
+from scvi_codegen.lowering.lattices import reach_of
+from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
+
+__all__ = ["looped_terms", "with_sums"]
+
+
+def looped_terms(system: IndexedSystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
+    """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
+    potentials = [_force(system, term, number) for number, term in enumerate(system.potentials)]
+    products, diagonals = _jacobian(system) if newton else ((), ())
+    return LoopedTerms(
+        forces=(
+            *potentials,
+            *(
+                looped_kernel(
+                    system,
+                    f"force_{number}",
+                    [formula for _, formula in force.targets],
+                    force,
+                    [pair for pair in force.slots if pair[1].array in (*system.state, *system.velocities)],
+                    targets=[access for access, _ in force.targets],
+                    text=f"forces {force}",
+                    purpose="Forces.",
+                )
+                for number, force in enumerate(system.forces, len(potentials))
+            ),
+        ),
+        masses=tuple(
+            looped_kernel(
+                system,
+                f"mass_{number}",
+                [term.formula],
+                term,
+                targets=[term.access],
+                text=f"mass of {term.access}",
+                purpose="A mass.",
+            )
+            for number, term in enumerate(system.masses)
+        ),
+        constants=tuple(
+            looped_kernel(system, f"constant_{number}", [term.formula], term, text=str(term), purpose="The term.")
+            for number, term in enumerate(system.energy_offsets)
+        ),
+        constrained=constrained,
+        products=products,
+        diagonals=diagonals,
+        reach=reach_of(system.coordinates, diagonals),
+    )
+
+
+def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
+    """Return the derivatives of a term with respect to its coordinates and momenta, and the term itself."""
+    moving = [pair for pair in term.slots if pair[1].array in system.state]
+    partials = gradient(term.formula, [slot for slot, _ in moving])
+    signs = [-1 if access.array in system.momenta else 1 for _, access in moving]  # of -H: -H_q and H_p
+    values = [sign * partials.get(place, S.Zero) for place, sign in enumerate(signs)]
+    purpose = "Derivatives with respect to its coordinates."
+    looped = looped_kernel(system, f"force_{number}", values, term, moving, text=str(term), purpose=purpose)
+    scalar = looped_kernel(system, f"term_{number}", [term.formula], term, moving, text="", purpose="The term.")
+    return replace(looped, scalar=scalar.kernel)
+
+
+def _jacobian(system: IndexedSystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
+    """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
+    found = [_derived(system, term, number) for number, term in enumerate(_all_forces(system))]
+    pairs = [pair for pair in found if pair]
+    return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
+
+
+def _all_forces(system: IndexedSystem) -> Iterator[IndexedForce]:
+    """Yield all forces, those of the potentials by their slots."""
+    for term in system.potentials:
+        moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
+        partials = gradient(term.formula, [slot for slot, _ in moving])
+        targets = tuple((access, partials[k]) for k, (_, access) in enumerate(moving) if k in partials)
+        yield IndexedForce(loops=term.loops, slots=term.slots, targets=targets)
+    yield from system.forces
+
+
+def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
+    """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on positions."""
+    moving = [pair for pair in force.slots if pair[1].array in system.state]
+    u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
+    rows = [gradient(formula, u) for _, formula in force.targets]
+    if not any(rows):
+        return None
+    along = [Add(*(derivative * w[k] for k, derivative in row.items())) for row in rows]
+    own = [
+        Add(*(derivative for k, derivative in row.items() if moving[k][1] == access))
+        for row, (access, _) in zip(rows, force.targets, strict=True)
+    ]
+    looped = partial(
+        looped_kernel,
+        system,
+        of=force,
+        u=moving,
+        targets=[access for access, _ in force.targets],
+        text=f"derivatives of {force}",
+    )
+    return (
+        looped(f"product_{number}", along, along=w, purpose="Jacobian of the forces times a direction."),
+        looped(f"diagonal_{number}", own, purpose="Diagonal of the Jacobian of the forces."),
+    )
+
+
+def with_sums(program: Program, of: SplitSystem) -> Program | None:
+    """Return the program of ``of.rest`` with the forces and the energy of the term groups.
+
+    ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
+    """
+    forces = tuple(_forces(of, family, number) for number, family in enumerate(of.families))
+    energies = tuple(_energy(of, family, number) for number, family in enumerate(of.families))
+    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(forces), program.splitting
+    energy = program.quantities.energy
+    if program.newton or energy is None or not (fixed_point or splitting):
+        return None
+    return replace(
+        program,
+        quantities=replace(program.quantities, energy=energy.with_sums(energies)),
+        fixed_point=fixed_point,
+        splitting=replace(splitting, force=splitting.force.with_sums(forces)) if splitting else None,
+    )
+
+
+def _forces(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
+    return _summed(of, f"pull_{number}", family, family.partials, ())
+
+
+def _energy(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
+    value = -family.formula if of.rest.auxiliaries else family.formula
+    return _summed(of, f"term_{number}", family, (value,), ((0,),) * len(family.places))
+
+
+def _summed(
+    of: SplitSystem, name: str, family: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+) -> LoopedKernel:
+    system = of.rest
+    places = {parameter: k for k, parameter in enumerate(system.parameters)}
+
+    def constant(value: Expr) -> Constant | Load:
+        return Load("parameters", places[value]) if value in places else Constant(exact_number(value))
+
+    term = lower_kernel(
+        name,
+        arguments=(*family.slots, *family.given),
+        time=system.time,
+        parameters=system.parameters,
+        values=tuple(values),
+        constants=len(family.given),
+    )
+    given = tuple(tuple(map(constant, column)) for column in family.values)
+    return LoopedKernel.over_rows(term, family.places, given, targets)
