@@ -6,7 +6,7 @@ first requests it (:mod:`scvi_codegen.rendering.fallback`); that call is then re
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Self
 
@@ -18,6 +18,10 @@ from scvi_codegen.native.building import Library
 from scvi_codegen.native.options import FALLBACK_REQUIRED, SolverOptions, checked_options
 
 __all__ = ["Binding"]
+
+DOUBLE_SIZE = np.dtype(np.float64).itemsize
+WITHOUT_STEPS = frozenset(("start", "step_error", "energies"))
+"""Frequent functions that never request the fallback."""
 
 
 class Binding:
@@ -42,8 +46,8 @@ class Binding:
     ) -> None:
         self._origin = origin
         self._ffi, self._lib, self._prefix, self._workspace = library.ffi, library.lib, prefix, workspace
-        self.null = library.ffi.NULL
-        self._fallback = fallback if self._has("set_fallback") else None
+        self.null, self._doubles = library.ffi.NULL, partial(library.ffi.from_buffer, "double[]")
+        self._fallback = fallback if self.has("set_fallback") else None
         self._fallback_missing = self._fallback is not None
         self._fallback_binding: Self | None = None
 
@@ -56,11 +60,13 @@ class Binding:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
         own = () if memory is None else (memory,)
-        return self._with_fallback(function, *own) if self._fallback_missing else partial(function, *own)
+        if self._fallback_missing and name not in WITHOUT_STEPS:
+            return self._with_fallback(function, *own)
+        return partial(function, *own) if own else function
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
-        if self._has(name):
+        if self.has(name):
             return self
         if self._fallback is None:
             raise MethodError(
@@ -85,7 +91,8 @@ class Binding:
             getattr(self._lib, f"{self._prefix}_set_fallback")(lender.function("provided_fallback")())
             self._fallback_missing = False
 
-    def _has(self, name: str) -> bool:
+    def has(self, name: str) -> bool:
+        """Return whether the library has the function ``<prefix>_<name>``."""
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
     def _with_fallback(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
@@ -135,7 +142,11 @@ class Binding:
         """Return a pointer to the first element of a contiguous float64 or int32 array; NULL for an empty one."""
         if not array.size:
             return self.null
-        return self._ffi.from_buffer("int[]" if array.dtype == np.int32 else "double[]", array)
+        return self._ffi.from_buffer("double[]" if array.itemsize == DOUBLE_SIZE else "int[]", array)
+
+    def pointers(self, *arrays: NDArray[np.float64]) -> Iterable[Any]:
+        """Return pointers to the first elements of contiguous float64 arrays that are not empty."""
+        return map(self._doubles, arrays)
 
     def workspace(self) -> Any:
         """Return memory for one call."""

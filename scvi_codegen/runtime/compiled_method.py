@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -66,6 +66,7 @@ class CompiledMethod:
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
         self._event_variants: dict[tuple[Event, ...], Self] = {}
+        self._released_runs: list[Any] = []
         self._plain = source
         self.source = _event_variant(source, interface, events) if events else source
         library = building.load(self.source, flags=flags)

@@ -8,7 +8,6 @@ and its status gives the reason. Other lanes are unaffected. Results are bitwise
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -27,7 +26,7 @@ from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTr
 from scvi_codegen.runtime.inputs import Array, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.run_loop import record_states
+from scvi_codegen.runtime.run_loop import drive, record
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.runtime.workers import MOST_JOBS, PROGRESS_SECONDS, workers_of
@@ -44,6 +43,8 @@ FIRST_CHUNK_STEPS = 64
 """Steps of the first chunk of a block, before its speed is known."""
 CHUNK_SECONDS = 0.02
 """Target duration of a chunk in seconds; bounds the delay of an interruption."""
+GROWTH = 8.0
+"""Largest ratio of successive chunk sizes."""
 
 
 class Change(NamedTuple):
@@ -165,13 +166,20 @@ class Ensemble:
 
         def advance(number: int) -> None:
             block = make(firsts[number])
-            chunk_size = min(FIRST_CHUNK_STEPS, self.steps)
-            while reached[number] < self.steps and not stop.is_set():
-                began = time.perf_counter()
-                block.advance(chunk_size)
-                reached[number] += chunk_size
-                faster = CHUNK_SECONDS / max(time.perf_counter() - began, 1e-6)
-                chunk_size = min(max(1, int(chunk_size * min(8.0, faster))), self.steps - int(reached[number]))
+
+            def advance_chunk(size: int) -> int:
+                block.advance(size)
+                reached[number] += size
+                return size
+
+            drive(
+                advance_chunk,
+                self.steps,
+                first=FIRST_CHUNK_STEPS,
+                growth=GROWTH,
+                seconds=CHUNK_SECONDS,
+                ended=stop.is_set,
+            )
 
         def take(piece: int) -> None:
             for number in range(piece, len(firsts), MOST_JOBS):
@@ -370,7 +378,7 @@ class _SingleRun:
             return
         row = work.row(run.steps)
         try:
-            trajectory = record_states(run, step - run.steps, save_every=save_every)
+            trajectory = record(run, step - run.steps, save_every=save_every)
         except StepFailedError as failure:
             work.status[j], trajectory, self.run = failure.status, Trajectory.before(failure), None
         work.done[j] = run.steps

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 MOST_STEPS, MOST_NUMBERS = 2048, 2**18
 """Default limits of the second run: number of steps, and that number times the number of coordinates."""
-FASTEST = 1.15
+DECADES_PER_STEP = math.log10(1.15)
 """Assumed largest growth of an error per step; runs with too few steps to reach the threshold are not checked."""
 NUDGE = 2.0**-50
 """Relative perturbation of the initial state, unless the local tolerance is larger."""
@@ -82,10 +82,8 @@ class GrowthCheck:
         self.run, self.requested, self.advance_until = run, requested, advance_until or self._to
         self.wanted = adaptive and requested is not False and warnings_wanted()
         if self.wanted:
-            self.start: Any = run.checkpoint() if isinstance(run, Memory) else run.snapshot
-            self.parameters = (
-                run.parameters.copy() if isinstance(run, Memory) else None
-            )  # inputs change them during the run
+            self.start: Any = run.snapshot
+            self.parameters = run.parameters if isinstance(run, Memory) else None  # inputs change them during the run
 
     def warn(self, states: ComparedStates) -> None:
         """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
@@ -95,9 +93,11 @@ class GrowthCheck:
         steps, tolerance = self.run.steps, self.run.plan.tolerance
         nudge = max(NUDGE, tolerance)
         tolerable = min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
-        last, decades = self._last(states, steps), math.log10(tolerable / nudge)
-        few = steps * math.log10(FASTEST) < decades
-        if last == 0 or (not self.requested and (few or self._grows_slowly(states, last, max(nudge, COARSE), decades))):
+        decades = math.log10(tolerable / nudge)
+        if not self.requested and steps * DECADES_PER_STEP < decades:
+            return
+        last = self._last(states, steps)
+        if last == 0 or (not self.requested and self._grows_slowly(states, last, max(nudge, COARSE), decades)):
             return
         try:
             self._begin(nudge, tolerance)

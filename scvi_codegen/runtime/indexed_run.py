@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -28,7 +27,7 @@ from scvi_codegen.runtime.indexed_saving import (
 )
 from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.one_thread import OneThread, alone
-from scvi_codegen.runtime.run_loop import CALL_SECONDS
+from scvi_codegen.runtime.run_loop import drive
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.validation.counts import checked_count
 
@@ -383,22 +382,24 @@ class IndexedRun(OneThread):
         Raises:
             StepFailedError: if a step fails; the run is left at the state before it.
         """
-        steps, done, chunk_size = checked_count(steps, "steps", least=0), 0, 1
-        report = self._binding.new("report *")
+        steps, report = checked_count(steps, "steps", least=0), self._binding.new("report *")
         if steps and self.problem.unset_inputs:
             raise missing_input(self.problem.unset_inputs[0])
-        while done < steps and not self.arrived and not (stop and stop()):
-            size, began = min(chunk_size, steps - done), time.perf_counter()
+
+        def advance(size: int) -> int:
             status = self._steps(size, report)
-            done += report.steps
             self.iterations += report.iterations
             if status:
                 h, failures = 0.0 if self.plan else self.h, FAILURES_BY_SOLVER[self.interface.solver]
                 raise step_failure(status, report, step=self.steps, h=h, failures=failures)
-            if progress is not None:
-                progress(self.steps)
-            elapsed = max(time.perf_counter() - began, 1e-6)
-            chunk_size = max(1, int(min(2.0 * size, size * CALL_SECONDS / elapsed)))
+            return int(report.steps)
+
+        drive(
+            advance,
+            steps,
+            ended=lambda: self.arrived or bool(stop and stop()),
+            progress=progress and (lambda _: progress(self.steps)),
+        )
 
     def call(self, name: str, *arguments: Any) -> int:
         """Call a C function with the run as its first argument and return its status."""

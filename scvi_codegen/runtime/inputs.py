@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -14,6 +15,7 @@ from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
 
 __all__ = [
+    "BINARY64",
     "Array",
     "Parameters",
     "TakesInputs",
@@ -30,6 +32,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+BINARY64 = np.dtype(np.float64)
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 """Parameters by name (others have their defaults), or all in order."""
 
@@ -52,6 +55,13 @@ class TakesInputs(Protocol):
 
 def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
     """Return a finite, contiguous (m,) copy; for one coordinate a number suffices."""
+    if (
+        type(value) is np.ndarray
+        and value.dtype is BINARY64
+        and value.shape == (len(interface.coordinates),)
+        and math.isfinite(value.dot(value))  # not of large numbers
+    ):
+        return value.copy()
     array, coordinates = real_array(value, name), interface.coordinates
     if array.ndim == 0 and interface.dimension == 1:
         array = array.reshape(1)
@@ -108,7 +118,7 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
 
 def inputs_not_given(interface: TakesInputs, parameters: Any) -> tuple[str, ...]:
     """Return the names of inputs that the parameters do not set; parameters in order set all."""
-    if parameters is not None and not isinstance(parameters, Mapping):
+    if not interface.inputs or (parameters is not None and not isinstance(parameters, Mapping)):
         return ()
     return tuple(name for name in interface.inputs if f"{name}_0" not in (parameters or {}))
 

@@ -189,15 +189,9 @@ class Integrator(LinearisedMethod):
         Raises:
             StateError: if a state is outside the domain of L.
         """
-        result = np.empty(len(t))
-        status = self.binding.function("energies")(
-            len(t),
-            self.binding.pointer(t),
-            self.binding.pointer(q),
-            self.binding.pointer(p),
-            self.binding.pointer(parameters),
-            self.binding.pointer(result),
-            self.binding.workspace(),
+        result, binding = np.empty(len(t)), self.binding
+        status = binding.function("energies")(
+            len(t), *map(binding.pointer, (t, q, p, parameters, result)), binding.workspace()
         )
         if status:
             raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")

@@ -34,6 +34,8 @@ STEPS_PER_CALL = 10**5
 """Largest number of steps per call into C, between checks for Ctrl-C."""
 GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16
 """Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
+FUNCTIONS = ("start", "advance", "advance_to", "step_error")
+"""Functions of C that take a run; sources of version 0.1 have no error estimate."""
 NO_OUTPUT = LARGEST_COUNT
 """Output stride that saves no state."""
 
@@ -49,26 +51,18 @@ class Memory(OneThread):
     C calls are allocated once per run, so a call costs little more than its steps.
     """
 
-    def __init__(
-        self,
-        stepper: Integrator,
-        memory: Any,
-        parameters: Array,
-        options: SolverOptions | None,
-        plan: StepPlan | None = None,
-        unset_inputs: tuple[str, ...] = (),
-    ) -> None:
+    def __init__(self, stepper: Integrator) -> None:
         super().__init__()
-        self.stepper, self._memory, self._parameters, self._options = stepper, memory, parameters, options
-        binding = stepper.binding
+        self.stepper, binding = stepper, stepper.binding
+        self._memory = memory = binding.new("run *")
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
-        self._given = binding.pointer(parameters), binding.options(options)
+        self._parameters = stepper.defaults
+        self._parameters_pointer = binding.pointer(self._parameters)
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
+        self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
         firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
         self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
-        self.plan, self._unset_inputs, self.longest = plan, unset_inputs, 0.0
-        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 
     @classmethod
     def started(
@@ -83,19 +77,37 @@ class Memory(OneThread):
         options: SolverOptions | None = None,
     ) -> Self:
         """Construct at (q, p) and t before the first step, with fixed step size or a step plan."""
-        interface, binding = stepper.interface, stepper.binding
-        q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
-        memory = binding.new("run *")
-        binding.function("start")(
-            memory,
-            checked_number(t, "the time t"),
-            0.0 if isinstance(h, StepPlan) else checked_step(h),
-            binding.pointer(q0),
-            binding.pointer(p0),
-        )
+        run = cls(stepper)
+        run.start(q, p, h=h, t=t, parameters=parameters, options=options)
+        return run
+
+    def start(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float | StepPlan,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> None:
+        """Start at (q, p) and t, with fixed step size or a step plan; nothing of an earlier run remains."""
+        stepper, interface = self.stepper, self.stepper.interface
         plan = h if isinstance(h, StepPlan) else None
-        values, unset_inputs = stepper._parameters_at(q0, p0, parameters), inputs_not_given(interface, parameters)
-        return cls(stepper, memory, values, checked_options(options), plan, unset_inputs)
+        q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+        now, size = checked_number(t, "the time t"), 0.0 if isinstance(h, StepPlan) else checked_step(h)
+        self._functions["start"](now, size, *stepper.binding.pointers(q0, p0))
+        values = stepper._parameters_at(q0, p0, parameters)
+        self._set(values, checked_options(options), plan, inputs_not_given(interface, parameters))
+
+    def _set(
+        self, values: Array, options: SolverOptions | None, plan: StepPlan | None, unset_inputs: tuple[str, ...]
+    ) -> None:
+        binding = self.stepper.binding
+        self._parameters[:], self._options, self.plan = values, options, plan
+        self._arguments = self._parameters_pointer, binding.options(options)
+        self._unset_inputs, self.longest = unset_inputs, 0.0
+        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 
     @classmethod
     def restored(
@@ -108,8 +120,8 @@ class Memory(OneThread):
         plan: StepPlan | None = None,
     ) -> Self:
         """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
-        memory = stepper.binding.new("run *")
-        buffer = stepper.binding.buffer(memory)
+        run = cls(stepper)
+        memory, buffer = run._memory, stepper.binding.buffer(run._memory)
         if not isinstance(saved, bytes):
             raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
         if len(saved) != len(buffer):
@@ -124,11 +136,9 @@ class Memory(OneThread):
             )
         if not stepper._has_energy(parameters):
             raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
-        values, unset_inputs = (
-            checked_parameters(stepper.interface, parameters),
-            inputs_not_given(stepper.interface, parameters),
-        )
-        return cls(stepper, memory, values, checked_options(options), plan, unset_inputs)
+        values = checked_parameters(stepper.interface, parameters)
+        run._set(values, checked_options(options), plan, inputs_not_given(stepper.interface, parameters))
+        return run
 
     @property
     def plan(self) -> StepPlan | None:
@@ -138,7 +148,7 @@ class Memory(OneThread):
     @plan.setter
     def plan(self, plan: StepPlan | None) -> None:
         self._plan, self._plan_arguments = plan, (plan.t_end, plan.tau or plan.tolerance) if plan else ()
-        self._advance_function = self.stepper.binding.function("advance_to" if plan else "advance", self._memory)
+        self._advance_function = self._functions["advance_to" if plan else "advance"]
 
     @property
     def h(self) -> float:
@@ -240,10 +250,15 @@ class Memory(OneThread):
         for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
             self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
 
+    @property
+    def snapshot(self) -> bytes:
+        """Bitwise copy of the present state for :meth:`rollback`."""
+        return bytes(self.stepper.binding.buffer(self._memory))
+
     @alone
     def checkpoint(self) -> bytes:
         """Return a bitwise copy of the run for :meth:`Stepper.from_checkpoint` on the same kind of machine."""
-        return bytes(self.stepper.binding.buffer(self._memory))
+        return self.snapshot
 
     def check_inputs(self) -> None:
         """Raise :class:`StateError` if an input is not set."""
@@ -282,7 +297,7 @@ class Memory(OneThread):
         if self._unset_inputs and steps:
             self.check_inputs()
         status: int = self._advance_function(
-            *self._plan_arguments, steps, save_every, *self._given, *output_arrays, self._report, self._workspace
+            *self._plan_arguments, steps, save_every, *self._arguments, *output_arrays, self._report, self._workspace
         )
         return status
 
@@ -295,23 +310,27 @@ class Memory(OneThread):
     def iterations(self, count: int) -> None:
         self._memory.iterations = count
 
+    def has_arrived(self) -> bool:
+        """Return whether the run has reached its target time."""
+        return self._plan is not None and self.left_to(self._plan.t_end) == 0.0
+
     @property
     def arrived(self) -> bool:
         """Return whether the run has reached its target time."""
-        return self.plan is not None and self.left_to(self.plan.t_end) == 0.0
+        return self.has_arrived()
 
     @property
     def rejected_steps(self) -> int:
         """Number of rejected steps."""
-        return int(getattr(self._memory, "rejected", 0))
+        return int(self._memory.rejected) if self._plan is not None and not self._plan.tau else 0
 
     @property
     def step_error(self) -> tuple[float, float]:
         """Estimated relative error of the worst step and its start time; NaN without an estimate."""
-        if not hasattr(self._memory, "error"):  # source generated by version 0.1
+        if "step_error" not in self._functions:
             return np.nan, np.nan
-        error = float(self.stepper.binding.function("step_error")(self._memory))
-        return (error, float(self._memory.error_t)) if error >= 0.0 else (np.nan, np.nan)
+        error = self._functions["step_error"]()
+        return (error, self._memory.error_t) if error >= 0.0 else (np.nan, np.nan)
 
     @property
     def _leaving(self) -> bool:

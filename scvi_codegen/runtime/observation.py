@@ -6,7 +6,7 @@ saved. States are therefore bitwise equal with and without events.
 
 from __future__ import annotations
 
-import time
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -17,7 +17,7 @@ from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.runtime.dense_output import states_and_steps_at, step_sizes_at, times_of_run
 from scvi_codegen.runtime.event_search import CrossingSearch
 from scvi_codegen.runtime.memory import Memory
-from scvi_codegen.runtime.run_loop import CALL_SECONDS, record, trajectory_of
+from scvi_codegen.runtime.run_loop import drive, record, trajectory_of
 from scvi_codegen.runtime.singular_time import ProgressWatch
 from scvi_codegen.runtime.time_transformation import part_of_step
 from scvi_codegen.runtime.times import WHOLE
@@ -70,33 +70,36 @@ class Observation:
             StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
             EventError: if an event function is not finite.
         """
-        plan = self.run.plan
-        on = steps is None and (plan or self.end is not None)
-        most_steps = np.inf if on else checked_count(steps, "steps", least=0)
-        self._keep(record(self.run, 0), first=True)
-        most = max(1, CHUNK_NUMBERS // self.run.stepper.dimension)
-        chunk_size, done = min(FIRST_STEPS, most), 0
-        watch = ProgressWatch(self.run.stepper, self.end if plan is None else plan.t_end if plan.tau else None)
-        while done < most_steps and not self.run.arrived and not stop():
-            size, began = int(min(chunk_size, most_steps - done)), time.perf_counter()
-            before = self.run.t, self.run.steps
-            try:
-                self._advance_chunk(size)
-                if failure := watch.check_progress(before[0], self.run.t, self.run.steps - before[1], self.run.steps):
-                    raise failure
-            except StepFailedError as failure:
-                failure.trajectory = self.trajectory()
-                raise
-            if self.ended:
-                break
-            done += size
-            if progress is not None:
-                progress(done)
-            elapsed = max(time.perf_counter() - began, 1e-6)
-            chunk_size = max(1, min(most, 2 * size, int(size * CALL_SECONDS / elapsed)))
+        run, plan = self.run, self.run.plan
+        unbounded = steps is None and (plan or self.end is not None)
+        count = math.inf if unbounded else checked_count(steps, "steps", least=0)
+        self._keep(record(run, 0), first=True)
+        most = max(1, CHUNK_NUMBERS // run.stepper.dimension)
+        end = self.end if plan is None else plan.t_end if plan.tau else None
+        watch = None if end is None else ProgressWatch(run.stepper, end)
+
+        def advance(size: int) -> int:
+            before, number = run.t, run.steps
+            self._advance_chunk(size)
+            if watch is not None:
+                watch.check_progress(before, run.t, run.steps - number, run.steps)
+            return run.steps - number
+
+        try:
+            drive(
+                advance,
+                count,
+                first=min(FIRST_STEPS, most),
+                most=most,
+                ended=lambda: run.arrived or self.ended or stop(),
+                progress=progress,
+            )
+        except StepFailedError as failure:
+            failure.trajectory = self.trajectory()
+            raise
         found = self.trajectory()
         if self.times is None and not self.ended:
-            self.run.iterations = self.iterations - int(found.iterations.sum())
+            run.iterations = self.iterations - int(found.iterations.sum())
         return found
 
     def _advance_chunk(self, size: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_large_steps
@@ -19,6 +19,9 @@ from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["Run"]
 
+MOST_KEPT = 2**16
+"""Largest number of doubles of workspace of a run that is kept for later calls."""
+
 
 class Run(Memory):
     """Run in progress: :class:`Memory` with recording of states."""
@@ -27,6 +30,21 @@ class Run(Memory):
         interface = self.stepper.interface
         tau = bool(interface.energy_parameter)
         return describe_run(short_title(interface), interface.solver, self, tau=tau, unset_inputs=self._unset_inputs)
+
+    @classmethod
+    def reused(cls, stepper: Integrator) -> Self:
+        """Return a released run of the stepper, to be started, or a new one if all are in use."""
+        try:
+            found: Self = stepper._released_runs.pop()
+            return found
+        except IndexError:
+            pass
+        return cls(stepper)
+
+    def release(self) -> None:
+        """Let :meth:`reused` return this run; the caller drops it. Large memory is freed instead."""
+        if len(self._workspace) <= MOST_KEPT:
+            self.stepper._released_runs.append(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
@@ -50,14 +68,19 @@ class Run(Memory):
             EventError: if an event function is not finite.
         """
         before = 0.0 if self._leaving else self.step_error[0]
-        if self.stepper.events:
-            trajectory = Observation(self, save_every=save_every).advance(steps, progress)
-        else:
-            trajectory = record(self, steps, save_every=save_every, progress=progress)
+        trajectory = self._recorded(steps, save_every=save_every, progress=progress)
         if not self._leaving:
             warn_of_large_steps(trajectory, before=before)
         warn_of_energy_error(trajectory)
         return trajectory
+
+    def _recorded(
+        self, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
+    ) -> Trajectory:
+        """Return the states as :meth:`record` does, without its warnings and its lock."""
+        if self.stepper.events:
+            return Observation(self, save_every=save_every).advance(steps, progress)
+        return record(self, steps, save_every=save_every, progress=progress)
 
 
 def _restored(

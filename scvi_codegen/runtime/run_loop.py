@@ -1,158 +1,179 @@
-"""Run loop: advance a run in chunks and save every k-th state, so that Python regains control regularly."""
+"""Run loop: advance in chunks of bounded duration, and save every k-th state of a run."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from struct import Struct
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scvi_codegen.errors import StepFailedError
 from scvi_codegen.native.arguments import empty_array
 from scvi_codegen.native.options import step_failure
 from scvi_codegen.runtime.events import Crossings
-from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.memory import Memory, fill
-from scvi_codegen.runtime.singular_time import ProgressWatch, lost_energy_surface
+from scvi_codegen.runtime.inputs import BINARY64, Array
+from scvi_codegen.runtime.memory import Memory
+from scvi_codegen.runtime.singular_time import ProgressWatch, check_energy_surface
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["CALL_SECONDS", "first_step_size", "record", "record_states", "record_until", "trajectory_of"]
+__all__ = ["CALL_SECONDS", "drive", "first_step_size", "record", "trajectory_of"]
 
+NATIVE_DOUBLE = Struct("d")
 CALL_SECONDS = 0.1
 """Target duration of a C call in seconds; bounds the delay of Ctrl-C and of ``progress``."""
+FIRST_STEPS = 256
+"""Number of saved states of the first C call, before the speed of the steps is known."""
+
+
+def drive(
+    advance: Callable[[int], int],
+    steps: float,
+    *,
+    first: int = 1,
+    multiple: int = 1,
+    most: float = math.inf,
+    growth: float = 2.0,
+    seconds: float = CALL_SECONDS,
+    ended: Callable[[], bool] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Take steps in chunks of about ``seconds``, so that Python regains control regularly.
+
+    Args:
+        advance: function that takes a number of steps and returns how many it took.
+        steps: number of steps, possibly infinite.
+        first, multiple, most: steps of the first chunk; divisor of the chunk sizes; largest chunk size.
+        growth: largest ratio of successive chunk sizes.
+        seconds: target duration of a chunk.
+        ended: function that returns whether the run has ended; called before each chunk.
+        progress: called with the number of steps after each chunk.
+    """
+    done, size, began = 0, first, -math.inf
+    while done < steps and not (ended is not None and ended()):
+        now = time.perf_counter()
+        if done:
+            faster = min(growth, seconds / max(now - began, 1e-6))
+            size = multiple * max(1, int(min(size * faster, most) / multiple))
+        size, began = int(min(size, steps - done)), now
+        done += advance(size)
+        if progress is not None:
+            progress(done)
 
 
 def record(
     memory: Memory, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
 ) -> Trajectory:
-    """Record ``steps`` steps, or up to the target time of adaptive steps (all steps to it if ``steps`` is omitted)."""
-    if memory.plan is None:
-        return record_states(memory, checked_count(steps, "steps", least=0), save_every=save_every, progress=progress)
-    count = None if steps is None else checked_count(steps, "steps", least=0)
-    return record_until(memory, count, save_every=save_every, progress=progress)
-
-
-def record_states(
-    memory: Memory, steps: int, *, save_every: int = 1, progress: Callable[[int], None] | None = None
-) -> Trajectory:
     """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
+
+    Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted.
 
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
     """
-    steps = checked_count(steps, "steps", least=0)
+    count = None if steps is None and memory.plan is not None else checked_count(steps, "steps", least=0)
     save_every = checked_count(save_every, "save_every", least=1)
-    first = memory.steps
-    capacity = (first + steps) // save_every - first // save_every
-    m = memory.stepper.dimension
-    t, q, p = (empty_array((capacity + 1, *shape)) for shape in ((), (m,), (m,)))
-    iterations = np.zeros(capacity + 1, dtype=np.int32)
-    t[0], q[0], p[0] = memory.t, memory.q, memory.p
-    filled, done, chunk_size = 1, 0, save_every * max(1, 256 // save_every)
-    while done < steps:
-        size = min(chunk_size, steps - done)
-        began = time.perf_counter()
-        status, report = fill(memory, size, save_every, t[filled:], q[filled:], p[filled:], iterations[filled:])
-        done += report.steps
-        filled = 1 + (first + done) // save_every - first // save_every
-        if status:
-            kept = trajectory_of(
-                memory,
-                t[:filled],
-                q[:filled],
-                p[:filled],
-                iterations[:filled],
-                tau=_tau(memory, first, save_every, filled),
-            )
-            raise step_failure(status, report, step=memory.steps, h=memory.h, kept=kept)
-        if progress is not None:
-            progress(done)
-        elapsed = max(time.perf_counter() - began, 1e-6)
-        chunk_size = save_every * max(1, int(min(2.0 * size, size * CALL_SECONDS / elapsed) / save_every))
-    found = trajectory_of(memory, t, q, p, iterations, tau=_tau(memory, first, save_every, len(t)))
-    memory.longest = float(np.abs(np.diff(found.t)).max(initial=memory.longest))
-    if found.tau is not None and (failure := lost_energy_surface(found, memory.longest)):
-        failure.trajectory = found
-        raise failure
+    recorder = _Recorder(memory, save_every, count)
+    try:
+        drive(
+            recorder.advance,
+            math.inf if count is None else count,
+            first=recorder.first_size,
+            multiple=save_every,
+            ended=None if memory.plan is None else memory.has_arrived,
+            progress=progress,
+        )
+    except StepFailedError as failure:
+        failure.trajectory = recorder.trajectory()
+        raise
+    found = recorder.trajectory()
+    if found.tau is not None:
+        memory.longest = float(np.abs(np.diff(found.t)).max(initial=memory.longest))
+        check_energy_surface(found, memory.longest)
     return found
 
 
-def _tau(memory: Memory, first: int, save_every: int, count: int) -> Array | None:
-    """Return tau after ``first`` steps and at the following multiples of ``save_every``; 0 at the start."""
-    if not memory.stepper.interface.energy_parameter:
-        return None
-    numbers = np.append(first, save_every * (first // save_every + np.arange(1, count)))
-    return times_after(0.0, memory.h, numbers)[0]
+class _Recorder:
+    """Present state of a run, and every ``save_every``-th of the following ones, in arrays that C fills.
 
-
-def record_until(
-    memory: Memory, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
-) -> Trajectory:
-    """Advance to the target time, or by ``steps``; save every ``save_every``-th state, the present and the final one.
-
-    Raises:
-        StepFailedError: if a step fails or underflows; ``trajectory`` has the saved states.
+    The number of states is known for fixed steps; for adaptive steps each chunk has arrays of its own.
     """
-    save_every = checked_count(save_every, "save_every", least=1)
-    pieces = [_Piece.of(memory)]
-    done, chunk_size = 0, 256 * save_every
-    watch = ProgressWatch(memory.stepper, memory.plan.t_end if memory.plan and memory.plan.tau else None)
-    while not memory.arrived and (steps is None or done < steps):
-        size, began, before = (
-            chunk_size if steps is None else min(chunk_size, steps - done),
-            time.perf_counter(),
-            memory.t,
-        )
-        piece = _Piece.empty(memory, size // save_every + 2)
-        status, report = fill(memory, size, save_every, *piece)
-        pieces.append(piece.first(report.stored))
-        done += report.steps
+
+    def __init__(self, memory: Memory, save_every: int, steps: int | None) -> None:
+        self.memory, self.save_every, self.first, plan = memory, save_every, memory.steps, memory.plan
+        self.earlier: list[tuple[Array, Array, Array, NDArray[np.int32]]] = []
+        if plan is None:
+            assert steps is not None  # by the caller
+            self.first_size = save_every * max(1, FIRST_STEPS // save_every)
+            self._allocate((self.first + steps) // save_every - self.first // save_every + 1)
+        else:
+            self.first_size = FIRST_STEPS * save_every
+            self._allocate(min(FIRST_STEPS, (self.first_size if steps is None else steps) // save_every) + 3)
+        self.t[0], self.q[0], self.p[0], self.filled = memory.t, memory._q, memory._p, 1
+        self.watch = ProgressWatch(memory.stepper, plan.t_end) if plan and plan.tau else None
+
+    def _allocate(self, rows: int) -> None:
+        m, binding = len(self.memory._q), self.memory.stepper.binding
+        self.t, self.q, self.p = empty_array((rows,)), empty_array((rows, m)), empty_array((rows, m))
+        self.iterations, self.filled = np.zeros(rows, dtype=np.int32), 0
+        self.starts = *binding.pointers(self.t, self.q, self.p), binding.pointer(self.iterations)
+
+    def advance(self, size: int) -> int:
+        """Take ``size`` steps, fewer if the target time is reached; return their number."""
+        memory, save_every = self.memory, self.save_every
+        plan, watch, rows = memory.plan, self.watch, size // save_every + 2
+        before = None if watch is None else memory.t
+        if plan is not None and self.filled + rows > len(self.t):
+            self.earlier.append(self._states())
+            self._allocate(rows)
+        filled, (t, q, p, iterations) = self.filled, self.starts
+        start = filled * self.q.shape[1]
+        status = memory._advance(size, save_every, (t + filled, q + start, p + start, iterations + filled))
+        report = memory._report
+        if plan is None:
+            self.filled = 1 + memory.steps // save_every - self.first // save_every
+        else:
+            self.filled += report.stored
         if status:
-            raise step_failure(status, report, step=memory.steps, h=memory.h, kept=_joined(memory, pieces, save_every))
-        if failure := watch.check_progress(before, memory.t, report.steps, memory.steps):
-            failure.trajectory = _joined(memory, pieces, save_every)
-            raise failure
-        if progress is not None:
-            progress(done)
-        elapsed = max(time.perf_counter() - began, 1e-6)
-        chunk_size = save_every * max(1, int(min(2.0 * size, size * CALL_SECONDS / elapsed) / save_every))
-    return _joined(memory, pieces, save_every)
+            raise step_failure(status, report, step=memory.steps, h=memory.h)
+        steps: int = report.steps
+        if watch is not None and before is not None:
+            watch.check_progress(before, memory.t, steps, memory.steps)
+        return steps
 
+    def _states(self) -> tuple[Array, Array, Array, NDArray[np.int32]]:
+        """Return the rows in use; copies if most are not."""
+        k, t, q, p, iterations = self.filled, self.t, self.q, self.p, self.iterations
+        if k == len(t):
+            return t, q, p, iterations
+        if 2 * k > len(t):
+            return t[:k], q[:k], p[:k], iterations[:k]
+        return t[:k].copy(), q[:k].copy(), p[:k].copy(), iterations[:k].copy()
 
-class _Piece(NamedTuple):
-    """States, and solver iterations since the previous state."""
-
-    t: Array
-    q: Array
-    p: Array
-    iterations: NDArray[np.int32]
-
-    @classmethod
-    def empty(cls, memory: Memory, room: int) -> _Piece:
-        m = memory.stepper.dimension
-        t, q, p = (empty_array((room, *shape)) for shape in ((), (m,), (m,)))
-        return cls(t, q, p, np.zeros(room, dtype=np.int32))
-
-    def first(self, count: int) -> _Piece:
-        return _Piece(self.t[:count], self.q[:count], self.p[:count], self.iterations[:count])
-
-    @classmethod
-    def of(cls, memory: Memory) -> _Piece:
-        """Return the present state."""
-        return cls(np.array([memory.t]), memory.q[np.newaxis], memory.p[np.newaxis], np.zeros(1, dtype=np.int32))
-
-
-def _joined(memory: Memory, pieces: Sequence[_Piece], save_every: int) -> Trajectory:
-    """Return the trajectory of an adaptive run; step sizes are known if every state is saved."""
-    t, q, p, iterations = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
-    lengths = np.full(len(t), np.nan)
-    if save_every == 1:
-        lengths[:-1] = np.diff(t)
-    return trajectory_of(memory, t, q, p, iterations, step_sizes=lengths)
+    def trajectory(self) -> Trajectory:
+        """Return the states saved so far."""
+        memory, save_every = self.memory, self.save_every
+        t, q, p, iterations = self._states()
+        if self.earlier:
+            blocks = zip(*self.earlier, (t, q, p, iterations), strict=True)
+            t, q, p, iterations = map(np.concatenate, blocks)
+        if memory.plan is not None:
+            step_sizes = np.empty(len(t))
+            step_sizes.fill(np.nan)
+            if save_every == 1:
+                np.subtract(t[1:], t[:-1], out=step_sizes[:-1])
+            return trajectory_of(memory, t, q, p, iterations, step_sizes=step_sizes)
+        tau = None
+        if memory.stepper.interface.energy_parameter:
+            numbers = save_every * (self.first // save_every + np.arange(len(t)))
+            numbers[0] = self.first
+            tau = times_after(0.0, memory.h, numbers)[0]
+        return trajectory_of(memory, t, q, p, iterations, tau=tau)
 
 
 def trajectory_of(
@@ -168,15 +189,16 @@ def trajectory_of(
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
+    plan, h = memory.plan, memory.h
     step_error, worst_step_time = memory.step_error
     return Trajectory(
         t=t,
         q=q,
         p=p,
         iterations=iterations,
-        step_sizes=np.broadcast_to(memory.h, t.shape) if step_sizes is None else step_sizes,
-        h=memory.h if memory.plan is None else first_step_size(memory.plan, t),
-        plan=memory.plan,
+        step_sizes=_repeated(h, len(t)) if step_sizes is None else step_sizes,
+        h=h if plan is None else first_step_size(plan, t),
+        plan=plan,
         steps=memory.steps if steps is None else steps,
         rejected_steps=memory.rejected_steps,
         step_error=step_error,
@@ -187,6 +209,11 @@ def trajectory_of(
         events=events,
         tau=tau,
     )
+
+
+def _repeated(value: float, count: int) -> Array:
+    """Return a read-only array of one number without memory for each; ``numpy.broadcast_to`` is ten times slower."""
+    return np.ndarray((count,), BINARY64, NATIVE_DOUBLE.pack(value), 0, (0,))
 
 
 def first_step_size(plan: StepPlan, t: Array) -> float:

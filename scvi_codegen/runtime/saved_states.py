@@ -42,7 +42,7 @@ def checked_rows(rows: slice, count: int) -> tuple[int, int, int]:
     return first, last, stride
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class SavedStates:
     """Saved states with the data for dense output and events; other fields as of :class:`Trajectory`.
 

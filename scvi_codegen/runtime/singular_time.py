@@ -14,7 +14,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.trajectory import Trajectory
 
-__all__ = ["ProgressWatch", "lost_energy_surface"]
+__all__ = ["ProgressWatch", "check_energy_surface"]
 
 MOST_STEPS: Final = 1e9
 """Number of remaining steps at the present rate above which slow progress counts."""
@@ -29,37 +29,36 @@ ENERGY_ERROR: Final = 1e-3
 
 
 class ProgressWatch:
-    """Progress in t of runs with a time transformation; ``end`` is the target time, ``None`` for other runs."""
+    """Progress in t of runs whose step size in t is unbounded below; ``end`` is the target time."""
 
-    def __init__(self, stepper: Integrator, end: float | None) -> None:
+    def __init__(self, stepper: Integrator, end: float) -> None:
         self.stepper, self.end, self.best, self.slow = stepper, end, 0.0, 0
 
-    def check_progress(self, before: float, t: float, steps: int, number: int) -> StepFailedError | None:
-        """Return an error if the target time is out of reach after ``steps`` steps from ``before`` to t.
+    def check_progress(self, before: float, t: float, steps: int, number: int) -> None:
+        """Raise an error if the target time is out of reach after ``steps`` steps from ``before`` to t.
 
         ``number`` is the step number in the run.
         """
-        if self.end is None or not steps:
-            return None
+        if not steps:
+            return
         passed, left = abs(t - before), abs(self.end - t)
         time_per_step = passed / steps
         self.best = max(self.best, time_per_step)
         self.slow = self.slow + steps if time_per_step < SLOW * self.best and left > MOST_STEPS * time_per_step else 0
-        if self.slow < SLOW_STEPS:
-            return None
-        return _singular_time_error(
-            self.stepper, t, number, f"{steps} steps advanced t by {passed:.1e}, {left:.3g} is left"
-        )
+        if self.slow >= SLOW_STEPS:
+            raise _singular_time_error(
+                self.stepper, t, number, f"{steps} steps advanced t by {passed:.1e}, {left:.3g} is left"
+            )
 
 
-def lost_energy_surface(states: Trajectory, longest: float) -> StepFailedError | None:
-    """Return an error if states in transformed time lost their energy because the rate of time vanished.
+def check_energy_surface(states: Trajectory, longest: float) -> None:
+    """Raise an error if states in transformed time lost their energy because the rate of time vanished.
 
     ``longest`` is the longest duration of a step in the run.
     """
     short = np.flatnonzero(np.abs(np.diff(states.t)) < SHORT_STEP * longest)
     if not len(short):
-        return None
+        return
     stepper = states.stepper
     level = states.parameters[stepper.parameters.index(stepper.interface.energy_parameter)]
     given = states.q[short], states.p[short], states.t[short], states.parameters
@@ -67,12 +66,14 @@ def lost_energy_surface(states: Trajectory, longest: float) -> StepFailedError |
     energies = stepper.energy(*given)
     wrong = np.flatnonzero(~(np.abs(energies - level) <= ENERGY_ERROR * (abs(level) + moving)))
     if not len(wrong):
-        return None
+        return
     first = int(wrong[0])
     evidence = f"the energy there is {energies[first]:g}, not {level:g}"
-    return _singular_time_error(
+    failure = _singular_time_error(
         stepper, float(states.t[short][first]), states.steps - len(states) + 1 + int(short[first]), evidence
     )
+    failure.trajectory = states
+    raise failure
 
 
 def _singular_time_error(stepper: Integrator, t: float, number: int, evidence: str) -> StepFailedError:

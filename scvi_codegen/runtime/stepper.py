@@ -152,31 +152,33 @@ class Stepper(Ensembles):
         data = None if inputs is None else checked_inputs(self.interface, inputs)
         if data is not None and t_eval is not None:
             raise StateError("t_eval is not supported with inputs: omit t_eval")
-        common: dict[str, Any] = {"t": t, "options": options}
         if error is not None:
             return confirmed_run(
                 checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, has_tau=self._has_tau),
                 partial(stepper.integrate, inputs=inputs),
                 partial(stepper.with_events(()).integrate, inputs=inputs),
                 (q, p, velocity),
-                common | {"parameters": parameters},
+                {"t": t, "options": options, "parameters": parameters},
                 {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
             )
-        start = partial(stepper.start, q, p, velocity=velocity, h=h, tolerance=tolerance, **common)
         to_end = h is None or bool(self.interface.time_transformation)
         if data is None:
-            run = start(t_end=t_end if to_end else None, parameters=parameters)
+            plan = h, t_end if to_end else None, tolerance
+            run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             check = GrowthCheck(run, check_growth)
             found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
             check.warn(found)
+            run.release()
             return found
         end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
         values = parameters_of(self, parameters, data)
-        run = start(t_end=end if to_end else None, parameters=values(first_inner_time(t, end)))
+        plan = h, end if to_end else None, tolerance
+        run = stepper._started(q, p, velocity, plan, t, values(first_inner_time(t, end)), options, reuse=True)
         check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
         save_every = checked_count(save_every, "save_every", least=1)
         driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
         check.warn(driven)
+        run.release()
         return driven
 
     @property
@@ -199,17 +201,38 @@ class Stepper(Ensembles):
         options: SolverOptions | None = None,
     ) -> Run:
         """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
+        return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
+
+    def _started(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None,
+        velocity: ArrayLike | None,
+        step_plan: tuple[float | None, float | None, float | None],
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+        *,
+        reuse: bool = False,
+    ) -> Run:
+        """Return a run with (h, t_end, tolerance) as of :meth:`start`, in memory of an earlier one if ``reuse``."""
         p = self._initial_momenta(q, p, velocity, t, parameters)
         if self.interface.constraints:
             q, p = consistent(self, q, p, t, parameters)
+        plan = self._checked_plan(*step_plan)
+        stepper = self._adaptive() if isinstance(plan, StepPlan) else self
+        run = Run.reused(stepper) if reuse else Run(stepper)
+        run.start(q, p, h=plan, t=t, parameters=parameters, options=options)
+        return run
+
+    def _checked_plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan | float:
+        """Return the step plan of adaptive steps, or h; raise ``StateError`` for other combinations."""
         if self.interface.time_transformation:
-            plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
-            return Run.started(self._adaptive(), q, p, h=plan, t=t, parameters=parameters, options=options)
+            return StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
         if h is None and self.interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
         if t_end is not None and h is None:
-            plan = StepPlan.checked(t_end, tolerance)
-            return Run.started(self._adaptive(), q, p, h=plan, t=t, parameters=parameters, options=options)
+            return StepPlan.checked(t_end, tolerance)
         if t_end is not None or h is None:
             raise StateError(
                 "give either h (fixed step size) or t_end (adaptive step size); got "
@@ -217,7 +240,7 @@ class Stepper(Ensembles):
             )
         if tolerance is not None:
             raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
-        return Run.started(self, q, p, h=h, t=t, parameters=parameters, options=options)
+        return h
 
     def from_checkpoint(
         self,
@@ -264,10 +287,7 @@ def _recorded(
         steps = whole
     _check_number(run, steps)
     if t_eval is None:
-        found = run.record(steps, save_every=save_every, progress=progress)
-        if run._leaving:
-            warn_of_large_steps(found)
-        return found
+        return _with_warnings(run._recorded(steps, save_every=save_every, progress=progress))
     if clocked:
         raise StateError("t_eval requires t_end instead of steps in transformed time")
     times = times_of_run(t_eval, run.t, _end_of(run, steps))

@@ -42,7 +42,7 @@ MOST_DRAWN, MOST_CURVES = 400, 6
 """Largest numbers of states and of coordinates in the plot of a notebook."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class Trajectory(TrajectoryDerivatives, Confirmed):
     """States along a run, the initial state first.
 

@@ -19,7 +19,7 @@ from scvi_codegen.validation.counts import checked_count
 __all__ = ["TrajectoryDerivatives"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class TrajectoryDerivatives(SavedStates):
     """:class:`SavedStates` with the exact derivatives of the computed map at fixed step sizes.
 

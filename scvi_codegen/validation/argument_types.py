@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import numbers
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import Parameter, signature
 from typing import Any, TypeVar, cast
@@ -43,6 +43,8 @@ __all__ = [
 
 Called = TypeVar("Called", bound=Callable[..., Any])
 MAX_SHOWN_LENGTH = 60
+MOST_ARGUMENTS = 2**31
+"""Position of arguments that only ``**named`` accepts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +120,18 @@ def checks_arguments(
         known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
         open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
         optional = {name for name in names if parameters[name].default is None}
+        places = [(names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()]
 
         @functools.wraps(function)
         def checked(*given: Any, **named: Any) -> Any:
             if not (open_ended or named.keys() <= known.keys()):
                 name = next(name for name in named if name not in known)
                 raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
-            pairs: Iterable[tuple[str, Any]] = (*zip(names, given, strict=False), *named.items())
-            for name, value in pairs:
-                if name in kinds and not (value is None and name in optional):
-                    check_kind(kinds[name], value, name, error)
+            for place, name, kind in places:
+                if place < len(given) or name in named:
+                    value = given[place] if place < len(given) else named[name]
+                    if not (value is None and name in optional):
+                        check_kind(kind, value, name, error)
             return function(*given, **named)
 
         for of_a_cache in ("cache_clear", "cache_info"):
