@@ -239,7 +239,7 @@ class TestInputs:
             for run in (others, none):
                 run.set_inputs(F=math.cos(run.t))
                 if run is none:
-                    run.rollback(run.mark)
+                    run.rollback(run.snapshot)
                 run.advance(1)
         assert same.iterations == free.iterations
         assert np.abs(same.q["q"] - free.q["q"]).max() < 1e-15
