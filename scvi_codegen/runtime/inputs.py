@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-BINARY64 = np.dtype(np.float64)
+BINARY64, FEW = np.dtype(np.float64), 64
 Parameters = Mapping[str, float] | Sequence[float] | Array | None
 """Parameters by name (others have their defaults), or all in order."""
 
@@ -59,7 +59,8 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
         type(value) is np.ndarray
         and value.dtype is BINARY64
         and value.shape == (len(interface.coordinates),)
-        and math.isfinite(value.dot(value))  # not of large numbers
+        and len(value) <= FEW  # faster than NumPy's functions
+        and all(map(math.isfinite, value.tolist()))
     ):
         return value.copy()
     array, coordinates = real_array(value, name), interface.coordinates
