@@ -2,8 +2,11 @@
 
     >>> from scvi_codegen.methods import SCVI
     >>> from scvi_codegen.models.systems import planar_pendulum
-    >>> print(derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True).equations[0])
-    (34a) 0 = g*l*m*sin(Q_1) + l**2*m*(Q_1/h**2 - q_k/h**2 - v_0/h)
+    >>> equation = derive(planar_pendulum(), SCVI(1, "gauss-legendre:2"), radicals=True).equations[0]
+    >>> names = {symbol.name: symbol for symbol in equation.residual.free_symbols}
+    >>> expected = sympy.sympify("m*l**2*((Q_1 - q_k)/h**2 - v_0/h) + m*g*l*sin(Q_1)", names)
+    >>> equation.number, sympy.simplify(equation.residual - expected)
+    ('34a', 0)
 
 Entries of nodes' and quadratures' tables appear as named symbols with their values beside them, or as radicals where
 these are short. Nothing is simplified after the derivation. The compiled code solves the same

@@ -11,7 +11,7 @@ from scvi_codegen.validation.synonyms import likely_names, synonym_hint
 __all__ = ["EVENTS", "key_hint"]
 
 KEYS: Final = {
-    "run": "step span steps tolerance every controller",
+    "run": "step span steps tolerance save_every controller",
     "initial": "q q_dot p t",
     "method": "method degree quadrature",
     "system": "lagrangian hamiltonian damping dissipation constraints time_transformation inputs",

@@ -9,7 +9,7 @@ import click
 
 from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.cli.formatting import table
-from scvi_codegen.methods import ARGUMENTS, METHODS, Method, method_from_specification, size_of
+from scvi_codegen.methods import ARGUMENTS, METHODS, method_from_specification, size_of
 from scvi_codegen.tables.closed_forms import exact_tableau
 from scvi_codegen.tables.nodes import Expressions
 from scvi_codegen.tables.precision import mp
@@ -51,12 +51,13 @@ def _entries_of(name: str) -> Iterator[dict[str, Any]]:
     """Yield the properties of an example of a method, and of the printed form of the paper if there is one."""
     variants: list[dict[str, Any]] = [{}, {"variational": False}] if "variational" in ARGUMENTS[name] else [{}]
     for variant in variants:
-        method = method_from_specification({**_example(name).specification(), **variant})
+        arguments = {**_example(name), **variant}
+        method = method_from_specification({"method": name, **arguments})
         yield {
             "name": name,
             "arguments": list(ARGUMENTS[name]),
             "number": size_of(name),
-            "example": method.name,
+            "example": _option(name, arguments),
             "order": method.order,
             "symplectic": method.symplectic,
             "symmetric": method.symmetric,
@@ -114,9 +115,19 @@ def _entries(A: Sequence[Expressions], b: Expressions, c: Expressions) -> Iterat
     yield from (f"b_{j} = {x}" for j, x in enumerate(b, 1))
 
 
-def _example(name: str) -> Method:
-    arguments = EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {})
-    return method_from_specification({"method": name, **arguments})
+def _example(name: str) -> Mapping[str, Any]:
+    return EXAMPLES.get(name, {"stages": EXAMPLE_STAGES} if "stages" in ARGUMENTS[name] else {})
+
+
+def _option(name: str, arguments: Mapping[str, Any]) -> str:
+    """Return a method as ``--method`` accepts it, followed by further options."""
+    size = size_of(name)
+    words = [f"{name}:{arguments[size]}" if size in arguments else name]
+    if "abscissae" in arguments:
+        words.append(f"--abscissae {','.join(map(str, arguments['abscissae']))}")
+    if not arguments.get("variational", True):
+        words.append("--printed")
+    return " ".join(words)
 
 
 def _yes_or_not(holds: bool) -> str:

@@ -207,8 +207,10 @@ class IndexedSystem:
         >>> from sympy import IndexedBase, Sum, symbols
         >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
         >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
-        >>> print(IndexedSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs))
-        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
+        >>> chain = IndexedSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
+        >>> print(*sorted(map(str, chain.terms)), sep=chr(10))
+        sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
+        sum(i in N, q_dot[i]**2/2)
         """
         if not isinstance(lagrangian, Expr):
             what = type(lagrangian).__name__
