@@ -1,5 +1,5 @@
 /* Fixed-point iteration of a step of an indexed Hamiltonian system: positions and momenta y at the points are updated
- * from their rates until they converge. Requires: points.h, convergence.h, the tables, coefficients.h, forces, which
+ * from their rates until they converge. Requires: points.h, convergence.h, the tables, curve_error.h, forces, which
  * computes the rates G at X: -H_q of the momenta, then H_p of the positions. Momenta follow positions in memory. */
 
 /* Parts of work, by groups of points: y there, and rates in this step, the last one and the one before. */
@@ -128,7 +128,7 @@ static double largest_yet(const run_memory *run, const lanes *velocity, long lon
 
 /* Largest value in a block of (displacement due to the leading coefficient of the velocities)^2 / (displacement due to
  * the curvature), all relative to the largest coordinate. The coefficient is at least `decay` times the next lower one
- * (coefficients.h). */
+ * (curve_error.h). */
 static double unresolved_of_block(const run_memory *run, const lanes *velocity, long long n, double decay,
     double largest, section here)
 {

@@ -1,16 +1,15 @@
 /* Linear systems of Newton's method for the points of a step of an indexed system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
- * multiplied by vectors, term group by term group. Requires: indexed_points.h; products and diagonals of F'. */
+ * multiplied by vectors, term group by term group. Requires: array_points.h; products and diagonals of F'. */
 
 typedef struct {
   const run_memory *run;
   const problem *given;
-  lengths by;
+  const step_points *points;
   long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
   measures by_size;
   double state; /* scaled size of the coordinates */
-  const lanes *X;
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;
   int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
@@ -22,9 +21,9 @@ typedef struct {
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
-  products(of->run, of->given, of->X, x, of->forces, n);
+  products(of->run, of->given, of->points->X, x, of->forces, n);
   for (long long i = of->own.first; i < of->own.end; i++) {
-    const double unit = of->by.square * of->run->inverse_mass[i];
+    const double unit = unit_of(of->points, i);
     for (int g = 0; g < GROUPS; g++)
       y[g * n + i] = x[g * n + i] - unit * contribution_of_points(PRODUCT, g, &of->forces[i], n);
   }
@@ -90,13 +89,13 @@ static double mean_derivative(const linear_system *of, const lanes *x, long long
   double mean = 0.0;
   for (int j = 0; j < KEPT; j++)
     mean += at_point(&x[i], of->n, j) / KEPT;
-  return of->by.square * of->run->inverse_mass[i] * mean;
+  return unit_of(of->points, i) * mean;
 }
 
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
-  diagonals(of->run, of->given, of->X, of->forces, of->n);
+  diagonals(of->run, of->given, of->points->X, of->forces, of->n);
   for (long long i = of->own.first; i < of->own.end; i++)
     keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
 }

@@ -5,17 +5,16 @@
 #define UNSOLVED 1e-10 /* relative to the state: a larger residual is not due to rounding */
 
 /* Parts of work behind those of the fixed-point iteration. */
-static linear_system linear_of(const run_memory *run, const problem *given, const parts_of_work *parts, long long n)
+static linear_system linear_of(const step_points *points)
 {
-  const long long count = GROUPS * n;
-  lanes *work = (lanes *)run->work + ITERATION_VECTORS * count;
-  const linear_system of = {.run = run,
-      .given = given,
-      .by = sizes_of_steps(run->h),
-      .n = n,
+  const long long count = GROUPS * points->n;
+  lanes *work = (lanes *)points->run->work + ITERATION_VECTORS * count;
+  const linear_system of = {.run = points->run,
+      .given = points->given,
+      .points = points,
+      .n = points->n,
       .count = count,
-      .own = mine(run, n),
-      .X = parts->X,
+      .own = mine(points->run, points->n),
       .residual = work,
       .correction = work + count,
       .product = work + 2 * count,
@@ -27,60 +26,60 @@ static linear_system linear_of(const run_memory *run, const problem *given, cons
   return of;
 }
 
-/* Residual: the change by one fixed-point iteration at points X with forces F, for the coordinates of this thread. */
-static void find_residual(linear_system *of, const lanes *X, const lanes *F)
+/* Residual: the change by one fixed-point iteration at the points with their forces, for the coordinates of this
+ * thread. */
+static void find_residual(linear_system *of, const step_points *w)
 {
-  const run_memory *run = of->run;
-  const long long n = of->n;
   for (long long i = of->own.first; i < of->own.end; i++) {
-    double low;
-    const double drift = drift_of(run, i, &low), unit = of->by.square * run->inverse_mass[i];
+    const drift along = find_drift(w, i);
+    const double q = w->step->q0[i];
     for (int g = 0; g < GROUPS; g++) {
-      const lanes sum = contribution_of_points(PRODUCT, g, &F[i], n) + contribution_of_points(PRODUCT_LOW, g, &F[i], n);
-      const lanes rest = run->carry_q[i] + DRIFT[g] * low + DRIFT_LOW[g] * drift;
-      of->residual[g * n + i] = (run->q[i] - X[g * n + i]) + DRIFT[g] * drift + (unit * sum + rest);
+      const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i) + SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
+      of->residual[g * w->n + i] = (q - w->X[g * w->n + i]) + DRIFT[g] * along.high +
+          (unit_of(w, i) * sum + low_words(w, g, along, i));
     }
   }
 }
 
 /* Squared scaled size of the coordinates in the step. */
-static double size_of_state(const linear_system *of, const lanes *X)
+static double size_of_state(const linear_system *of)
 {
-  const run_memory *run = of->run;
+  const step_points *w = of->points;
   sums all;
-  begin_sums(&all, run, of->n);
+  begin_sums(&all, w->run, w->n);
   while (next_block(&all)) {
     double size = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
-      double low;
-      const double part = fabs(run->q[i]) + fabs(drift_of(run, i, &low));
-      const double of_one = of->by_size.scale * (part + fabs(at_point(&X[i], of->n, KEPT - 1) - run->q[i]));
+      const double q = w->step->q0[i], part = fabs(q) + fabs(find_drift(w, i).high);
+      const double of_one = of->by_size.scale * (part + fabs(at_point(&w->X[i], w->n, KEPT - 1) - q));
       size += of_one * of_one;
     }
     add_block(&all, size, 0.0);
   }
-  wait_at_barrier(run);
+  wait_at_barrier(w->run);
   return sum_of(&all, 0);
 }
 
 /* Starts from the extrapolated points or from points at rest, whichever has the smaller residual: the forces of a stiff
  * system have no curve that could be extrapolated. */
-static void start_nearer(linear_system *of, const parts_of_work *parts)
+static void start_nearer(linear_system *of)
 {
-  const run_memory *run = of->run;
+  const step_points *w = of->points;
+  step_points rest = *w;
   double continued, at_rest;
-  find_residual(of, parts->X, parts->F);
+  rest.X = of->correction, rest.F = of->forces;
+  find_residual(of, w);
   continued = inner_product(of, of->residual, of->residual);
   for (int g = 0; g < GROUPS; g++)
     for (long long i = of->own.first; i < of->own.end; i++)
-      of->correction[g * of->n + i] = lanes_of(run->q[i]);
-  forces_at_points(run, of->given, of->correction, of->forces, of->n);
-  find_residual(of, of->correction, of->forces);
+      rest.X[g * of->n + i] = lanes_of(w->step->q0[i]);
+  forces_at_points(&rest);
+  find_residual(of, &rest);
   at_rest = inner_product(of, of->residual, of->residual);
   if (continued <= at_rest)
     return;
-  scale(of, parts->X, 1.0, of->correction);
-  scale(of, parts->F, 1.0, of->forces);
+  scale(of, w->X, 1.0, rest.X);
+  scale(of, w->F, 1.0, rest.F);
 }
 
 /* Iterates until the points converge. The tables extrapolate from *guess steps. On success *guess is the number of
@@ -88,25 +87,29 @@ static void start_nearer(linear_system *of, const parts_of_work *parts)
 static int solve(run_memory *run, const problem *given, long long n, const struct predictor_tables_of *tables,
     long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
 {
-  const parts_of_work parts = divide(run, n);
-  linear_system of = linear_of(run, given, &parts, n);
-  double largest = first_positions(run, &parts, &of.by, n, tables, *guess);
   iteration now = new_iteration();
-  forces_at_points(run, given, parts.X, parts.F, n);
-  largest = largest_moved(run, parts.F, &of.by, n, largest);
+  array_step step;
+  const step_points *w = &step.points;
+  linear_system of;
+  double largest;
+  begin_step(run, given, n, &step);
+  of = linear_of(w);
+  largest = first_points(w, tables, *guess);
+  forces_at_points(w);
+  largest = largest_moved(w, largest);
   of.by_size = measures_of(largest);
-  start_nearer(&of, &parts);
-  of.state = sqrt(size_of_state(&of, parts.X));
+  start_nearer(&of);
+  of.state = sqrt(size_of_state(&of));
   while (now.status == 0) {
     double total[3] = {0.0}, left;
-    find_residual(&of, parts.X, parts.F);
+    find_residual(&of, w);
     if (now.last.of_all > REFRESHED) /* also before the first iteration */
       find_inverses(&of);
     left = find_correction(&of, report);
-    add_multiple(&of, parts.X, 1.0, of.correction);
-    forces_at_points(run, given, parts.X, parts.F, n);
+    add_multiple(&of, w->X, 1.0, of.correction);
+    forces_at_points(w);
     total[0] = inner_product(&of, of.correction, of.correction);
-    total[2] = size_of_state(&of, parts.X);
+    total[2] = size_of_state(&of);
     of.state = sqrt(total[2]);
     record_change(&now, relative_changes(total, &of.by_size, n, options), options, report);
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
@@ -116,5 +119,5 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   if (now.status < 0)
     return failure_of(&now);
   *guess = steps_to_continue(*guess, now.first);
-  return examine(run, parts.F, &of.by, n, largest, decay, error) ? OK : NOT_FINITE;
+  return examine(w, largest, decay, error) ? OK : NOT_FINITE;
 }

@@ -1,42 +1,118 @@
 /* Fixed-point iteration of a step for constant diagonal masses and forces F(q, t) (Li, Wu & Leok, eqs. (25)-(30)): X_n
  * = q0 + h c_n v0 + h^2 sum_j (a A)_nj F(X_j) / m, with the quadrature points or the trajectories as SIMD lanes.
- * Coefficients are double-double: the sum of a table and its _LOW partner. Requires: points.h or trajectories.h with
- * what they require, the tables, the kernels force_lanes and mass. */
+ * Coefficients are double-double: the sum of a table and its _LOW partner. Values at the points are in flat arrays,
+ * [group of points][coordinate], whose groups are EXTENT(n) elements apart: M coordinates or, if ARRAYS is defined, n,
+ * which is known at run time. Requires: points.h or trajectories.h with what they require, the tables, the kernels
+ * force_lanes and mass; with ARRAYS forces and VELOCITIES, 1 if they depend on velocities, too. */
+
+#ifdef ARRAYS
+#define EXTENT(n) (n)
+#define PASS static inline
+#else
+#define EXTENT(n) M
+#define PASS static inline __attribute__((always_inline))
+#define VELOCITIES 0
+
+/* Range of coordinates. */
+typedef struct {
+  long long first, end;
+} section;
+#endif
+
+enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, then velocities */
+
+#define FEW 8 /* coordinates, whose squared changes are added, which is faster */
 
 /* Constants of a step size: h^2 = square + square_low, h w = kick + kick_low. */
 typedef struct {
   weight kick[GROUPS], kick_low[GROUPS];
+#ifdef ARRAYS
+  const number *inverse_mass;
+#else
   number inverse_mass[M];
+#endif
   double square, square_low;
 } iteration_data;
 
-static void prepare_iteration(const step_data *step, iteration_data *data)
+/* h v of a coordinate. */
+typedef struct {
+  number high, low;
+} drift;
+
+/* Arguments and arrays of a step: the points X and the forces F there. */
+typedef struct {
+  const step_data *step;
+  const iteration_data *data;
+  lanes *X, *F;
+  long long n;
+#ifdef ARRAYS
+  const run_memory *run;
+  const problem *given;
+  const lanes *last, *before; /* forces in the last step and in the one before */
+  double scale; /* of coordinates */
+#else
+  drift *drifts;
+  lanes *base, *rests; /* points of the straight line; low words of the iteration, with the first forces */
+  number *inverse_size;
+#endif
+} step_points;
+
+static void prepare_step_size(double h, iteration_data *data)
 {
-  const double h = step->h;
   data->square = h * h;
   data->square_low = fma(h, h, -data->square);
   for (int n = 0; n < GROUPS; n++) {
     data->kick[n] = h * POINT_END_MOMENTUM[n];
     data->kick_low[n] = fused_weights(h, POINT_END_MOMENTUM[n], -data->kick[n]) + h * POINT_END_MOMENTUM_LOW[n];
   }
-  mass(NULL, step->t, step->parameters, data->inverse_mass);
-  for (int i = 0; i < M; i++)
-    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
 }
 
-#define FEW 8 /* coordinates, whose squared changes are added, which is faster */
-
-/* Square of the largest change. For many coordinates the sum of the rounding errors would stay above the tolerance. A
- * NaN is detected later, by the increments. */
-static inline lanes with_change(lanes change, lanes moved)
+PASS drift find_drift(const step_points *w, long long i)
 {
-  return M <= FEW ? change + moved * moved : larger_lanes(change, moved * moved);
+  const double h = w->step->h;
+  const number inverse = w->data->inverse_mass[i], v = inverse * w->step->p0[i];
+  const number v_low = fused_numbers(inverse, w->step->p0[i], -v);
+  drift of;
+  of.high = h * v;
+  of.low = fused_numbers(number_of(h), v, -of.high) + h * (v_low + inverse * w->step->carry_p[i]);
+  return of;
 }
 
-static inline void forces(const step_data *step, lanes (*X)[M], lanes (*F)[M])
+/* The drift of a coordinate, its points without forces and the unit of their changes. Those of few coordinates are
+ * stored, those of many are computed again. Rounding of the coefficients would displace the points to the same side in
+ * every step, and the last iteration alone would leave a part of that, so that for few coordinates all iterations
+ * include the low words, with the first forces. */
+#ifdef ARRAYS
+#define DRIFT_OF(w, i) find_drift(w, i)
+#define STRAIGHT(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
+#define WITH_LOW_WORDS(w, g, i, x) (x)
+#define MEASURE(w, i) ((w)->scale)
+#else
+#define DRIFT_OF(w, i) ((w)->drifts[i])
+#define STRAIGHT(w, g, i, of) ((w)->base[(g) * M + (i)])
+#define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
+#define MEASURE(w, i) ((w)->inverse_size[i])
+#endif
+
+/* sum_j table_gj F_j of a coordinate. */
+#define SUM_OF_FORCES(table, w, g, i) contribution_of_points(table, g, &(w)->F[i], EXTENT((w)->n))
+
+/* h^2 / m. */
+PASS number unit_of(const step_points *w, long long i)
 {
-  for (int n = 0; n < GROUPS; n++)
-    force_lanes(X[n], step->t + step->h * ABSCISSA[n], step->parameters, F[n]);
+  return w->data->square * w->data->inverse_mass[i];
+}
+
+/* Size of a coordinate in the step: |q| + |h v| + |h^2 F / m|. */
+PASS number size_of(const step_points *w, drift of, long long i)
+{
+  return magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
+}
+
+/* Low words of a point without forces. */
+PASS lanes low_words(const step_points *w, int g, drift of, long long i)
+{
+  return w->step->carry_q[i] + DRIFT[g] * of.low + DRIFT_LOW[g] * of.high;
 }
 
 /* x + (y + rest), where rest is below the rounding error of x + y, by a two-sum. */
@@ -46,73 +122,147 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
   return sum + (((x - (sum - part)) + (y - part)) + rest);
 }
 
-/* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
- * more with double-double coefficients; the forces are stored for the predictor. Rounding of the coefficients would
- * displace the points to the same side in every step, and the last iteration alone would leave a part of that, so that
- * all iterations include the low words, with the first forces. On failure the increments are undefined. */
-HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
-    number *dp,
-    const solver_options *options, solver_report *report)
+/* A point with double-double coefficients. */
+PASS lanes accurate_point(const step_points *w, int g, drift of, long long i)
 {
+  const iteration_data *data = w->data;
+  const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i), low = SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
+  return sum_of_three(lanes_of_number(w->step->q0[i]),
+      DRIFT[g] * of.high + data->inverse_mass[i] * (data->square * sum),
+      low_words(w, g, of, i) + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
+}
+
+/* Increments of a coordinate: of q, with its low word, and of p. */
+typedef struct {
+  number q, q_low, p;
+} end_increments;
+
+PASS end_increments increments_of(const step_points *w, long long i)
+{
+  const iteration_data *data = w->data;
+  const lanes *F = &w->F[i];
+  const drift of = DRIFT_OF(w, i);
+  const number sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, EXTENT(w->n));
+  const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
+  end_increments end;
+  end.q = q;
+  end.q_low =
+      (of.high - (q - part)) + (kick - part) + (of.low + data->inverse_mass[i] * (data->square_low * sum));
+  end.p = weigh_apart_twice(data->kick, data->kick_low, F, EXTENT(w->n));
+  return end;
+}
+
+/* Adds the square of a change. For many coordinates with names the sum of the rounding errors would stay above the
+ * tolerance: there it is the largest. A NaN is detected later, by the increments. */
+static inline lanes with_change(lanes change, lanes moved)
+{
+#ifndef ARRAYS
+  if (M > FEW)
+    return larger_lanes(change, moved * moved);
+#endif
+  return change + moved * moved;
+}
+
+/* Updates the points of a range of coordinates from the forces; returns the sum of the squared changes. *size, if it is
+ * not NULL, is that of the sizes. */
+PASS lanes improve_points(const step_points *w, section here, number *size)
+{
+  lanes change = lanes_of(0.0);
+  number sizes = number_of(0.0);
+  for (long long i = here.first; i < here.end; i++) {
+    const drift of = DRIFT_OF(w, i);
+    const number unit = unit_of(w, i);
+    for (int g = 0; g < GROUPS; g++) {
+      lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
+      const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
+      const lanes x = STRAIGHT(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
+      change = with_change(change, (x - *X) * MEASURE(w, i));
+      *X = x;
+    }
+    if (size) {
+      const number of_one = MEASURE(w, i) * size_of(w, of, i);
+      sizes += of_one * of_one;
+    }
+  }
+  if (size)
+    *size = sizes;
+  return change;
+}
+
+#ifndef ARRAYS
+static void prepare_iteration(const step_data *step, iteration_data *data)
+{
+  prepare_step_size(step->h, data);
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1.0 / data->inverse_mass[i];
+}
+
+PASS void forces(const step_points *w)
+{
+  for (int g = 0; g < GROUPS; g++)
+    force_lanes(w->X + g * M, w->step->t + w->step->h * ABSCISSA[g], w->step->parameters, w->F + g * M);
+}
+
+/* Points of the straight line or, if there are former steps, with extrapolated forces. */
+PASS void first_points(const step_points *w, history past, long long steps)
+{
+  for (int i = 0; i < M; i++) {
+    w->drifts[i] = find_drift(w, i);
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * M + i] = w->base[g * M + i] = w->step->q0[i] + DRIFT[g] * w->drifts[i].high;
+  }
+  if (steps == 0)
+    return;
+  continue_curve(w->step, past, steps, (coordinates *)w->F);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * M + i] += unit_of(w, i) * w->F[g * M + i];
+}
+
+/* Sizes of the coordinates, and low words of their iteration, with the first forces. */
+PASS void measure_points(const step_points *w, const solver_options *options)
+{
+  for (int i = 0; i < M; i++)
+    w->inverse_size[i] = size_of(w, w->drifts[i], i);
+  invert_sizes(options, 1.0, w->inverse_size);
+  for (int i = 0; i < M; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->rests[g * M + i] = low_words(w, g, w->drifts[i], i) +
+          w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
+}
+
+/* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
+ * more with double-double coefficients; the forces are stored for the predictor. On failure the increments are
+ * undefined. */
+HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
+    number *dp, const solver_options *options, solver_report *report)
+{
+  const section all = {0, M};
   coordinates X[GROUPS], base[GROUPS], rests[GROUPS], own[GROUPS], *F = kept(past, own);
-  number drift[M], drift_low[M], inverse_size[M];
+  drift drifts[M];
+  number inverse_size[M];
+  const step_points w = {step, data, X[0], F[0], M, drifts, base[0], rests[0], inverse_size};
   progress now = before_iterations();
   int status;
-  for (int i = 0; i < M; i++) {
-    const number v = data->inverse_mass[i] * step->p0[i];
-    const number v_low = fused_numbers(data->inverse_mass[i], step->p0[i], -v);
-    drift[i] = step->h * v;
-    drift_low[i] = fused_numbers(number_of(step->h), v, -drift[i]) +
-        step->h * (v_low + data->inverse_mass[i] * step->carry_p[i]);
-    for (int n = 0; n < GROUPS; n++)
-      X[n][i] = base[n][i] = step->q0[i] + DRIFT[n] * drift[i];
-  }
-  if (*steps > 0) {
-    continue_curve(step, past, *steps, F);
-    for (int i = 0; i < M; i++)
-      for (int n = 0; n < GROUPS; n++)
-        X[n][i] += (data->square * data->inverse_mass[i]) * F[n][i];
-  }
-  forces(step, X, F);
-  for (int i = 0; i < M; i++)
-    inverse_size[i] = magnitude(step->q0[i]) + magnitude(drift[i]) +
-        magnitude(data->square * data->inverse_mass[i] * at_start(F, i));
-  invert_sizes(options, 1.0, inverse_size);
-  for (int i = 0; i < M; i++)
-    for (int n = 0; n < GROUPS; n++)
-      rests[n][i] = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i] +
-          data->inverse_mass[i] * (data->square * apply(PRODUCT_LOW, n, F, i));
+  first_points(&w, past, *steps);
+  forces(&w);
+  measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    lanes change = lanes_of(0.0);
-    for (int i = 0; i < M; i++)
-      for (int n = 0; n < GROUPS; n++) {
-        const lanes x = base[n][i] + ((data->square * data->inverse_mass[i]) * apply(PRODUCT, n, F, i) + rests[n][i]);
-        const lanes moved = (x - X[n][i]) * inverse_size[i];
-        change = with_change(change, moved);
-        X[n][i] = x;
-      }
-    forces(step, X, F);
+    const lanes change = improve_points(&w, all, NULL);
+    forces(&w);
     take_change(&now, total_change(change), options, k, report);
   }
   status = outcome(&now, report);
   if (status != OK)
     return status;
   for (int i = 0; i < M; i++)
-    for (int n = 0; n < GROUPS; n++) {
-      const lanes sum = apply(PRODUCT, n, F, i), low = apply(PRODUCT_LOW, n, F, i);
-      const lanes rest = step->carry_q[i] + DRIFT[n] * drift_low[i] + DRIFT_LOW[n] * drift[i];
-      X[n][i] = sum_of_three(lanes_of_number(step->q0[i]),
-          DRIFT[n] * drift[i] + data->inverse_mass[i] * (data->square * sum),
-          rest + data->inverse_mass[i] * (data->square * low + data->square_low * sum));
-    }
-  forces(step, X, F);
+    for (int g = 0; g < GROUPS; g++)
+      X[g][i] = accurate_point(&w, g, drifts[i], i);
+  forces(&w);
   for (int i = 0; i < M; i++) {
-    const number sum = weigh_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, i);
-    const number kick = data->inverse_mass[i] * (data->square * sum), part = (drift[i] + kick) - drift[i];
-    dq[i] = drift[i] + kick;
-    dq[M + i] = (drift[i] - (dq[i] - part)) + (kick - part) +
-        (drift_low[i] + data->inverse_mass[i] * (data->square_low * sum));
-    dp[i] = weigh_twice(data->kick, data->kick_low, F, i);
+    const end_increments end = increments_of(&w, i);
+    dq[i] = end.q, dq[M + i] = end.q_low, dp[i] = end.p;
   }
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
@@ -120,3 +270,4 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+#endif

@@ -94,7 +94,7 @@ static void probe_stencils(linear_system *of, const lattice *all, lanes *x, lane
           find_mean(of, &probe, of->forces, mean);
       }
     if (asked)
-      products(of->run, of->given, of->X, x, of->forces, of->n); /* begins with a barrier */
+      products(of->run, of->given, of->points->X, x, of->forces, of->n); /* begins with a barrier */
   }
   wait_at_barrier(of->run);
 }

@@ -63,20 +63,35 @@ static inline weight fused_weights(double a, weight b, weight c)
   return fma(a, b, c);
 }
 
-/* sum_j table_nj x_j of one coordinate, in two independent sums. */
-static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
+/* sum_j table_nj x_j, in two independent sums; values at successive points are `apart` elements apart. */
+static inline lanes contribution_of_points(const double (*table)[S], int n, const lanes *x, long long apart)
 {
-  lanes a = table[n][0] * x[0][i], b = lanes_of(0.0);
+  lanes a = table[n][0] * x[0], b = lanes_of(0.0);
   for (int j = 1; j + 1 < S; j += 2) {
-    b += table[n][j] * x[j][i];
-    a += table[n][j + 1] * x[j + 1][i];
+    b += table[n][j] * x[j * apart];
+    a += table[n][j + 1] * x[(j + 1) * apart];
   }
   if (S % 2 == 0)
-    b += table[n][S - 1] * x[S - 1][i];
+    b += table[n][S - 1] * x[(S - 1) * apart];
   return a + b;
 }
 
-/* sum_n weights_n x_n; weigh_twice: with the low words of the weights. */
+/* The same for one coordinate. */
+static inline lanes apply(const double (*table)[S], int n, lanes (*x)[M], int i)
+{
+  return contribution_of_points(table, n, &x[0][i], M);
+}
+
+/* sum_n weights_n x_n with the low words of the weights. */
+static inline number weigh_apart_twice(const weight *weights, const weight *low, const lanes *x, long long apart)
+{
+  number sum = lanes_of(0.0);
+  for (int n = 0; n < S; n++)
+    sum += multiply_add(lanes_of(weights[n]), x[n * apart], low[n] * x[n * apart]);
+  return sum;
+}
+
+/* sum_n weights_n x_n of one coordinate. */
 static inline number weigh(const weight *weights, lanes (*x)[M], int i)
 {
   number sum = lanes_of(0.0);
@@ -85,12 +100,10 @@ static inline number weigh(const weight *weights, lanes (*x)[M], int i)
   return sum;
 }
 
-static inline number weigh_twice(const weight *weights, const weight *low, lanes (*x)[M], int i)
+/* Value at the first point. */
+static inline number at_first(const lanes *x)
 {
-  number sum = lanes_of(0.0);
-  for (int n = 0; n < S; n++)
-    sum += multiply_add(lanes_of(weights[n]), x[n][i], low[n] * x[n][i]);
-  return sum;
+  return x[0];
 }
 
 /* Values at the first and at the last point. */
