@@ -38,14 +38,14 @@ def numbers(found):
 @pytest.mark.parametrize("plan", [{"h": 0.05, "steps": 400}, {"t_end": 9.0}])
 def test_memory_of_earlier_calls_does_not_matter(stepper, plan):
     first = stepper.integrate(Q, P, **plan)
-    kept = numbers(first)
+    saved = numbers(first)
     stepper.integrate(2.0 * Q, P, **plan, t=3.0 if "h" in plan else 1.0, parameters={"mu": 1.5})
     with pytest.raises(StepFailedError):
         stepper.integrate(Q, 0.0 * P, **({"h": 0.05, "steps": 400} if "h" in plan else {"t_end": 9.0}))
     with pytest.raises(StateError):
         stepper.integrate([np.nan, 0.0], P, **plan)
-    assert numbers(first) == kept == numbers(stepper.integrate(Q, P, **plan))
-    assert kept == numbers(compile_stepper(problem("kepler").system, SVI(8)).integrate(Q, P, **plan))
+    assert numbers(first) == saved == numbers(stepper.integrate(Q, P, **plan))
+    assert saved == numbers(compile_stepper(problem("kepler").system, SVI(8)).integrate(Q, P, **plan))
 
 
 def test_calls_within_calls_and_from_threads_have_runs_of_their_own(stepper):
