@@ -231,7 +231,7 @@ def _candidates(method: Method) -> list[Method]:
 def _points(method: Method) -> int:
     """Return the number of evaluation points of the Lagrangian per step, which is the same for every system."""
     simplest = LagrangianSystem.from_text(name="free particle", coordinates=["q"], lagrangian="q_dot**2/2")
-    return sum(len(family.abscissae) for family in method.stage_system(simplest).families)
+    return sum(len(group.abscissae) for group in method.stage_system(simplest).stage_groups)
 
 
 def _cost(pilot: Pilot, n: float, points: int) -> float:

@@ -31,9 +31,9 @@ def table_entries(stages: StageSystem, method: Method) -> tuple[TableEntry, ...]
     """Return the named numbers of all tables of a method's equations, also those that do not occur in the equations."""
     tables = [stages.end_position]
     values: dict[sympy.Symbol, Number] = {}
-    for family in stages.families:
-        tables += [gather.table for gather in family.gathers] + [scatter.table for scatter in family.scatters]
-        tables.append(Table(entries=(family.weights,), names=(family.weight_names,)))
+    for group in stages.stage_groups:
+        tables += [gather.table for gather in group.gathers] + [scatter.table for scatter in group.scatters]
+        tables.append(Table(entries=(group.weights,), names=(group.weight_names,)))
     for table in tables:
         for names, numbers in zip(table.names, table.entries, strict=True):
             for name, value in zip(names, numbers, strict=True):

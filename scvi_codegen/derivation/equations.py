@@ -261,9 +261,9 @@ class _Writer:
         rows: list[list[list[sympy.Expr]]] = [
             [[c * self.p[i]] if c != 0 else [] for i in range(size)] for c, size in zip(momenta, sizes, strict=True)
         ]
-        for family in self.stages.families:
-            for n in range(len(family.abscissae)):
-                self._scatter(family, n, powers, rows)
+        for group in self.stages.stage_groups:
+            for n in range(len(group.abscissae)):
+                self._scatter(group, n, powers, rows)
         return rows
 
     def _momentum(self, column: int, row: Row) -> sympy.Expr:
@@ -274,10 +274,10 @@ class _Writer:
             return self._named(name, row.momentum)
         return _rational(row.momentum)
 
-    def _scatter(self, family: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
-        arguments = self._arguments(family, n)
-        weight = self._named(family.weight_names[n], family.weights[n]) * self._growth(family, n)
-        for scatter in family.scatters:
+    def _scatter(self, group: StageGroup, n: int, powers: Sequence[int], rows: list[list[list[sympy.Expr]]]) -> None:
+        arguments = self._arguments(group, n)
+        weight = self._named(group.weight_names[n], group.weights[n]) * self._growth(group, n)
+        for scatter in group.scatters:
             values = [result.xreplace(arguments) for result in scatter.results]
             for r, power in enumerate(powers):
                 coefficient = self._entry(scatter.table, n, r)
@@ -287,22 +287,22 @@ class _Writer:
                 for i, value in enumerate(values):
                     rows[r][i].append(factor * value)
 
-    def _growth(self, family: StageGroup, n: int) -> sympy.Expr:
+    def _growth(self, group: StageGroup, n: int) -> sympy.Expr:
         """Return the factor of a weight due to damping."""
         if self.stages.damping == 0:
             return sympy.S.One
-        return sympy.exp(self.stages.damping * self._abscissa(family, n) * self.step)
+        return sympy.exp(self.stages.damping * self._abscissa(group, n) * self.step)
 
-    def _abscissa(self, family: StageGroup, n: int) -> sympy.Expr:
+    def _abscissa(self, group: StageGroup, n: int) -> sympy.Expr:
         """Return the abscissa of point n on the step, by its name."""
-        prefix, abscissa = "d" if family.name == "quadrature" else "c", family.abscissae[n]
+        prefix, abscissa = "d" if group.name == "quadrature" else "c", group.abscissae[n]
         return self._named("" if abscissa in (0, 1) else f"{prefix}_{n + 1}", abscissa)
 
-    def _arguments(self, family: StageGroup, n: int) -> dict[sympy.Symbol, sympy.Expr]:
+    def _arguments(self, group: StageGroup, n: int) -> dict[sympy.Symbol, sympy.Expr]:
         replaced = {}
-        if any(self.system.time in result.free_symbols for result in family.results):
-            replaced[self.system.time] = self.time + self._abscissa(family, n) * self.step
-        for gather in family.gathers:
+        if any(self.system.time in result.free_symbols for result in group.results):
+            replaced[self.system.time] = self.time + self._abscissa(group, n) * self.step
+        for gather in group.gathers:
             values = self._gathered(gather.table, n, power=gather.power, scale=_fraction(gather.scale))
             replaced |= dict(zip(gather.arguments, values, strict=True))
         return replaced

@@ -62,22 +62,24 @@ class DerivedStep:
 
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
-        symbols = [(*family.arguments, system.time, *system.parameters) for family in stages.families]
-        self.kernels = [Tape(family.results, own) for family, own in zip(stages.families, symbols, strict=True)]
+        symbols = [(*group.arguments, system.time, *system.parameters) for group in stages.stage_groups]
+        self.kernels = [Tape(group.results, own) for group, own in zip(stages.stage_groups, symbols, strict=True)]
         self.scalars = [
-            None if family.scalar is None else Tape([family.scalar], own)
-            for family, own in zip(stages.families, symbols, strict=True)
+            None if group.scalar is None else Tape([group.scalar], own)
+            for group, own in zip(stages.stage_groups, symbols, strict=True)
         ]
         self.damping = Tape([stages.damping], system.parameters)
         self.rate = Tape([system.clock.rate], symbols[0]) if system.clock else None
         self.blocks = _slices(stages.block_sizes(system.dimension))
         self.rows = _slices(stages.row_sizes(system.dimension))
-        self.arguments = [_slices([len(gather.arguments) for gather in family.gathers]) for family in stages.families]
-        self.results = [_slices([len(scatter.results) for scatter in family.scatters]) for family in stages.families]
+        self.arguments = [_slices([len(gather.arguments) for gather in group.gathers]) for group in stages.stage_groups]
+        self.results = [_slices([len(scatter.results) for scatter in group.scatters]) for group in stages.stage_groups]
         self.powers = [row.power for row in stages.rows] + [0]
         self.momenta = numbers([*(row.momentum for row in stages.rows), stages.end_momentum])
-        self.gathers = [[numbers(gather.table.entries) for gather in family.gathers] for family in stages.families]
-        self.scatters = [[numbers(scatter.table.entries) for scatter in family.scatters] for family in stages.families]
+        self.gathers = [[numbers(gather.table.entries) for gather in group.gathers] for group in stages.stage_groups]
+        self.scatters = [
+            [numbers(scatter.table.entries) for scatter in group.scatters] for group in stages.stage_groups
+        ]
 
     def with_parameters(self, parameters: Sequence[Number]) -> DerivedStep:
         """Return the same equations with other values of the parameters, in order."""
@@ -142,8 +144,8 @@ class DerivedStep:
         if self.rate is None or not isinstance(shape, Velocities):
             raise StateError(f"'{self.system.name}' has no time transformation")
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.zero)
-        family, z = self.stages.families[0], np.array(solved.unknowns, dtype=object)
-        rates = [self.rate(self._point(family, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]
+        group, z = self.stages.stage_groups[0], np.array(solved.unknowns, dtype=object)
+        rates = [self.rate(self._point(group, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]
         return known.h * mp.fdot(shape.weights, rates)
 
     def action_gradient(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
@@ -172,16 +174,16 @@ class DerivedStep:
 
     def _action(self, z: Numbers, known: _Known) -> Number:
         total = mp.zero
-        for f, family in enumerate(self.stages.families):
+        for f, group in enumerate(self.stages.stage_groups):
             arguments = self._arguments(f, z, known)
-            scale = mp.mpf(family.scatters[0].scale.numerator) / family.scatters[0].scale.denominator
-            scale /= mp.mpf(family.gathers[0].scale.numerator) / family.gathers[0].scale.denominator
-            for n, weight in enumerate(family.weights):
+            scale = mp.mpf(group.scatters[0].scale.numerator) / group.scatters[0].scale.denominator
+            scale /= mp.mpf(group.gathers[0].scale.numerator) / group.gathers[0].scale.denominator
+            for n, weight in enumerate(group.weights):
                 scalar = self.scalars[f]
                 assert scalar is not None  # checked above
-                (value,) = scalar(self._point(family, n, arguments[n], known))
-                grown = self._damping_factor(family.abscissae[n], known)
-                total += scale * weight * grown * known.h ** (1 + family.scalar_power) * value
+                (value,) = scalar(self._point(group, n, arguments[n], known))
+                grown = self._damping_factor(group.abscissae[n], known)
+                total += scale * weight * grown * known.h ** (1 + group.scalar_power) * value
         return total
 
     def _straight(self, known: _Known) -> Numbers:
@@ -199,9 +201,9 @@ class DerivedStep:
         )
 
     def _arguments(self, f: int, z: Numbers, known: _Known) -> Numbers:
-        """Return the (points, arguments) of the kernel of a family."""
+        """Return the (points, arguments) of the kernel of a stage group."""
         parts = []
-        for gather, table in zip(self.stages.families[f].gathers, self.gathers[f], strict=True):
+        for gather, table in zip(self.stages.stage_groups[f].gathers, self.gathers[f], strict=True):
             factor = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
             parts.append(np.array([self._gathered(line, len(gather.arguments), z, known) * factor for line in table]))
         return np.concatenate(parts, axis=1)
@@ -213,17 +215,17 @@ class DerivedStep:
             total = total + z[self.blocks[b]] * (line[b + 1] * known.h ** self.stages.blocks[b].power)
         return total
 
-    def _point(self, family: StageGroup, n: int, arguments: Numbers, known: _Known) -> list[Number]:
-        return [*arguments, known.t + family.abscissae[n] * known.h, *self.motion.parameters]
+    def _point(self, group: StageGroup, n: int, arguments: Numbers, known: _Known) -> list[Number]:
+        return [*arguments, known.t + group.abscissae[n] * known.h, *self.motion.parameters]
 
     def _kernel(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:
-        return np.array(self.kernels[f](self._point(self.stages.families[f], n, arguments, known)), dtype=object)
+        return np.array(self.kernels[f](self._point(self.stages.stage_groups[f], n, arguments, known)), dtype=object)
 
-    def _factor(self, family: StageGroup, s: int, n: int, r: Any, known: _Known) -> Number:
-        scatter = family.scatters[s]
+    def _factor(self, group: StageGroup, s: int, n: int, r: Any, known: _Known) -> Number:
+        scatter = group.scatters[s]
         scale = mp.mpf(scatter.scale.numerator) / scatter.scale.denominator
-        grown = self._damping_factor(family.abscissae[n], known)
-        return scale * family.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
+        grown = self._damping_factor(group.abscissae[n], known)
+        return scale * group.weights[n] * grown * known.h ** (scatter.power + self.powers[r])
 
     def _damping_factor(self, c: Number, known: _Known) -> Number:
         """Return the factor e^(gamma c h) of a weight at the point c of the step, where gamma is the damping rate."""
@@ -238,29 +240,29 @@ class DerivedStep:
             for own, x in zip(self.rows, self.momenta, strict=True)
         ]
         rows = np.concatenate(starts)
-        for f, family in enumerate(self.stages.families):
+        for f, group in enumerate(self.stages.stage_groups):
             arguments = self._arguments(f, z, known)
-            for n in range(len(family.abscissae)):
+            for n in range(len(group.abscissae)):
                 values = self._kernel(f, n, arguments[n], known)
                 for s, (table, results) in enumerate(zip(self.scatters[f], self.results[f], strict=True)):
                     for r in np.flatnonzero(table[n]):
-                        rows[self.rows[r]] += values[results] * (self._factor(family, s, n, r, known) * table[n, r])
+                        rows[self.rows[r]] += values[results] * (self._factor(group, s, n, r, known) * table[n, r])
         return rows
 
     def _exact_matrix(self, z: Numbers, known: _Known) -> Numbers:
         """Return the derivatives of the rows with respect to the unknowns; those of the kernels by differences."""
         matrix = numbers(np.zeros((self.unknowns, self.unknowns)))
         powers = [known.h**block.power for block in self.stages.blocks]
-        for f, family in enumerate(self.stages.families):
+        for f, group in enumerate(self.stages.stage_groups):
             arguments = self._arguments(f, z, known)
-            for n in range(len(family.abscissae)):
+            for n in range(len(group.abscissae)):
                 derivatives = self._kernel_jacobian(f, n, arguments[n], known)
                 for s, rows in enumerate(self.scatters[f]):
-                    for g, gather in enumerate(family.gathers):
+                    for g, gather in enumerate(group.gathers):
                         own = derivatives[self.results[f][s], self.arguments[f][g]]
                         moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
                         for r in np.flatnonzero(rows[n, :-1]):
-                            factor = self._factor(family, s, n, r, known) * rows[n, r] * moved
+                            factor = self._factor(group, s, n, r, known) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
                                 matrix[self.rows[r], self.blocks[b]] += own * entry

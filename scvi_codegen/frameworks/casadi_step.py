@@ -124,7 +124,7 @@ class _StageExpressions:
         momenta = (*(row.momentum for row in self.stages.rows), self.stages.end_momentum)
         powers = (*(row.power for row in self.stages.rows), 0)
         rows = [float(c) * self.p if c else self.ca.SX(size, 1) for c, size in zip(momenta, sizes, strict=True)]
-        for group in self.stages.families:
+        for group in self.stages.stage_groups:
             kernel = self._kernel(group)
             for n, weight in enumerate(group.weights):
                 results = iter(kernel(*self._arguments(group, n), *self._surroundings(group.abscissae[n])))
@@ -154,7 +154,7 @@ class _StageExpressions:
             MethodError: if the action is not a quadrature of L along a curve.
         """
         system = self.system
-        groups = [group for group in self.stages.families if group.in_action]
+        groups = [group for group in self.stages.stage_groups if group.in_action]
         known = {*system.coordinates, *system.velocities}
         if not groups or any(group.scalar_power or not known <= {*group.arguments} for group in groups):
             raise MethodError(

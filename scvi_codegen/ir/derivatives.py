@@ -91,10 +91,10 @@ class Derivatives:
     lanes: int = 8
 
     @property
-    def families(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
+    def stage_groups(self) -> tuple[tuple[LoweredStageGroup, InputDerivatives, Kernel | None], ...]:
         """Stage groups with the derivatives of their kernels, and second derivatives, if requested and nonzero."""
         curvatures = self.curvatures or (None,) * len(self.by_given)
-        return tuple(zip(self.program.equations.families, self.by_given, curvatures, strict=True))
+        return tuple(zip(self.program.equations.stage_groups, self.by_given, curvatures, strict=True))
 
     @property
     def kernels(self) -> tuple[Kernel, ...]:
@@ -126,22 +126,22 @@ class Derivatives:
         """Number of derivatives at all points: with respect to h, arguments, parameters and time, a damping."""
         damped = bool(self.damping)
         return sum(
-            family.points
+            group.points
             * (
-                family.derivative.arguments
-                + len(family.derivative.results)
+                group.derivative.arguments
+                + len(group.derivative.results)
                 + len(given.entries)
-                + damped * family.derivative.values
+                + damped * group.derivative.values
             )
-            for family, given, _ in self.families
+            for group, given, _ in self.stage_groups
         )
 
     @property
     def at_points(self) -> int:
         """Largest number of arguments and results at the points of a stage group."""
         return max(
-            family.points * (family.derivative.arguments + family.derivative.values)
-            for family in self.program.equations.families
+            group.points * (group.derivative.arguments + group.derivative.values)
+            for group in self.program.equations.stage_groups
         )
 
     @property
@@ -172,5 +172,5 @@ class Derivatives:
     @property
     def places(self) -> int:
         """Largest number of arguments of all points of a stage group, if second derivatives are requested."""
-        wanted = self.program.equations.families if self.curvatures else ()
-        return max((family.points * family.derivative.arguments for family in wanted), default=0)
+        wanted = self.program.equations.stage_groups if self.curvatures else ()
+        return max((group.points * group.derivative.arguments for group in wanted), default=0)

@@ -118,7 +118,7 @@ class StageEquations:
     Attributes:
         sites: the coordinates, then the components of unknowns of other sizes.
         blocks: number of unknowns B at each site.
-        families: stage groups of the equations; none without Newton's method.
+        stage_groups: stage groups of the equations; none without Newton's method.
         places: (sites,) position of each site in matrices, in a bandwidth-reducing ordering.
         mass_positions: (m,) the same for the coordinates alone.
         bandwidth: largest distance of coupled sites in that ordering.
@@ -136,7 +136,7 @@ class StageEquations:
 
     sites: int = 0
     blocks: int = 0
-    families: tuple[LoweredStageGroup, ...] = ()
+    stage_groups: tuple[LoweredStageGroup, ...] = ()
     places: tuple[int, ...] = ()
     mass_positions: tuple[int, ...] = ()
     bandwidth: int = 0
@@ -269,11 +269,11 @@ class Program:
     @property
     def kernels(self) -> tuple[Kernel, ...]:
         """All kernels, in the order of emission."""
-        families, found = self.equations.families, self.quantities
+        stage_groups, found = self.equations.stage_groups, self.quantities
         constraints, rattle, integrals = self.constraints, self.rattle, found.integrals
         kernels = (
-            *(kernel for family in families for kernel in (family.value, family.derivative)),
-            *(found.legendre, found.energy, *(family.integrand for family in families), found.momentum_kernel),
+            *(kernel for group in stage_groups for kernel in (group.value, group.derivative)),
+            *(found.legendre, found.energy, *(group.integrand for group in stage_groups), found.momentum_kernel),
             *(integrals.kernel if integrals else None, constraints and constraints.kernel),
             *(constraints and constraints.motion, self.damping, rattle and rattle.force, rattle and rattle.mass),
         )
@@ -340,11 +340,11 @@ class Program:
             f"program {self.prefix}: {self.title}",
             f"  {equations.blocks} blocks of {equations.sites} unknowns, bandwidth {equations.bandwidth}",
         ]
-        for family in equations.families:
-            head.append(f"  family {family.name}: {family.points} points")
+        for group in equations.stage_groups:
+            head.append(f"  stage group {group.name}: {group.points} points")
             head += [
                 f"    gather  {loop.name}: {'q0 + ' * loop.from_state}h^{loop.power} sum_b {loop.name}[n][b] z[b]"
-                for loop in family.gathers
+                for loop in group.gathers
             ]
-            head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in family.scatters]
+            head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in group.scatters]
         return "\n".join([*head, *(str(kernel) for kernel in self.kernels)])

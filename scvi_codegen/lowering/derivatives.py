@@ -28,14 +28,14 @@ def derivatives_of(
         second: whether second derivatives are included.
     """
     given = tuple(
-        _input_derivatives(system, family.name, family.results, family.arguments) for family in stages.families
+        _input_derivatives(system, group.name, group.results, group.arguments) for group in stages.stage_groups
     )
     return Derivatives(
         program=program,
         by_given=given,
-        curvatures=tuple(_curvature(system, family) for family in stages.families) if second else (),
+        curvatures=tuple(_curvature(system, group) for group in stages.stage_groups) if second else (),
         damping=_input_derivatives(system, "damping", (stages.damping,), ()) if program.damping else None,
-        clock=_time_derivatives(system, stages.families[0].arguments) if system.clock else None,
+        clock=_time_derivatives(system, stages.stage_groups[0].arguments) if system.clock else None,
         iterated=point_derivatives_of(system, program.fixed_point) if program.fixed_point else None,
     )
 
@@ -93,20 +93,20 @@ def _energy_derivatives(system: MechanicalSystem) -> Kernel:
     )
 
 
-def _curvature(system: MechanicalSystem, family: StageGroup) -> Kernel | None:
+def _curvature(system: MechanicalSystem, group: StageGroup) -> Kernel | None:
     """Return the kernel of the Hessian-vector product of multipliers . results: gradient of a derivative."""
-    depends = (*family.arguments, *system.parameters, system.time)
-    multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(family.results))]
+    depends = (*group.arguments, *system.parameters, system.time)
+    multipliers = [Symbol(f"multiplier[{i}]", real=True) for i in range(len(group.results))]
     changes = [Symbol(f"change[{j}]", real=True) for j in range(len(depends))]
-    entries = jacobian(family.results, depends)
+    entries = jacobian(group.results, depends)
     along = Add(*(Mul(multipliers[i], entry, changes[j]) for (i, j), entry in entries.items()))
     partials = gradient(along, depends)
     if not partials:
         return None
     return system_kernel(
         system,
-        f"{family.name}_curvature",
+        f"{group.name}_curvature",
         [partials.get(j, S.Zero) for j in range(len(depends))],
-        of=(*family.arguments, *multipliers, *changes),
+        of=(*group.arguments, *multipliers, *changes),
         purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )

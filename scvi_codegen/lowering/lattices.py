@@ -10,12 +10,12 @@ from scvi_codegen.ir.kernel import LoopedKernel
 __all__ = ["reach_of"]
 
 
-def reach_of(arrays: Iterable[Array], families: Iterable[LoopedKernel]) -> int:
+def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> int:
     """Return the largest distance on an axis of places that forces couple.
 
     Args:
         arrays: of coordinates; in a lattice the first axes are named sizes, the last ones integers.
-        families: term groups of forces, with the coordinates that each depends on.
+        term_groups: term groups of forces, with the coordinates that each depends on.
 
     Returns:
         0 if no places are coupled, if an array is no lattice, or if a term group couples places by a table or all
@@ -25,7 +25,7 @@ def reach_of(arrays: Iterable[Array], families: Iterable[LoopedKernel]) -> int:
         return 0
     pairs = [
         (target, slot)
-        for looped in families
+        for looped in term_groups
         if looped.loops
         for target in looped.targets
         for slot in looped.slots

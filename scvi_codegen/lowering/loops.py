@@ -128,8 +128,8 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
 
     ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
     """
-    forces = tuple(_forces(of, family, number) for number, family in enumerate(of.families))
-    energies = tuple(_energy(of, family, number) for number, family in enumerate(of.families))
+    forces = tuple(_forces(of, group, number) for number, group in enumerate(of.term_groups))
+    energies = tuple(_energy(of, group, number) for number, group in enumerate(of.term_groups))
     fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(forces), program.splitting
     energy = program.quantities.energy
     if program.newton or energy is None or not (fixed_point or splitting):
@@ -142,17 +142,17 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
     )
 
 
-def _forces(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
-    return _summed(of, f"pull_{number}", family, family.partials, ())
+def _forces(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
+    return _summed(of, f"pull_{number}", group, group.partials, ())
 
 
-def _energy(of: SplitSystem, family: TermGroup, number: int) -> LoopedKernel:
-    value = -family.formula if of.rest.auxiliaries else family.formula
-    return _summed(of, f"term_{number}", family, (value,), ((0,),) * len(family.places))
+def _energy(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
+    value = -group.formula if of.rest.auxiliaries else group.formula
+    return _summed(of, f"term_{number}", group, (value,), ((0,),) * len(group.places))
 
 
 def _summed(
-    of: SplitSystem, name: str, family: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+    of: SplitSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
 ) -> LoopedKernel:
     system = of.rest
     places = {parameter: k for k, parameter in enumerate(system.parameters)}
@@ -162,11 +162,11 @@ def _summed(
 
     term = lower_kernel(
         name,
-        arguments=(*family.slots, *family.given),
+        arguments=(*group.slots, *group.given),
         time=system.time,
         parameters=system.parameters,
         values=tuple(values),
-        constants=len(family.given),
+        constants=len(group.given),
     )
-    given = tuple(tuple(map(constant, column)) for column in family.values)
-    return LoopedKernel.over_rows(term, family.places, given, targets)
+    given = tuple(tuple(map(constant, column)) for column in group.values)
+    return LoopedKernel.over_rows(term, group.places, given, targets)

@@ -74,8 +74,8 @@ def lower(
     m, sites = system.dimension, layout_of(stages, system.dimension)
     blocks, rows = [stages.blocks[b] for b in sites.columns[m]], [stages.rows[r] for r in sites.rows[m]]
     mass = forms_of(system).legendre_jacobian
-    families = tuple(lowered_stage_group(system, family, sites) for family in stages.families) if newton else ()
-    coupled = [*mass, *_coupled_coordinates(families)]
+    stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
+    coupled = [*mass, *_coupled_coordinates(stage_groups)]
     order = places(coupled, sites.count)
     polynomial = method.exactness.curve != 0
     layout = Layout(
@@ -87,7 +87,7 @@ def lower(
     equations = StageEquations(
         sites=sites.count,
         blocks=len(blocks),
-        families=families,
+        stage_groups=stage_groups,
         places=order,
         mass_positions=tuple(sorted(range(m), key=order.__getitem__).index(i) for i in range(m)),
         bandwidth=bandwidth(coupled, order),
@@ -99,7 +99,7 @@ def lower(
         extrapolation=lower_matrix(
             tuple(line for columns in sites.columns.values() for line in _required_extrapolation(stages, columns))
         ),
-        acts=sites.count == m and has_action(system) and any(family.in_action for family in stages.families),
+        acts=sites.count == m and has_action(system) and any(group.in_action for group in stages.stage_groups),
         stage_curve=_stage_curve(stages) if newton and polynomial and splitting is None else None,
         numbers=_numbers(system, method, len(rows)) if len(blocks) * sites.count <= FEW_UNKNOWNS else ("", "", ""),
     )
@@ -200,7 +200,7 @@ def _distinct(points: Vector) -> bool:
 
 
 def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) -> Integrals | None:
-    kernel = integrand_kernel(system, "integrands", stages.families[0].arguments)
+    kernel = integrand_kernel(system, "integrands", stages.stage_groups[0].arguments)
     if kernel is None:
         return None
     if not isinstance(stages.shape, Velocities):
@@ -213,7 +213,7 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
 
 def _exchanges(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
     """Return the names of work and impulses of forces, if the method integrates along a curve."""
-    integrates = any(family.in_action for family in stages.families)
+    integrates = any(group.in_action for group in stages.stage_groups)
     return tuple(each.name for each in exchanges(system)) if integrates else ()
 
 
@@ -253,9 +253,9 @@ def _momentum_kernel(system: MechanicalSystem, symmetries: Sequence[Symmetry]) -
     )
 
 
-def _coupled_coordinates(families: Sequence[LoweredStageGroup]) -> list[tuple[int, int]]:
+def _coupled_coordinates(stage_groups: Sequence[LoweredStageGroup]) -> list[tuple[int, int]]:
     """Return the pairs of coordinates with a nonzero derivative."""
-    return [pair for family in families for block in family.blocks for pair in block.entries]
+    return [pair for group in stage_groups for block in group.blocks for pair in block.entries]
 
 
 def notes_of(method: Method, system: MechanicalSystem) -> tuple[str, ...]:

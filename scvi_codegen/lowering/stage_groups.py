@@ -37,68 +37,68 @@ def has_action(system: MechanicalSystem) -> bool:
     return not isinstance(system, HamiltonianSystem) or system.is_regular
 
 
-def lowered_stage_group(system: MechanicalSystem, family: StageGroup, sites: UnknownLayout) -> LoweredStageGroup:
+def lowered_stage_group(system: MechanicalSystem, group: StageGroup, sites: UnknownLayout) -> LoweredStageGroup:
     """Return a stage group in loops: its kernel with derivatives, and rounded tables."""
-    partials, blocks = _derivative_blocks(family, sites)
-    names = tuple(argument_name(system, gather) for gather in family.gathers)
+    partials, blocks = _derivative_blocks(group, sites)
+    names = tuple(argument_name(system, gather) for gather in group.gathers)
     u = f"u = ({', '.join(names)})"
     return LoweredStageGroup(
-        name=family.name,
+        name=group.name,
         arguments=names,
-        abscissae=lower_vector(family.abscissae),
-        weights=lower_vector(family.weights),
-        gathers=tuple(_gather_loop(family, g, sites) for g in range(len(family.gathers))),
-        scatters=tuple(_scatter_loop(family, s, sites) for s in range(len(family.scatters))),
+        abscissae=lower_vector(group.abscissae),
+        weights=lower_vector(group.weights),
+        gathers=tuple(_gather_loop(group, g, sites) for g in range(len(group.gathers))),
+        scatters=tuple(_scatter_loop(group, s, sites) for s in range(len(group.scatters))),
         value=system_kernel(
             system,
-            f"{family.name}_value",
-            family.results,
-            of=family.arguments,
-            purpose=f"{_results(family, names)} at {u}.",
+            f"{group.name}_value",
+            group.results,
+            of=group.arguments,
+            purpose=f"{_results(group, names)} at {u}.",
         ),
         derivative=system_kernel(
             system,
-            f"{family.name}_slope",
-            family.results,
-            of=family.arguments,
+            f"{group.name}_slope",
+            group.results,
+            of=group.arguments,
             partials=partials,
             purpose=f"The same, and the nonzero derivatives with respect to {u}.",
         ),
         blocks=blocks,
-        integrand=_integrand(system, family, u) if family.in_action else None,
-        integrand_power=family.scalar_power,
+        integrand=_integrand(system, group, u) if group.in_action else None,
+        integrand_power=group.scalar_power,
     )
 
 
-def _results(family: StageGroup, names: tuple[str, ...]) -> str:
+def _results(group: StageGroup, names: tuple[str, ...]) -> str:
     """Return a description of the results of a kernel."""
-    if family.computes:
-        return family.computes
-    if family.name == "node":
+    if group.computes:
+        return group.computes
+    if group.name == "node":
         return "Derivatives of lambda . E" if "lambda" in names else "The Euler-Lagrange residual E"
-    if family.scalar_power:
-        return f"Derivatives of d^{family.scalar_power}L/dt^{family.scalar_power}"
+    if group.scalar_power:
+        return f"Derivatives of d^{group.scalar_power}L/dt^{group.scalar_power}"
     partials = [f"L_{name}" for name in names]
-    if family.forced:
+    if group.forced:
         partials[0] += " + f"
-    return " and ".join(partials) if len(family.scatters) == len(names) else "L_v"
+    return " and ".join(partials) if len(group.scatters) == len(names) else "L_v"
 
 
-def _integrand(system: MechanicalSystem, family: StageGroup, u: str) -> Kernel | None:
+def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | None:
     """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
     if given := exchanges(system):
         rates, purpose = [each.rate for each in given], f"Power and impulse rates of the forces at {u}."
-        return system_kernel(system, "exchanges", rates, of=family.arguments, purpose=purpose)
+        return system_kernel(system, "exchanges", rates, of=group.arguments, purpose=purpose)
     if not has_action(system):
         return None
-    assert family.scalar is not None
-    k = family.scalar_power
+    assert group.scalar is not None
+    k = group.scalar_power
     rate = f"d{f'^{k}' * (k > 1)}L/dt{f'^{k}' * (k > 1)}"
     return system_kernel(
         system,
-        "lagrangian" if family.name == "quadrature" else f"{family.name}_action",
-        (family.scalar,),
-        of=family.arguments,
+        "lagrangian" if group.name == "quadrature" else f"{group.name}_action",
+        (group.scalar,),
+        of=group.arguments,
         purpose=f"{rate if k else 'p . v - H' if system.auxiliaries else 'L'} at {u}.",
     )
 
@@ -118,16 +118,16 @@ def argument_name(system: MechanicalSystem, gather: Gather) -> str:
 
 
 def _derivative_blocks(
-    family: StageGroup, sites: UnknownLayout
+    group: StageGroup, sites: UnknownLayout
 ) -> tuple[tuple[sympy.Expr, ...], tuple[DerivativeBlock, ...]]:
     """Return the nonzero derivatives, grouped by scatter and gather."""
-    entries = _partials(family)
+    entries = _partials(group)
     partials: list[sympy.Expr] = []
     blocks = []
-    for s, scatter in enumerate(family.scatters):
-        top = sum(len(other.results) for other in family.scatters[:s])
-        for g, gather in enumerate(family.gathers):
-            left = sum(len(other.arguments) for other in family.gathers[:g])
+    for s, scatter in enumerate(group.scatters):
+        top = sum(len(other.results) for other in group.scatters[:s])
+        for g, gather in enumerate(group.gathers):
+            left = sum(len(other.arguments) for other in group.gathers[:g])
             rows, columns = range(top, top + len(scatter.results)), range(left, left + len(gather.arguments))
             found = [(i - top, j - left) for i, j in entries if i in rows and j in columns]
             if found:
@@ -138,16 +138,16 @@ def _derivative_blocks(
     return tuple(partials), tuple(blocks)
 
 
-def _partials(family: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
+def _partials(group: StageGroup) -> dict[tuple[int, int], sympy.Expr]:
     """Return the nonzero derivatives of results with respect to arguments; symmetric for a gradient."""
-    entries = jacobian(family.results, family.arguments)
-    if family.scalar is None or family.forced:
+    entries = jacobian(group.results, group.arguments)
+    if group.scalar is None or group.forced:
         return entries
-    _check_symmetry(family, entries)
+    _check_symmetry(group, entries)
     return {(i, j): entries.get((min(i, j), max(i, j)), entry) for (i, j), entry in entries.items()}
 
 
-def _check_symmetry(family: StageGroup, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
+def _check_symmetry(group: StageGroup, entries: Mapping[tuple[int, int], sympy.Expr]) -> None:
     """Raise :class:`MethodError` if mixed derivatives differ: Newton's method would not converge with them."""
     unlike = [(i, j) for (i, j), entry in entries.items() if i < j and entry != entries.get((j, i))]
     for i, j in unlike[:MOST_PAIRS_COMPARED]:
@@ -160,37 +160,37 @@ def _check_symmetry(family: StageGroup, entries: Mapping[tuple[int, int], sympy.
         except ArithmeticError:
             continue
         if abs(one - other) > LARGEST_DIFFERENCE * size:  # the terms may cancel
-            u = family.arguments
+            u = group.arguments
             raise MethodError(
-                f"the results of the stage group '{family.name}' are not the gradient of its scalar: the "
+                f"the results of the stage group '{group.name}' are not the gradient of its scalar: the "
                 "derivative of that "
                 f"for {u[i]} by {u[j]} is {pair[0]}, of that for {u[j]} by {u[i]} {pair[1]}. They must be equal: check "
                 "the signs and the order of the results in its scatters, or give the stage group no scalar"
             )
 
 
-def _gather_loop(family: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
-    gather = family.gathers[index]
+def _gather_loop(group: StageGroup, index: int, sites: UnknownLayout) -> GatherLoop:
+    gather = group.gathers[index]
     size = len(gather.arguments)
     return GatherLoop(
-        name=f"{family.name}_gather_{index}",
+        name=f"{group.name}_gather_{index}",
         first=sites.first[size],
         sites=size,
-        offset=sum(len(other.arguments) for other in family.gathers[:index]),
+        offset=sum(len(other.arguments) for other in group.gathers[:index]),
         from_state=bool(gather.table.entries[0][0]),
         power=gather.power + 1,
         table=lower_matrix(gather.table.columns([b + 1 for b in sites.columns[size]]).entries),
     )
 
 
-def _scatter_loop(family: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
-    scatter = family.scatters[index]
+def _scatter_loop(group: StageGroup, index: int, sites: UnknownLayout) -> ScatterLoop:
+    scatter = group.scatters[index]
     size = len(scatter.results)
     return ScatterLoop(
-        name=f"{family.name}_scatter_{index}",
+        name=f"{group.name}_scatter_{index}",
         first=sites.first[size],
         sites=size,
-        offset=sum(len(other.results) for other in family.scatters[:index]),
+        offset=sum(len(other.results) for other in group.scatters[:index]),
         power=scatter.power,
         table=lower_matrix(scatter.table.columns([*sites.rows[size], -1]).entries),
     )

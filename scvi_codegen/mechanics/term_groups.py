@@ -65,11 +65,11 @@ class SplitSystem:
 
     Attributes:
         rest: the same system without the term groups.
-        families: term groups of L, or of -H for a Hamiltonian.
+        term_groups: term groups of L, or of -H for a Hamiltonian.
     """
 
     rest: MechanicalSystem
-    families: tuple[TermGroup, ...]
+    term_groups: tuple[TermGroup, ...]
 
 
 @dataclass(frozen=True, slots=True)

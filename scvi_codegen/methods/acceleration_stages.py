@@ -60,7 +60,7 @@ def position_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
             Row(number="p0", kind="Legendre", momentum=mp.one),
             *(Row(number="18", kind="stage", momentum=mp.zero) for _ in range(size)),
         ),
-        families=(
+        stage_groups=(
             replace(start, scatters=(Scatter(results=momenta, table=start_table, power=0),)),
             collocation,
             replace(end, scatters=(Scatter(results=momenta, table=end_table, power=0),)),

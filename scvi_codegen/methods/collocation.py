@@ -125,7 +125,7 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
     size = nodes.degree
     momenta = forms_of(system).momentum
     none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
-    family = residual_group(
+    group = residual_group(
         system,
         nodes.abscissae[1:],
         nodal_gathers(system, nodes),
@@ -146,7 +146,7 @@ def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
             *(Row(number="18", kind="stage", momentum=mp.zero) for _ in range(size)),
             Row(number="p0", kind="Legendre", momentum=mp.one),
         ),
-        families=(family, replace(start, scatters=(Scatter(results=momenta, table=start_table, power=0),))),
+        stage_groups=(group, replace(start, scatters=(Scatter(results=momenta, table=start_table, power=0),))),
         end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
         end_momentum=mp.zero,
         end_numbers=("15", "p1"),

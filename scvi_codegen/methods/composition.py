@@ -193,7 +193,7 @@ def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
     return StageSystem(
         blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k, _ in enumerate(moving, start=1)),
         rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k, _ in enumerate(moving, start=1)),
-        families=(_kick_group(system, kicks, drifts), _drift_group(system, drifts)),
+        stage_groups=(_kick_group(system, kicks, drifts), _drift_group(system, drifts)),
         end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (tuple(drifts[k] for k in moving),))),
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),

@@ -66,8 +66,8 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
     if not system.constraints:
         return stages
     _check_points(system, stages, name)
-    family, count = stages.families[0], len(system.constraints)
-    nothing, points = (mp.zero, mp.zero), len(family.abscissae)
+    group, count = stages.stage_groups[0], len(system.constraints)
+    nothing, points = (mp.zero, mp.zero), len(group.abscissae)
     multipliers = tuple(
         Block(name=f"lambda_{n}", power=1, straight=nothing, moves=False, size=count) for n in range(points)
     )
@@ -81,25 +81,25 @@ def with_constraints(system: MechanicalSystem, stages: StageSystem, name: str) -
             Row(number="end", kind="stage", momentum=-stages.end_momentum),
             *(Row(number=number, kind=kind, momentum=mp.zero, size=count) for number, kind in conditions),
         ),
-        families=(
-            _with_multipliers(system, family),
-            *_velocity_conditions(system, stages, family),
+        stage_groups=(
+            _with_multipliers(system, group),
+            *_velocity_conditions(system, stages, group),
             _end(system, stages, points),
         ),
         end_position=Table.joined(stages.end_position, Table.constant(1, 1 + points)),
-        extrapolation=stages.extrapolation and _extrapolation(stages, family.abscissae),
+        extrapolation=stages.extrapolation and _extrapolation(stages, group.abscissae),
     )
 
 
 def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> None:
-    family, s = stages.families[0], len(stages.blocks)
-    ends = (family.abscissae[0], family.abscissae[-1]) == (0, 1)
-    if any(nonholonomic_expressions(system)) and ends and not _is_polynomial(family):
+    group, s = stages.stage_groups[0], len(stages.blocks)
+    ends = (group.abscissae[0], group.abscissae[-1]) == (0, 1)
+    if any(nonholonomic_expressions(system)) and ends and not _is_polynomial(group):
         raise MethodError(
             f"{name} does not support the nonholonomic constraints of '{system.name}', because its curves "
             "are not polynomials: use an SVI with polynomials"
         )
-    if ends and len(stages.families) == 1 and len(family.abscissae) == s + 1 and family.in_action:
+    if ends and len(stages.stage_groups) == 1 and len(group.abscissae) == s + 1 and group.in_action:
         return
     raise MethodError(
         f"{name} does not support the constraints of '{system.name}': they require an SVI whose "
@@ -108,24 +108,24 @@ def _check_points(system: MechanicalSystem, stages: StageSystem, name: str) -> N
     )
 
 
-def _is_polynomial(family: StageGroup) -> bool:
+def _is_polynomial(group: StageGroup) -> bool:
     """Return whether the velocity at the last point is interpolated by the others, as for a polynomial of degree s."""
-    velocities, points = family.gathers[1].table.entries, family.abscissae
-    others = Table(entries=velocities[:-1], names=family.gathers[1].table.names[:-1])
+    velocities, points = group.gathers[1].table.entries, group.abscissae
+    others = Table(entries=velocities[:-1], names=group.gathers[1].table.names[:-1])
     last = _interpolated(others, cardinal_values(points[:-1], points[-1:]), "").entries[0]
     return all(abs(x - y) < SAME for x, y in zip(last, velocities[-1], strict=True))
 
 
-def _with_multipliers(system: MechanicalSystem, family: StageGroup) -> StageGroup:
+def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup:
     """Return the quadrature with multipliers: L + lambda . g in place of L, and g itself in rows of its own."""
-    assert family.scalar is not None
-    points, factors = len(family.abscissae), constraint_multipliers(system)
-    columns, rows = len(family.gathers[0].table.entries[0]), len(family.scatters[0].table.entries[0]) - 1
+    assert group.scalar is not None
+    points, factors = len(group.abscissae), constraint_multipliers(system)
+    columns, rows = len(group.gathers[0].table.entries[0]), len(group.scatters[0].table.entries[0]) - 1
     none, one = Table.constant(points, 1 + points), Table.constant(points, 1)
-    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in family.gathers]
+    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in group.gathers]
     place = Table.joined(Table.constant(points, columns), one, Table.identity(points))
     gathers.append(Gather(arguments=factors, table=place, power=-1))
-    scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in family.scatters]
+    scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in group.scatters]
     scatters[0] = replace(scatters[0], results=with_constraint_forces(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
     conditions_table = Table.joined(Table.constant(points, rows), one, Table.named("", conditions), one)
@@ -134,27 +134,27 @@ def _with_multipliers(system: MechanicalSystem, family: StageGroup) -> StageGrou
         scatters.append(Scatter(results=positions, table=conditions_table, power=-1, scale=scatters[0].scale))
     products = [factor * g for factor, g in zip(factors, positions, strict=True)]
     return replace(
-        family,
+        group,
         gathers=tuple(gathers),
         scatters=tuple(scatters),
-        scalar=sympy.Add(family.scalar, *products),
+        scalar=sympy.Add(group.scalar, *products),
         computes="L_q + G^T lambda, L_v and g",
-        forced=family.forced or any(nonholonomic_expressions(system)),
+        forced=group.forced or any(nonholonomic_expressions(system)),
     )
 
 
-def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, family: StageGroup) -> tuple[StageGroup, ...]:
+def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: StageGroup) -> tuple[StageGroup, ...]:
     """Return the nonholonomic constraints at s Gauss points; empty if there are none."""
     conditions_table, size, rows = nonholonomic_expressions(system), len(stages.blocks), len(stages.rows)
     if not any(conditions_table):
         return ()
-    points, gauss = len(family.abscissae), gauss_legendre(size)
-    between = cardinal_values([2 * c - 1 for c in family.abscissae], gauss.points)
+    points, gauss = len(group.abscissae), gauss_legendre(size)
+    between = cardinal_values([2 * c - 1 for c in group.abscissae], gauss.points)
     gathers = [
         replace(
             gather, table=Table.joined(_interpolated(gather.table, between, name), Table.constant(size, 1 + points))
         )
-        for gather, name in zip(family.gathers, ("A", "L"), strict=True)
+        for gather, name in zip(group.gathers, ("A", "L"), strict=True)
     ]
     conditions = [[int(row == n) for row in range(size)] for n in range(size)]
     place = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))

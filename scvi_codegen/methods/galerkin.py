@@ -209,7 +209,7 @@ class SVI(Method):
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
         return stationary_nodal(
-            families=(nodal_quadrature_group(system, self.node_set, self.rule),),
+            stage_groups=(nodal_quadrature_group(system, self.node_set, self.rule),),
             blocks=blocks,
             end_block=s - 1,
             rows=(

@@ -84,7 +84,7 @@ def galerkin_system(
         shape = replace(exact, position=position, end=end_position, weights=weights, unrounded=exact)
     gathers = _curve_gathers(system, position, (velocity, *derivatives))
     return stationary_increments(
-        families=action_groups(system, abscissae, (weights, *derivative_weights), gathers),
+        stage_groups=action_groups(system, abscissae, (weights, *derivative_weights), gathers),
         blocks=tuple(Block(name=f"V_{b}", power=1, straight=(mp.zero, mp.one)) for b in range(1, size + 1)),
         end_position=end_position,
         rows=tuple(Row(number=f"V_{b}", kind="IDEL", momentum=end_position[b - 1]) for b in range(1, size + 1)),
@@ -96,7 +96,7 @@ def galerkin_system(
 def action_groups(
     system: MechanicalSystem, abscissae: Vector, weights: Matrix, gathers: tuple[Gather, ...]
 ) -> tuple[ScalarStageGroup, ...]:
-    """Return sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at points of a curve, a family per row of weights (paper, 4.2.3).
+    """Return sum_k h^(k + 1) sum_n w_kn d^k L/dt^k at points, a group per row of weights (paper, 4.2.3).
 
     Args:
         system: the mechanical system.

@@ -178,19 +178,19 @@ def unit_sum(weights: Sequence[Number]) -> Vector:
 
 
 def lagrangian_scatters(
-    family: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
+    group: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
 ) -> StageGroup:
-    """Return ``family`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
+    """Return ``group`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
     filled = (
         _with_results(force_scatter, forms_of(system).force),
         _with_results(momentum_scatter, forms_of(system).momentum),
     )
     return StageGroup(
-        name=family.name,
-        abscissae=family.abscissae,
-        weights=family.weights,
-        weight_names=family.weight_names,
-        gathers=family.gathers,
+        name=group.name,
+        abscissae=group.abscissae,
+        weights=group.weights,
+        weight_names=group.weight_names,
+        gathers=group.gathers,
         scatters=filled,
     )
 

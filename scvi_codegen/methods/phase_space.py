@@ -34,9 +34,9 @@ BLOCK_NAMES = {"quadrature": "P", "derivative": "P", "stage": "P", "node": "N", 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Group:
-    """Group of m unknowns per point of one family: symbols, equations, and the matrix of their predictor."""
+    """Group of m unknowns per point of one stage group: symbols, equations, and the matrix of their predictor."""
 
-    family: int
+    stage_group: int
     name: str
     momenta: bool
     symbols: tuple[sympy.Symbol, ...]
@@ -46,7 +46,7 @@ class _Group:
 
 def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSystem:
     """Return the stage equations with auxiliary variables at all points that need them; unchanged if there are none."""
-    groups = [group for f, family in enumerate(stages.families) for group in _groups(system, f, family)]
+    groups = [group for f, stage_group in enumerate(stages.stage_groups) for group in _groups(system, f, stage_group)]
     if not groups:
         return stages
     added = [(g, n) for g, group in enumerate(groups) for n in range(len(group.guess))]
@@ -57,9 +57,9 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
         stages,
         blocks=(*stages.blocks, *(_block(groups[g], n) for g, n in added)),
         rows=tuple(replace(row, number=NUMBERS.get(row.number, row.number)) for row in rows),
-        families=tuple(
-            _extended(family, [g for g, group in enumerate(groups) if group.family == f], groups, added)
-            for f, family in enumerate(stages.families)
+        stage_groups=tuple(
+            _extended(stage_group, [g for g, group in enumerate(groups) if group.stage_group == f], groups, added)
+            for f, stage_group in enumerate(stages.stage_groups)
         ),
         end_position=Table.joined(stages.end_position, Table.constant(1, len(added))),
         end_numbers=(NUMBERS.get(number_q, number_q), NUMBERS.get(number_p, number_p)),
@@ -67,30 +67,30 @@ def with_auxiliaries(system: MechanicalSystem, stages: StageSystem) -> StageSyst
     )
 
 
-def _groups(system: MechanicalSystem, f: int, family: StageGroup) -> Iterator[_Group]:
-    """Yield the auxiliary variables that occur in a family, and the multipliers of their equations."""
-    free = set().union(*(result.free_symbols for result in family.results))
-    free |= family.scalar.free_symbols if family.scalar is not None else set()
-    points = family.abscissae
+def _groups(system: MechanicalSystem, f: int, stage_group: StageGroup) -> Iterator[_Group]:
+    """Yield the auxiliary variables that occur in a stage group, and the multipliers of their equations."""
+    free = set().union(*(result.free_symbols for result in stage_group.results))
+    free |= stage_group.scalar.free_symbols if stage_group.scalar is not None else set()
+    points = stage_group.abscissae
     guesses = {
-        system.auxiliaries: identity_matrix(len(points)) if family.name == "drift" else next_step(points),
+        system.auxiliaries: identity_matrix(len(points)) if stage_group.name == "drift" else next_step(points),
         auxiliary_multipliers(system): identity_matrix(len(points)),
     }
     for symbols, guess in guesses.items():
         if free & set(symbols):
             momenta = symbols == system.auxiliaries
-            name = BLOCK_NAMES[family.name] if momenta else "nu"
-            results = _stationary(system, family, symbols)
-            yield _Group(family=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
+            name = BLOCK_NAMES[stage_group.name] if momenta else "nu"
+            results = _stationary(system, stage_group, symbols)
+            yield _Group(stage_group=f, name=name, momenta=momenta, symbols=symbols, results=results, guess=guess)
 
 
 def _stationary(
-    system: MechanicalSystem, family: StageGroup, symbols: Sequence[sympy.Symbol]
+    system: MechanicalSystem, stage_group: StageGroup, symbols: Sequence[sympy.Symbol]
 ) -> tuple[sympy.Expr, ...]:
-    """Return the equations of these symbols: the gradient of the family's scalar, or v - H_p if it has none."""
-    if family.scalar is None:
+    """Return the equations of these symbols: the gradient of the group's scalar, or v - H_p if it has none."""
+    if stage_group.scalar is None:
         return forms_of(system).constitutive
-    derivatives = gradient(family.scalar, symbols)
+    derivatives = gradient(stage_group.scalar, symbols)
     return tuple(derivatives.get(i, sympy.S.Zero) for i in range(len(symbols)))
 
 
@@ -100,20 +100,20 @@ def _block(group: _Group, n: int) -> Block:
 
 
 def _extended(
-    family: StageGroup, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
+    stage_group: StageGroup, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
 ) -> StageGroup:
-    """Return a family with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
-    points, rows = len(family.abscissae), len(family.scatters[0].table.entries[0]) - 1
+    """Return a stage group with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
+    points, rows = len(stage_group.abscissae), len(stage_group.scatters[0].table.entries[0]) - 1
     none = Table.constant(points, len(added))
-    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in family.gathers]
-    scatters = [replace(scatter, table=_inserted(scatter.table, none, rows)) for scatter in family.scatters]
-    known = Table.constant(points, len(family.gathers[0].table.entries[0]))
+    gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in stage_group.gathers]
+    scatters = [replace(scatter, table=_inserted(scatter.table, none, rows)) for scatter in stage_group.scatters]
+    known = Table.constant(points, len(stage_group.gathers[0].table.entries[0]))
     before, last = Table.constant(points, rows), Table.constant(points, 1)
     for g in own:
         place = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
         gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, place), power=-1))
         scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, place, last), power=0))
-    return replace(family, gathers=tuple(gathers), scatters=tuple(scatters))
+    return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))
 
 
 def _inserted(table: Table, columns: Table, at: int) -> Table:

@@ -164,7 +164,7 @@ class RungeKutta(Method):
 def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
     """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
     size = len(tableau.b)
-    family = StageGroup(
+    group = StageGroup(
         name="stage",
         abscissae=tableau.c,
         weights=(mp.one,) * size,
@@ -187,9 +187,9 @@ def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSyste
     return StageSystem(
         blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
         rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
-        families=(
+        stage_groups=(
             lagrangian_scatters(
-                family,
+                group,
                 system,
                 Scatter(results=(), table=Table.joined(_transposed(tableau), b_column), power=1),
                 Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),

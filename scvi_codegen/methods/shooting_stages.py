@@ -75,7 +75,7 @@ def shooting_increments(
     )
     extrapolated = acceleration_extrapolation(tableau)
     return stationary_increments(
-        families=(*action, _multiplier_group(system, tableau, rounded=rounded)),
+        stage_groups=(*action, _multiplier_group(system, tableau, rounded=rounded)),
         blocks=blocks,
         end_position=(*beta, *(mp.zero,) * size),
         rows=(
@@ -188,7 +188,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
             Row(number="34d", kind="IDEL", momentum=mp.one),
             *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
         ),
-        families=(quadrature, node),
+        stage_groups=(quadrature, node),
         end_position=Table.named("beta", [(1, *end_row)], column=0),
         end_momentum=mp.one,
         end_numbers=("34c", "34e"),
@@ -217,7 +217,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         forces=forms_of(system).multiplied_forces,
     )
     return stationary_nodal(
-        families=(nodal_quadrature_group(system, nodes, rule, other_blocks=1 + size), node),
+        stage_groups=(nodal_quadrature_group(system, nodes, rule, other_blocks=1 + size), node),
         blocks=(
             *nodal_blocks(nodes),
             *(Block(name=f"lambda_{i}", power=0, straight=(mp.zero, mp.zero)) for i in range(1, size + 1)),
@@ -255,7 +255,7 @@ def printed_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> S
             *(Row(number="34a", kind="stage", momentum=mp.zero) for _ in range(size)),
             Row(number="34d", kind="IDEL", momentum=mp.one),
         ),
-        families=(quadrature, node),
+        stage_groups=(quadrature, node),
         end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
         end_momentum=mp.zero,
         end_numbers=("34c", "34e"),

@@ -1,8 +1,8 @@
 """Stage equations common to all methods: points on the step, a small symbolic kernel at each, and tables of numbers.
 
 A step from (t, q0, p0) with step size h has unknown *blocks* z_1 .. z_B, of m components each unless declared
-otherwise (multipliers of constraints). At point n of a *family* (quadrature points, collocation nodes, the start, the
-end) the arguments of a kernel are *gathered* from the unknowns,
+otherwise (multipliers of constraints). At point n of a *stage group* (quadrature points, collocation nodes, the start,
+the end) the arguments of a kernel are *gathered* from the unknowns,
 
     u_n = scale h^power (G_n0 q0 + sum_b h^(power of b) G_nb z_b),                       t_n = t + c_n h,
 
@@ -206,7 +206,7 @@ class StageSystem:
     Attributes:
         blocks: the unknowns.
         rows: the equations, as many as blocks.
-        families: groups of points at which kernels are evaluated.
+        stage_groups: groups of points at which kernels are evaluated.
         end_position: one row, 1 + B columns: q1 = E_0 q0 + sum_b h^(power of b) E_b z_b.
         end_momentum: coefficient of p0 in p1.
         end_numbers: the paper's numbers of the equations for q1 and p1.
@@ -217,7 +217,7 @@ class StageSystem:
 
     blocks: tuple[Block, ...]
     rows: tuple[Row, ...]
-    families: tuple[StageGroup, ...]
+    stage_groups: tuple[StageGroup, ...]
     end_position: Table
     end_momentum: Number
     end_numbers: tuple[str, str]
@@ -263,7 +263,7 @@ class ScalarStageGroup:
         return derivatives
 
     def to_stage_group(self, tables: Sequence[Table]) -> StageGroup:
-        """Return the family with its gradient as kernel, scattered through ``tables`` (one per gather)."""
+        """Return the stage group with its gradient as kernel, scattered through ``tables`` (one per gather)."""
         scatters = tuple(
             Scatter(
                 results=results,
@@ -295,7 +295,7 @@ def dyadic(entries: Sequence[Sequence[Number]]) -> Matrix:
 
 def stationary_increments(
     *,
-    families: Sequence[ScalarStageGroup],
+    stage_groups: Sequence[ScalarStageGroup],
     blocks: tuple[Block, ...],
     end_position: Sequence[Number],
     rows: tuple[Row, ...],
@@ -310,19 +310,19 @@ def stationary_increments(
     """
     beta, number = tuple(end_position), count(1)
     built = []
-    for family in families:
+    for group in stage_groups:
         tables = []
-        for gather in family.gathers:
+        for gather in group.gathers:
             lines = [
                 [*(beta[b] * line[0] - line[b + 1] for b in range(len(blocks))), line[0]]
                 for line in gather.table.entries
             ]
             tables.append(Table.named(f"s{next(number)}", lines))
-        built.append(family.to_stage_group(tables))
+        built.append(group.to_stage_group(tables))
     return StageSystem(
         blocks=blocks,
         rows=rows,
-        families=tuple(built),
+        stage_groups=tuple(built),
         end_position=Table.named("beta", [(1, *beta)], column=0),
         end_momentum=mp.one,
         end_numbers=("q1", "p1"),
@@ -333,7 +333,7 @@ def stationary_increments(
 
 def stationary_nodal(
     *,
-    families: Sequence[ScalarStageGroup],
+    stage_groups: Sequence[ScalarStageGroup],
     blocks: tuple[Block, ...],
     end_block: int,
     rows: tuple[Row, ...],
@@ -344,12 +344,12 @@ def stationary_nodal(
     Rows: p0 + dG/dq0 = 0, then dG/dz = 0 for every other block in order; p1 = dG/dq1 (paper (5), (26), (27)).
     """
     order = [0, *(b + 1 for b in range(len(blocks)) if b != end_block), end_block + 1]
-    built = [family.to_stage_group([gather.table.columns(order) for gather in family.gathers]) for family in families]
+    built = [group.to_stage_group([gather.table.columns(order) for gather in group.gathers]) for group in stage_groups]
     unit = [int(b == end_block) for b in range(len(blocks))]
     return StageSystem(
         blocks=blocks,
         rows=rows,
-        families=tuple(built),
+        stage_groups=tuple(built),
         end_position=Table.named("", [(0, *unit)]),
         end_momentum=mp.zero,
         end_numbers=end_numbers,

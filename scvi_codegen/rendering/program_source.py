@@ -267,7 +267,7 @@ def workspace_size(program: Program) -> int:
 def scratch_size(program: Program) -> int:
     """Return the doubles for the kernels of one stage group, or for the mass matrix with its derivatives."""
     mass = program.matrix_size(program.dimension, 1) + len(program.quantities.mass_entries)
-    return max(mass, *(family.scratch for family in program.equations.families)) if program.newton else mass
+    return max(mass, *(group.scratch for group in program.equations.stage_groups)) if program.newton else mass
 
 
 def _context(

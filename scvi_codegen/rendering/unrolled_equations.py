@@ -31,7 +31,7 @@ Term: TypeAlias = tuple[Number, str]
 class UnrolledGroup:
     """Offsets of arguments, values and derivatives of a stage group, and the statements of its arguments."""
 
-    family: LoweredStageGroup
+    group: LoweredStageGroup
     u: int
     value: int
     derivative: int
@@ -44,7 +44,7 @@ class UnrolledGroup:
 class UnrolledEquations:
     """Statements; ``sizes`` are the numbers of arguments, values and derivatives."""
 
-    families: tuple[UnrolledGroup, ...]
+    stage_groups: tuple[UnrolledGroup, ...]
     sizes: tuple[int, int, int]
     residuals: tuple[str, ...]
     increments: tuple[str, ...]
@@ -68,11 +68,11 @@ class _Statements:
 
     def __init__(self, program: Program, target: Target) -> None:
         self.program, self.target = program, target
-        families = program.equations.families
-        self.u = list(accumulate((each.points * each.value.arguments for each in families), initial=0))
-        self.value = list(accumulate((each.points * each.value.values for each in families), initial=0))
-        self.partials = [len(each.derivative.results) - each.derivative.values for each in families]
-        counts = (each.points * count for each, count in zip(families, self.partials, strict=True))
+        stage_groups = program.equations.stage_groups
+        self.u = list(accumulate((each.points * each.value.arguments for each in stage_groups), initial=0))
+        self.value = list(accumulate((each.points * each.value.values for each in stage_groups), initial=0))
+        self.partials = [len(each.derivative.results) - each.derivative.values for each in stage_groups]
+        counts = (each.points * count for each, count in zip(stage_groups, self.partials, strict=True))
         self.derivative = list(accumulate(counts, initial=0))
 
     def written(self, entries: dict[tuple[int, int, int, int], list[list[Term]]]) -> UnrolledEquations:
@@ -80,7 +80,7 @@ class _Statements:
         program, blocks = self.program, self.program.equations.blocks
         sites = range(program.equations.sites)
         return UnrolledEquations(
-            families=tuple(self._family(k, family) for k, family in enumerate(program.equations.families)),
+            stage_groups=tuple(self._family(k, group) for k, group in enumerate(program.equations.stage_groups)),
             sizes=(self.u[-1], self.value[-1], self.derivative[-1]),
             residuals=tuple(
                 _statement(f"rows[{s * (blocks + 1) + r}] = {self._sum(self._row(s, r))};")
@@ -97,20 +97,20 @@ class _Statements:
             ),
         )
 
-    def _family(self, k: int, family: LoweredStageGroup) -> UnrolledGroup:
+    def _family(self, k: int, group: LoweredStageGroup) -> UnrolledGroup:
         return UnrolledGroup(
-            family=family,
+            group=group,
             u=self.u[k],
             value=self.value[k],
             derivative=self.derivative[k],
             partials=self.partials[k],
-            points=tuple(map(_statement, self._points(family))),
-            uses_step=any(loop.power for loop in family.gathers),
+            points=tuple(map(_statement, self._points(group))),
+            uses_step=any(loop.power for loop in group.gathers),
         )
 
-    def _points(self, family: LoweredStageGroup) -> Iterator[str]:
-        for n in range(family.points):
-            for loop in family.gathers:
+    def _points(self, group: LoweredStageGroup) -> Iterator[str]:
+        for n in range(group.points):
+            for loop in group.gathers:
                 for i in range(loop.sites):
                     unknowns = [
                         f"z[{(loop.first + i) * self.program.equations.blocks + b}]"
@@ -120,18 +120,18 @@ class _Statements:
                     text = _scaled(loop.power, self._sum(terms))
                     if loop.from_state:
                         text = f"step->q0[{i}] + (step->carry_q[{i}] + {text})"
-                    yield f"u[{n * family.value.arguments + loop.offset + i}] = {text};"
+                    yield f"u[{n * group.value.arguments + loop.offset + i}] = {text};"
 
     def _row(self, site: int, row: int) -> list[Term]:
         """Return the terms of row ``row`` of a site, the last row that of p1."""
         program = self.program
         begins = row < program.equations.blocks and site < program.dimension
         terms = [(program.equations.momentum_rows[row], f"step->p0[{site}]")] if begins else []
-        for k, family in enumerate(program.equations.families):
-            for loop in family.scatters:
+        for k, group in enumerate(program.equations.stage_groups):
+            for loop in group.scatters:
                 if loop.first <= site < loop.first + loop.sites:
-                    for n, weight in enumerate(family.weights):
-                        place = self.value[k] + n * family.value.values + loop.offset + site - loop.first
+                    for n, weight in enumerate(group.weights):
+                        place = self.value[k] + n * group.value.values + loop.offset + site - loop.first
                         terms.append((loop.table[n][row], self._product(weight, loop.power, f"value[{place}]")))
         return terms
 
@@ -153,14 +153,14 @@ class _Statements:
     def entries(self) -> dict[tuple[int, int, int, int], list[list[Term]]]:
         """Return the sums by row (i, r) and column (j, b) of the Jacobian, one sum per pair of tables."""
         entries: dict[tuple[int, int, int, int], list[list[Term]]] = {}
-        for k, family in enumerate(self.program.equations.families):
-            for block in family.blocks:
-                row, column = family.scatters[block.scatter], family.gathers[block.gather]
+        for k, group in enumerate(self.program.equations.stage_groups):
+            for block in group.blocks:
+                row, column = group.scatters[block.scatter], group.gathers[block.gather]
                 for e, (i, j) in enumerate(block.entries):
                     for b in range(self.program.equations.blocks):
                         factors = [
                             self._derivative_factor(k, n, block.first + e, row.power + column.power, column.table[n][b])
-                            for n in range(family.points)
+                            for n in range(group.points)
                         ]
                         for r in range(self.program.equations.blocks):
                             coefficients = [line[r] for line in row.table]
@@ -174,7 +174,7 @@ class _Statements:
         if not coefficient:
             return ""
         derivative = f"derivative[{self.derivative[k] + n * self.partials[k] + e}]"
-        product = self._product(self.program.equations.families[k].weights[n], power, derivative)
+        product = self._product(self.program.equations.stage_groups[k].weights[n], power, derivative)
         return product if coefficient == 1 else f"{product} * {self._signed(coefficient)}"
 
     def _product(self, weight: Number, power: int, factor: str, *, first: bool = False) -> str:

@@ -119,8 +119,8 @@ class TestEquations:
     def test_one_name_denotes_one_number(self, method):
         stages = method.paper_form(tilted())
         values: dict[str, Any] = {}
-        for family in stages.families:
-            for part in (*family.gathers, *family.scatters):
+        for group in stages.stage_groups:
+            for part in (*group.gathers, *group.scatters):
                 for names, numbers in zip(part.table.names, part.table.entries, strict=True):
                     for name, number in zip(names, numbers, strict=True):
                         assert not name or values.setdefault(name, number) == number

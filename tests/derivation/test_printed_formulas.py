@@ -201,7 +201,7 @@ def of_package(number: Any) -> Any:
 def table_values(stages: Any) -> dict[str, Any]:
     """Numbers of all tables by their printed names; those that are 0 and 1, and have no name, by that of their row."""
     found: dict[str, Any] = {}
-    tables = [part.table for family in stages.families for part in (*family.gathers, *family.scatters)]
+    tables = [part.table for group in stages.stage_groups for part in (*group.gathers, *group.scatters)]
     for table in (*tables, stages.end_position):
         for c in range(len(table.names[0])):
             column = [(r, line[c]) for r, line in enumerate(table.names, 1)]
@@ -218,8 +218,8 @@ def table_values(stages: Any) -> dict[str, Any]:
                 found[printed(name)] = of_package(table.entries[row - 1][c]) * factor
                 if line:  # as it is written out
                     found[printed("_".join([prefix, *indices]))] = found[printed(name)]
-    for family in stages.families:
-        for name, weight in zip(family.weight_names, family.weights, strict=True):
+    for group in stages.stage_groups:
+        for name, weight in zip(group.weight_names, group.weights, strict=True):
             if name:
                 found[printed(name)] = of_package(weight)
     return found
@@ -246,8 +246,8 @@ class PrintedStep:
             elif left[2] == "k+1" and left[1] in "qp" and entry.number:
                 self.ends[left[1]] = right
             else:
-                (family,) = [f for f in stages.families if entry.heading.startswith(MEETING[f.name])]
-                self.gathers[family.name, f"{left[1]}_{left[2]}"] = right
+                (group,) = [f for f in stages.stage_groups if entry.heading.startswith(MEETING[f.name])]
+                self.gathers[group.name, f"{left[1]}_{left[2]}"] = right
         assert set(self.ends) == {"q", "p"}
         self.sizes = [len(case.coordinates) if b.size is None else b.size for b in stages.blocks]
 
@@ -266,38 +266,38 @@ class PrintedStep:
         known = self.unknowns(x) | self.tables | {"q_k": numbers(q), "p_k": numbers(p), "h": mp.mpf(h)}
         known["Q^0"] = known["q_k"]
         gamma = self.case.parsed(self.case.damping).subs(PARAMETERS)
-        for family in self.stages.families:
-            first = int(family.weight_names[0].rpartition("_")[2] or 1)
-            for n, abscissa in enumerate(family.abscissae):
+        for group in self.stages.stage_groups:
+            first = int(group.weight_names[0].rpartition("_")[2] or 1)
+            for n, abscissa in enumerate(group.abscissae):
                 time = mp.mpf(t) + of_package(abscissa) * mp.mpf(h)
-                place = {"start": "k", "end": "k+1"}.get(family.name, str(n + first))
-                given = self.arguments(family, n + 1, place, known)
+                place = {"start": "k", "end": "k+1"}.get(group.name, str(n + first))
+                given = self.arguments(group, n + 1, place, known)
                 growth = mp.exp(mp.mpf(str(gamma)) * of_package(abscissa) * mp.mpf(h))
                 for letter in self.case.results:
                     name, _, index = letter.partition("_")
                     own = f"{name}_{index + ',' if index else ''}{place}"
-                    if own in known and not _offers(family, letter):
+                    if own in known and not _offers(group, letter):
                         continue
                     known[own] = self.case.result(letter, time, **given) * growth
         known["growth"] = mp.exp(mp.mpf(str(gamma)) * mp.mpf(h))
         return known
 
-    def arguments(self, family: Any, row: int, place: str, known: Mapping[str, Any]) -> dict[str, Any]:
+    def arguments(self, group: Any, row: int, place: str, known: Mapping[str, Any]) -> dict[str, Any]:
         """What the kernel of a family is given at a point; what has no formula is an unknown."""
         found = {}
         for letter in filter(self.case.letters.get, self.case.letters):
-            formulas = [self.gathers.get((family.name, f"{letter}_{at}")) for at in ("n", "k", "k+1", "1")]
+            formulas = [self.gathers.get((group.name, f"{letter}_{at}")) for at in ("n", "k", "k+1", "1")]
             formula = next((each for each in formulas if each is not None), None)
             if formula is not None:
-                others = self.nameless(family, letter, row)
+                others = self.nameless(group, letter, row)
                 found[letter] = value(formula, lambda name: others.get(name, known.get(name)), {"n": row})  # noqa: B023
             elif f"{letter}_{place}" in known:
                 found[letter] = known[f"{letter}_{place}"]
         return found
 
-    def nameless(self, family: Any, letter: str, row: int) -> dict[str, Any]:
+    def nameless(self, group: Any, letter: str, row: int) -> dict[str, Any]:
         """G_n,j of tables without names: the entries of the argument's own gather."""
-        own = [g for g in family.gathers if _letter(g, self.case) == letter]
+        own = [g for g in group.gathers if _letter(g, self.case) == letter]
         found = {}
         for gather in own:
             line = gather.table.entries[row - 1]
@@ -357,10 +357,10 @@ def velocity_of(case: Case, q: Any, p: Any, t: Any) -> np.ndarray[Any, Any]:
     return newton(lambda v: case.result("L_v", t, q=numbers(q), **{"q'": v}) - numbers(p), start)
 
 
-def _offers(family: Any, letter: str) -> bool:
+def _offers(group: Any, letter: str) -> bool:
     """Whether the results called so at a point are those of this family, where another has them, too."""
     scalar = {"S": "node", "L'": "derivative_1", "E": "node"}.get(letter.partition("_")[0])
-    names = family.name if family.name != "kick" else "kick"
+    names = group.name if group.name != "kick" else "kick"
     if scalar is not None:
         return names == scalar
     return names in (("drift",) if letter == "L_v" else ("quadrature", "stage", "kick"))
@@ -568,9 +568,9 @@ def paper_numbers(name: str, x: Any = None) -> dict[str, Any]:
     for coordinate, position, momentum, speed in zip(case.coordinates, q, p, velocity_of(case, q, p, t), strict=True):
         found |= {f"{coordinate}_k": mp.mpf(position), f"{coordinate}'_k": speed}
         found[f"p_{coordinate},k" if several else "p_k"] = mp.mpf(momentum)
-    for family in step.stages.families:  # times of points, by the names of their abscissae
-        letter = "d" if family.name == "quadrature" else "c"
-        found |= {f"{letter}_{n}": of_package(c) for n, c in enumerate(family.abscissae, 1) if c not in (0, 1)}
+    for group in step.stages.stage_groups:  # times of points, by the names of their abscissae
+        letter = "d" if group.name == "quadrature" else "c"
+        found |= {f"{letter}_{n}": of_package(c) for n, c in enumerate(group.abscissae, 1) if c not in (0, 1)}
     return found
 
 
@@ -674,9 +674,9 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
     end = step.end(x, q, p, h, t)
     found: dict[str, Any] = {"h": mp.mpf(h), "q_k": numbers(q), "p_k": numbers(p), "q_k+1": end[0], "p_k+1": end[1]}
     found["v_0"] = known.get("v_0", velocity_of(case, q, p, t))
-    families = [f for f in step.stages.families if f.name != "derivative_1"]
-    places = families[-1] if hasattr(fixed_point, "nodes") and len(families) > 1 else families[0]
-    places = next((f for f in families if f.name == "node"), places) if hasattr(fixed_point, "nodes") else places
+    stage_groups = [f for f in step.stages.stage_groups if f.name != "derivative_1"]
+    places = stage_groups[-1] if hasattr(fixed_point, "nodes") and len(stage_groups) > 1 else stage_groups[0]
+    places = next((f for f in stage_groups if f.name == "node"), places) if hasattr(fixed_point, "nodes") else places
     first = int(places.weight_names[0].rpartition("_")[2] or 1)
     for n in range(1, len(places.abscissae) + 1):
         given = step.arguments(places, n, str(n - 1 + first), known)

@@ -116,11 +116,13 @@ def partials(change: Callable[[int, sympy.Expr], sympy.Expr]) -> Make:
 
 def last_column_negated(stages: Any) -> Any:
     """The scatter tables of the last gather, with p1 changed by the other sign."""
-    family = stages.families[-1]
-    own = family.scatters[0]
+    group = stages.stage_groups[-1]
+    own = group.scatters[0]
     entries = tuple((*line[:-1], -line[-1]) for line in own.table.entries)
     scatter = replace(own, table=replace(own.table, entries=entries))
-    return replace(stages, families=(*stages.families[:-1], replace(family, scatters=(scatter, *family.scatters[1:]))))
+    return replace(
+        stages, stage_groups=(*stages.stage_groups[:-1], replace(group, scatters=(scatter, *group.scatters[1:])))
+    )
 
 
 def of_another_system(original: Any) -> Any:

@@ -140,24 +140,24 @@ def test_kernels_have_the_values_and_derivatives_of_their_formulas(name, method)
     system = problem(name).system
     program = lowered(system, method)
     points = random.Random(name)
-    for family, own in zip(method.stage_system(system).families, program.equations.families, strict=True):
-        symbols = (*family.arguments, system.time, *system.parameters)
+    for group, own in zip(method.stage_system(system).stage_groups, program.equations.stage_groups, strict=True):
+        symbols = (*group.arguments, system.time, *system.parameters)
         point = {symbol: sympy.Rational(points.randint(1, 30), 64) for symbol in symbols}
         point |= {symbol: 1 + value for symbol, value in point.items() if symbol in system.parameters}
         numbers = [float(point[symbol]) for symbol in symbols]
-        m = len(family.arguments)
-        expected = [float(exact(e, point)) for e in (*family.results, *derivatives_in_order(family))]
+        m = len(group.arguments)
+        expected = [float(exact(e, point)) for e in (*group.results, *derivatives_in_order(group))]
         found = interpret(own.derivative, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
         values = interpret(own.value, numbers[:m], numbers[m], numbers[m + 1 :], float, FLOATS)
         np.testing.assert_allclose(values, expected[: len(values)], rtol=1e-12, atol=1e-14)
 
 
-def derivatives_in_order(family: Any) -> list[sympy.Expr]:
+def derivatives_in_order(group: Any) -> list[sympy.Expr]:
     return [
         derivative
-        for scatter in family.scatters
-        for gather in family.gathers
+        for scatter in group.scatters
+        for gather in group.gathers
         for derivative in jacobian(scatter.results, gather.arguments).values()
     ]
 

@@ -156,9 +156,9 @@ def test_wrong_sign_in_a_scatter_is_reported_before_compilation():
     """Newton's matrix is the Jacobian of a gradient: by one of other results the iteration would never converge."""
     system = LagrangianSystem.from_text(name="mixed", coordinates=["x"], lagrangian="(1 + x**2)*x_dot**2/2 - x**4")
     stages = discretise(system, SVI(2))
-    (family,), sites = stages.families, layout_of(stages, 1)
-    lowered_stage_group(system, family, sites)
-    first, *others = family.scatters
+    (group,), sites = stages.stage_groups, layout_of(stages, 1)
+    lowered_stage_group(system, group, sites)
+    first, *others = group.scatters
     wrong = replace(first, results=tuple(-each for each in first.results))
     with pytest.raises(MethodError, match=r"(?s)'quadrature' are not the gradient of its scalar.*check the signs"):
-        lowered_stage_group(system, replace(family, scatters=(wrong, *others)), sites)
+        lowered_stage_group(system, replace(group, scatters=(wrong, *others)), sites)

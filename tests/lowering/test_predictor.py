@@ -28,14 +28,14 @@ def stepper(kind, method, degree):
     force = motion(degree) + mass * motion(degree).deriv(2)
     pushed = "(" + " + ".join(f"{float(c)!r}*t**{k}" for k, c in enumerate(force.coef)) + f")*({coordinates})"
     if "hamiltonian" in kind:
-        family, given = sc.HamiltonianSystem, {"hamiltonian": f"{kinetic} + {potential} - {pushed}"}
+        group, given = sc.HamiltonianSystem, {"hamiltonian": f"{kinetic} + {potential} - {pushed}"}
     else:
-        family, given = sc.LagrangianSystem, {"lagrangian": f"{kinetic} - {potential} + {pushed}"}
+        group, given = sc.LagrangianSystem, {"lagrangian": f"{kinetic} - {potential} + {pushed}"}
     if "array" in kind:
         system = sc.IndexedSystem.from_text(name=kind, coordinates=["x[N]"], **given)
         return sc.compile_indexed(system, method, solver="fixed-point"), [mass] * 3
     names = ["x", "y"] if "y" in coordinates else ["x"]
-    system = family.from_text(name=kind, coordinates=names, **given)
+    system = group.from_text(name=kind, coordinates=names, **given)
     return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * len(names)
 
 

@@ -131,5 +131,5 @@ def test_parameters_may_have_the_names_of_reads():
         lagrangian=" + ".join(f"{q}_dot**2" for q in names) + springs,
         parameters={"slot_0": 2, "given_0": 3},
     )
-    (family,) = module.rolled(system).families
-    assert {each.name for each in family.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}
+    (group,) = module.rolled(system).term_groups
+    assert {each.name for each in group.formula.free_symbols} >= {"slot_0", "given_0", "slot__0"}

@@ -34,25 +34,25 @@ class Evaluation:
         for name, value in unknowns.items():
             letter, _, index = name.rpartition("_")
             self.values |= {f"{letter}_{index}": value, f"{letter}__{index}": value}
-        for family in stages.families:
-            self._evaluate_kernel(family)
+        for group in stages.stage_groups:
+            self._evaluate_kernel(group)
 
-    def _evaluate_kernel(self, family) -> None:
-        formulas = {formula.left: formula.right for formula in gather_formulas(self.system, self.stages, family)}
-        first = int(family.weight_names[0].rpartition("_")[2] or 1)
+    def _evaluate_kernel(self, group) -> None:
+        formulas = {formula.left: formula.right for formula in gather_formulas(self.system, self.stages, group)}
+        first = int(group.weight_names[0].rpartition("_")[2] or 1)
         for place, (abscissa, weight, name) in enumerate(
-            zip(family.abscissae, family.weights, family.weight_names, strict=True)
+            zip(group.abscissae, group.weights, group.weight_names, strict=True)
         ):
             number, row = place + first, place + 1
             arguments = {self.system.time: self.values["t_k"] + sympy.Float(str(abscissa), DIGITS) * self.values["h"]}
-            for gather in family.gathers:
-                left = argument_symbol(self.system, gather, point_index(family))
+            for gather in group.gathers:
+                left = argument_symbol(self.system, gather, point_index(group))
                 right = renamed(formulas.get(left, left), "n", row)
                 arguments[gather.arguments[0]] = self.value(right)
             if name:
                 self.values[name] = sympy.Float(str(weight), DIGITS)
-            for scatter in family.scatters:
-                symbol = result_symbol(self.system, family, scatter, point_index(family, number))
+            for scatter in group.scatters:
+                symbol = result_symbol(self.system, group, scatter, point_index(group, number))
                 result = scatter.results[0].xreplace(arguments).xreplace(self.parameters)
                 self.values[symbol.name] = sympy.N(result, DIGITS)
 
@@ -77,7 +77,7 @@ class Evaluation:
 
 def _table_values(stages: StageSystem) -> Iterator[tuple[str, sympy.Expr]]:
     """What the entries of columns with names are, by what they are called at each point."""
-    tables = [part.table for family in stages.families for part in (*family.gathers, *family.scatters)]
+    tables = [part.table for group in stages.stage_groups for part in (*group.gathers, *group.scatters)]
     for table in (*tables, stages.end_position):
         for number in range(len(table.names[0])):
             column = column_of(table, number)

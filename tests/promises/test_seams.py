@@ -96,7 +96,7 @@ from scvi_codegen.compiler import program_of
 assert scvi_codegen.__file__.startswith(sys.path[0])
 system, method = problem("kepler").system, method_from_specification({"method": "midpoint"})
 own, gauss = (program_of(system, each, prefix="p") for each in (method, Gauss(1)))
-same = own.equations.families == gauss.equations.families, own.fixed_point == gauss.fixed_point
+same = own.equations.stage_groups == gauss.equations.stage_groups, own.fixed_point == gauss.fixed_point
 print(*same, *(each.exact for each in own.quantities.momentum_maps))
 """
     assert run(extended, script).split() == ["True", "True", "True"]
@@ -164,7 +164,7 @@ class Constrained(Method):
                 *(Row(number="27b", kind="stage", momentum=mp.zero) for _ in range(s - 1)),
                 *(Row(number="g", kind="stage", momentum=mp.zero, size=k) for _ in range(s)),
             ),
-            families=(action.to_stage_group(rows), self._reactions(system, nodes), self._surface(system, nodes)),
+            stage_groups=(action.to_stage_group(rows), self._reactions(system, nodes), self._surface(system, nodes)),
             end_position=Table.named("", [[0] * s + [1] + [0] * s]),
             end_momentum=mp.zero,
             end_numbers=("27", "27c"),
@@ -255,7 +255,7 @@ class ConstrainedIncrements(Constrained):
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         s, k = self.degree, len(self.constraints)
         own = SVI(s, f"gauss-lobatto:{s + 1}").stage_system(system)
-        (action,) = own.families
+        (action,) = own.stage_groups
         place, none = action.gathers[0].table, Table.constant(s + 1, s)
         rows = [_widened(scatter.table, none) for scatter in action.scatters]
         product, multipliers = self._product()
@@ -307,7 +307,7 @@ class ConstrainedIncrements(Constrained):
                 *(Block(name=f"m_{n}", power=1, straight=still, moves=False, size=k) for n in range(s)),
             ),
             rows=(*own.rows, *(Row(number="g", kind="stage", momentum=mp.zero, size=k) for _ in range(s))),
-            families=(free, reaction, surface),
+            stage_groups=(free, reaction, surface),
             end_position=Table.joined(own.end_position, Table.constant(1, s)),
             extrapolation=(*((*line, *zero) for line in own.extrapolation or ()), *((*zero, *zero) for _ in zero)),
             shape=None,

@@ -29,9 +29,9 @@ MULTIPLIED_FORCES = (
 )
 
 
-def point_index(family: StageGroup, point: object = "n") -> str:
+def point_index(group: StageGroup, point: object = "n") -> str:
     """Return the index of a point of a stage group: n, or k and k + 1 at an end of the step."""
-    return PLACES.get(family.name, str(point if len(family.abscissae) > 1 else 1))
+    return PLACES.get(group.name, str(point if len(group.abscissae) > 1 else 1))
 
 
 def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Symbol:
@@ -40,30 +40,30 @@ def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Sym
     return Symbol(f"{ARGUMENTS.get(name, name)}_{place}")
 
 
-def result_symbol(system: MechanicalSystem, family: StageGroup, scatter: Scatter, place: str) -> Symbol:
+def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, place: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
     if system.constraints and scatter.results == holonomic_expressions(system):
         return Symbol(f"g_{place}")
     if system.constraints and scatter.results in (nonholonomic_expressions(system), constraint_rates(system)):
         return Symbol(f"g_dot_{place}")
-    if family.scalar is None:
+    if group.scalar is None:
         forms = forms_of(system)
         known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
         return Symbol(f"{known[scatter.results]}_{place}")
-    name = argument_name(system, family.gathers[family.scatters.index(scatter)])
-    return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(family)}_{name}_{place}")
+    name = argument_name(system, group.gathers[group.scatters.index(scatter)])
+    return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(group)}_{name}_{place}")
 
 
-def scalar_name(family: StageGroup) -> str:
+def scalar_name(group: StageGroup) -> str:
     """Return L, its k-th time derivative along the curve, or S."""
-    if family.name == "node":
+    if group.name == "node":
         return "S"
-    return "L" if not family.scalar_power else "L_dot" if family.scalar_power == 1 else f"L_d{family.scalar_power}"
+    return "L" if not group.scalar_power else "L_dot" if group.scalar_power == 1 else f"L_d{group.scalar_power}"
 
 
-def meaning(family: StageGroup) -> str:
+def meaning(group: StageGroup) -> str:
     """Return the meaning of the letter of a stage group's results."""
-    if family.scalar is not None:
-        name = scalar_name(family)
-        return MEANINGS[name[:5]] + (MULTIPLIED_FORCES if name == "S" and family.forced else "")
-    return MEANINGS["E"] if family.name == "node" else MEANINGS["L"]
+    if group.scalar is not None:
+        name = scalar_name(group)
+        return MEANINGS[name[:5]] + (MULTIPLIED_FORCES if name == "S" and group.forced else "")
+    return MEANINGS["E"] if group.name == "node" else MEANINGS["L"]

@@ -37,9 +37,9 @@ def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
     offsets = [0, *accumulate(stages.block_sizes(dimension))]
     lines = [0, *accumulate(stages.row_sizes(dimension))]
     found: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
-    for family in stages.families:
-        for scatter in family.scatters:
-            for gather in family.gathers:
+    for group in stages.stage_groups:
+        for scatter in group.scatters:
+            for gather in group.gathers:
                 pairs = jacobian(scatter.results, gather.arguments)
                 for r, b in _coupled_pairs(scatter.table.entries, gather.table.entries, len(stages.rows)):
                     for i, j in pairs:

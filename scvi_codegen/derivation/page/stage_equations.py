@@ -71,19 +71,19 @@ def idel_section(system: MechanicalSystem, stages: StageSystem) -> Section:
 def stage_group_contents(system: MechanicalSystem, stages: StageSystem) -> Iterator[Content]:
     """Yield the arguments of each stage group, and the names of its results."""
     meanings: dict[str, None] = {}
-    for family in stages.families:
-        given = list(gather_formulas(system, stages, family))
+    for group in stages.stage_groups:
+        given = list(gather_formulas(system, stages, group))
         if given:
-            yield Paragraph(f"{_place(family)}:")
+            yield Paragraph(f"{_place(group)}:")
             yield from given
-        meanings[meaning(family)] = None
+        meanings[meaning(group)] = None
     yield Paragraph(f"{'; '.join(meanings)}.")
 
 
 def component_equations(system: MechanicalSystem, method: Method, stages: StageSystem) -> StepEquations | None:
     """Return the equations component by component, ``None`` if they would be too long."""
     points = sum(
-        len(family.abscissae) * sum(1 + operations(result) for result in family.results) for family in stages.families
+        len(group.abscissae) * sum(1 + operations(result) for result in group.results) for group in stages.stage_groups
     )
     return derive(system, method) if points * len(stages.rows) <= MOST_OPERATIONS else None
 
@@ -130,10 +130,10 @@ def _unknowns(system: MechanicalSystem, stages: StageSystem) -> str:
     return f"Unknown are {', '.join(names)}{each}: {size} in all. Known are q_k, p_k, t_k and h."
 
 
-def _place(family: StageGroup) -> str:
-    first = family.name.partition("_")[0]
-    named = FAMILIES.get(first, f"At the points of '{family.name}'")
-    return named if len(family.abscissae) == 1 else f"{named}, {len(family.abscissae)} of them"
+def _place(group: StageGroup) -> str:
+    first = group.name.partition("_")[0]
+    named = FAMILIES.get(first, f"At the points of '{group.name}'")
+    return named if len(group.abscissae) == 1 else f"{named}, {len(group.abscissae)} of them"
 
 
 def _formula(equation: Equation) -> Formula:

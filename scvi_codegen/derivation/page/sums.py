@@ -24,10 +24,10 @@ h, n, j = Symbol("h"), Symbol("n", integer=True), Symbol("j", integer=True)
 RUNNING_ROW = "i"
 
 
-def gather_formulas(system: MechanicalSystem, stages: StageSystem, family: StageGroup) -> Iterator[Formula]:
+def gather_formulas(system: MechanicalSystem, stages: StageSystem, group: StageGroup) -> Iterator[Formula]:
     """Yield the arguments of the kernel of a stage group at point n, except those that are unknowns themselves."""
-    for gather in family.gathers:
-        total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, point_index(family))
+    for gather in group.gathers:
+        total, left = gathered(gather.table, stages.blocks), argument_symbol(system, gather, point_index(group))
         scale = sympy.Rational(str(gather.scale))
         if scale == 1:
             right = sympy.Add(*(h**gather.power * term for term in sympy.Add.make_args(total)))
@@ -109,7 +109,7 @@ class _Part:
     """Contribution of a scatter to a line: the column of the table, and the result that it multiplies."""
 
     system: MechanicalSystem
-    family: StageGroup
+    group: StageGroup
     scatter: Scatter
     column: Column
     power: int
@@ -117,7 +117,7 @@ class _Part:
     @property
     def first(self) -> int:
         """Number of the first point, as in the names of the weights."""
-        return int(self.family.weight_names[0].rpartition("_")[2] or 1)
+        return int(self.group.weight_names[0].rpartition("_")[2] or 1)
 
     @property
     def index(self) -> int | None:
@@ -127,13 +127,13 @@ class _Part:
 
     def product(self, index: object) -> sympy.Expr:
         """Return the entry times the result, without weight: at point n, or at the single point of the entry."""
-        place = point_index(self.family, index if self.column.kind == "single" else n)
+        place = point_index(self.group, index if self.column.kind == "single" else n)
         factor = sympy.Rational(str(self.scatter.scale)) * h**self.power
-        return factor * self.column.entry(index) * result_symbol(self.system, self.family, self.scatter, place)
+        return factor * self.column.entry(index) * result_symbol(self.system, self.group, self.scatter, place)
 
     def weight(self, index: object) -> sympy.Expr:
         """Return the weight of a point, 1 if weights have no names."""
-        name = self.family.weight_names[0]
+        name = self.group.weight_names[0]
         return Symbol(f"{name.rpartition('_')[0]}_{index}") if name else sympy.S.One
 
 
@@ -158,9 +158,9 @@ class _Line:
         """Return a row; ``r`` beyond the last one is the line of p_(k+1)."""
         row = stages.rows[r] if r < len(stages.rows) else None
         parts = tuple(
-            _Part(system, family, scatter, column, scatter.power + (row.power if row else 0))
-            for family in stages.families
-            for scatter in family.scatters
+            _Part(system, group, scatter, column, scatter.power + (row.power if row else 0))
+            for group in stages.stage_groups
+            for scatter in group.scatters
             if (column := column_of(scatter.table, r)).kind != "zero"
         )
         indices = [part.index for part in parts if part.index is not None and part.column.points > 1]
@@ -214,7 +214,7 @@ class _Line:
                 terms.append(part.weight(index) * product)
             else:
                 last = index if part.column.kind == "leading" else part.first + part.column.points - 1
-                sums.setdefault((part.family.name, last), []).append((part, product))
+                sums.setdefault((part.group.name, last), []).append((part, product))
         for (_, last), products in sums.items():
             part = products[0][0]
             total = part.weight(n) * sympy.Add(*(product for _, product in products))

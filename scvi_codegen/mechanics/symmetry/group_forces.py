@@ -22,27 +22,27 @@ FEW = 12
 """Number of bodies per term group that :func:`terms_among_few_bodies` selects."""
 
 
-def terms_among_few_bodies(families: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
+def terms_among_few_bodies(term_groups: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
     """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
     own = {place: number for number, body in enumerate(bodies) for place in body.columns}
     chosen = dict[int, None]()
-    for term_group in families:
+    for term_group in term_groups:
         met = dict.fromkeys(own.get(place, -1 - place) for row in term_group.places for place in row)
         chosen |= dict.fromkeys(list(met)[:FEW])
     return tuple(
         term_group.where([all(own.get(place, -1 - place) in chosen for place in row) for row in term_group.places])
-        for term_group in families
+        for term_group in term_groups
     )
 
 
 def array_forces(
-    families: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Any], count: int
 ) -> Sequence[Any]:
     """Return the force on each coordinate at ``count`` points; ``known`` has coordinates, parameters and time there."""
-    if not families:
+    if not term_groups:
         return [0.0] * len(coordinates)
     q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
-    for term_group in families:
+    for term_group in term_groups:
         places, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
         values |= {slot: q[places[:, k]] for k, slot in enumerate(term_group.slots)}
         for symbol, column in zip(term_group.given, term_group.values, strict=True):
@@ -53,11 +53,11 @@ def array_forces(
 
 
 def exact_forces(
-    families: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
+    term_groups: Sequence[TermGroup], coordinates: Sequence[Symbol], known: Mapping[Any, Number]
 ) -> list[Number]:
     """Return the force on each coordinate at one point, in 60 digits."""
     force: list[Number] = [mp.zero] * len(coordinates)
-    for term_group in families:
+    for term_group in term_groups:
         shared_symbols = [symbol for symbol in known if symbol not in coordinates]
         tape = Tape(term_group.partials, (*term_group.slots, *term_group.given, *shared_symbols))
         shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()

@@ -73,7 +73,7 @@ class Rates:
         time: t.
         constants: default value by parameter; long numbers of the formula are parameters here.
         numbers: long numbers by the symbols that replace them.
-        families: term groups that contribute to the forces.
+        term_groups: term groups that contribute to the forces.
     """
 
     arguments: tuple[Symbol, ...]
@@ -84,7 +84,7 @@ class Rates:
     time: Symbol
     constants: Mapping[Symbol, float]
     numbers: Mapping[Symbol, sympy.Rational]
-    families: tuple[TermGroup, ...] = ()
+    term_groups: tuple[TermGroup, ...] = ()
 
     @property
     def closed(self) -> bool:
@@ -101,7 +101,7 @@ class Rates:
             size = 1.5 if k < m else generator.choice(SPREADS, count)
             values[argument] = size * generator.uniform(-1.0, 1.0, count)
         with np.errstate(all="ignore"):
-            group_forces = array_forces(self.families, self.arguments[:m], values, count)
+            group_forces = array_forces(self.term_groups, self.arguments[:m], values, count)
             return self._sample(
                 values, lambda expression: array_value(expression, values) + np.zeros(count), group_forces
             )
@@ -120,7 +120,7 @@ class Rates:
                 values[argument] = mp.mpf(size * generator.uniform(-1.0, 1.0))
             try:
                 known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
-                group_forces = exact_forces(self.families, self.arguments[: len(self.momenta)], values)
+                group_forces = exact_forces(self.term_groups, self.arguments[: len(self.momenta)], values)
                 found = self._sample(values, functools.partial(_known_or_evaluated, known, values), group_forces)
             except ArithmeticError:
                 continue
@@ -130,7 +130,7 @@ class Rates:
     @functools.cached_property
     def verifying(self) -> list[Sample]:
         """Points in 60 digits, empty if the system is defined nowhere; one suffices for term groups."""
-        count = 1 if self.families else VERIFIED_AT
+        count = 1 if self.term_groups else VERIFIED_AT
         for near in (False, True):
             drawn = drawn_parameters(self.constants, 1, near=near)
             found = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, count))
@@ -163,8 +163,8 @@ def _known_or_evaluated(known: Mapping[Expr, Number], values: Mapping[Symbol, Nu
     return evaluate(expression, {x: values[x] for x in expression.free_symbols})
 
 
-def rates_of(system: MechanicalSystem, families: tuple[TermGroup, ...] = ()) -> Rates:
-    """Return the rates of a system with term groups ``families``; long numbers are replaced by parameters."""
+def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) -> Rates:
+    """Return the rates of a system with term groups ``term_groups``; long numbers are replaced by parameters."""
     arguments, transformed = forms_of(system).legendre_arguments, forms_of(system).legendre
     forces = with_constraint_forces(system, forms_of(system).momentum_rate)
     numbers = _long_numbers((*transformed, *forces))
@@ -180,7 +180,7 @@ def rates_of(system: MechanicalSystem, families: tuple[TermGroup, ...] = ()) -> 
         time=system.time,
         constants=system.constants | {given: float(number) for given, number in numbers.items()},
         numbers=numbers,
-        families=families,
+        term_groups=term_groups,
     )
 
 

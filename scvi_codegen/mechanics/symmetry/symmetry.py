@@ -189,8 +189,8 @@ def _rigid(system: MechanicalSystem) -> list[Terms]:
     parts, columns = rolled(system), list[Polynomial](rigid_columns(system))
     if parts is None:
         return _combined(*_conserved_by(system, rates_of(system), columns))
-    motion = rates_of(parts.rest, parts.families)
-    of_few = replace(motion, families=terms_among_few_bodies(parts.families, bodies_of(system)))
+    motion = rates_of(parts.rest, parts.term_groups)
+    of_few = replace(motion, term_groups=terms_among_few_bodies(parts.term_groups, bodies_of(system)))
     rows, known = _conserved_by(parts.rest, of_few, columns)
     if not all(confirmed(motion, known, row) for row in rows):
         rows, known = _conserved_by(parts.rest, motion, columns)
