@@ -38,7 +38,7 @@ def unknowns(system, method, degree, velocity):
 def test_leading_displacements_are_legendre_coefficients_of_the_acceleration(name):
     """A random velocity of the degree of the curve. Its leading coefficient is proportional to h^degree."""
     system, method, degree = CASES[name]
-    curve = program_of(system, sc.methods.as_method(method), solver="newton").stage_curve
+    curve = program_of(system, sc.methods.as_method(method), solver="newton").equations.stage_curve
     velocity = Legendre(np.random.default_rng(7).normal(size=degree + 1), domain=[0, 1])
     z = unknowns(system, method, degree, velocity)
     highest, following, whole, half = (
