@@ -36,7 +36,15 @@ myst_heading_anchors = 3
 autodoc_typehints = "signature"
 maximum_signature_line_length = 90
 autodoc_type_aliases = {
-    name: name for name in ("Array", "ArrayLike", "Parameters", "EnsembleParameters", "Vector", "Number")
+    name: name
+    for name in (
+        "Array",
+        "ArrayLike",
+        "Parameters",
+        "EnsembleParameters",
+        "Vector",
+        "Number",
+    )
 }
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

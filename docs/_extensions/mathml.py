@@ -10,7 +10,8 @@ from sphinx.application import Sphinx
 __all__ = ["setup"]
 
 DOTTED = re.compile(
-    r"<munderover>\s*<mi>(\w)</mi>\s*(.*?)\s*(<mo stretchy=\"false\">˙</mo>)\s*</munderover>", re.DOTALL
+    r"<munderover>\s*<mi>(\w)</mi>\s*(.*?)\s*(<mo stretchy=\"false\">˙</mo>)\s*</munderover>",
+    re.DOTALL,
 )
 """Dotted letter with a subscript, which docutils translates with the subscript below the letter."""
 
@@ -25,7 +26,9 @@ def setup(app: Sphinx) -> dict[str, Any]:
 def _mathml(latex: str, *, as_block: bool) -> str:
     """Return MathML in which the index of a dotted letter is a subscript."""
     translated = tex2mathml(latex, as_block=as_block)
-    return DOTTED.sub(r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>', translated)
+    return DOTTED.sub(
+        r'<msub><mover accent="true"><mi>\1</mi>\3</mover>\2</msub>', translated
+    )
 
 
 def _inline(writer: Any, node: nodes.math) -> None:
@@ -34,5 +37,7 @@ def _inline(writer: Any, node: nodes.math) -> None:
 
 
 def _display(writer: Any, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="formula">{_mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(
+        f'<div class="formula">{_mathml(node.astext(), as_block=True)}</div>'
+    )
     raise nodes.SkipNode

@@ -19,15 +19,22 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def _resolve(
-    app: Sphinx, environment: BuildEnvironment, reference: pending_xref, content: nodes.Element
+    app: Sphinx,
+    environment: BuildEnvironment,
+    reference: pending_xref,
+    content: nodes.Element,
 ) -> nodes.reference | None:
     """Return the link for ``scvi_codegen.runtime.stepper.Stepper.step`` or ``Stepper.step``; None for other targets."""
     if reference.get("refdomain") != "py":
         return None
     parts = reference["reftarget"].split(".")
-    public = next((n for n, part in enumerate(parts) if part in scvi_codegen.__all__), None)
+    public = next(
+        (n for n, part in enumerate(parts) if part in scvi_codegen.__all__), None
+    )
     if public is None or not (public == 0 or parts[0] == "scvi_codegen"):
         return None
     target = ".".join(["scvi_codegen", *parts[public:]])
     domain = environment.domains["py"]
-    return domain.resolve_xref(environment, reference["refdoc"], app.builder, "obj", target, reference, content)
+    return domain.resolve_xref(
+        environment, reference["refdoc"], app.builder, "obj", target, reference, content
+    )
