@@ -23,14 +23,14 @@ SANITIZED = ("gcc", "-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sani
 
 @cache
 def is_sanitized() -> bool:
-    """Whether there is a compiler that has the sanitizers."""
+    """Return whether a compiler with sanitizers is available."""
     words = [*SANITIZED, "-x", "c", "-", "-o", os.devnull]
     empty = "int main(void) { return 0; }"
     return subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
 
 
 def output_of(program: str, folder: Path, *flags: str) -> str:
-    """What a program prints, compiled in a folder under the sanitizers."""
+    """Return the output of a program compiled in a folder with sanitizers."""
     needs(SANITIZED[0])
     if not is_sanitized():
         pytest.skip("no gcc with sanitizers here")

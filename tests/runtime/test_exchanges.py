@@ -1,4 +1,4 @@
-"""What forces give: work beside the energy, impulses beside the momentum maps, by curves and by quadrature."""
+"""Work and impulses of forces compared with energy and momentum maps, by curves and by quadrature."""
 
 import numpy as np
 import pytest
