@@ -166,7 +166,7 @@ def test_velocity_constraints_implied_by_configuration_constraints_are_dropped()
 
 
 def test_bicycle_has_the_constraints_of_its_wheels() -> None:
-    """One says where the front wheel touches, two that it rolls; the rear one's rolling is in the velocities."""
+    """Contact of the front wheel, its rolling (two), and the rear wheel whose rolling is in the velocities."""
     lengths = dict.fromkeys(("htangle", "WRrad", "WFrad", "framelength", "forkoffset", "forklength", "g"), 0.5)
     moments = [f"I{body}{axis}" for body in ("frame", "fork", "rear", "front") for axis in ("11", "22")]
     masses = [f"m{body}" for body in ("frame", "fork", "rear", "front")]

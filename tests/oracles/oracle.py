@@ -53,7 +53,7 @@ def cardinals(points: np.ndarray) -> list[np.ndarray]:
 
 
 def table(points: np.ndarray, at: np.ndarray, operation: Callable[[np.ndarray], np.ndarray] = np.array) -> np.ndarray:
-    """Values (slopes, integrals from 0) of the cardinal polynomials on ``points``, one row for each of ``at``."""
+    """Return values (derivatives, integrals from 0) of the cardinal polynomials on ``points``, a row per ``at``."""
     return _table(tuple(points), tuple(at), operation)
 
 

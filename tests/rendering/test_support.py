@@ -74,7 +74,7 @@ int main(void)
 
 
 def test_predictor_is_limited_to_the_available_tables(tmp_path):
-    """From the last step for every change of length that has a table; from two for every pair; from none beyond."""
+    """One step predicts across every tabulated change of size, two across every pair; others are not predicted."""
     assert REACH == 2
     lines = [list(map(int, line.split())) for line in output_of(LEVELS, tmp_path, f"-I{SUPPORT}").splitlines()]
     assert len(lines) == 2 * 13 * 13
