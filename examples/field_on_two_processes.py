@@ -142,14 +142,14 @@ def best(count: int, size: int) -> tuple[np.ndarray, float, float]:
 
 def main() -> None:
     """Compare bits, states, and times with those of the model."""
-    ring = sc.IndexedSystem.from_text(
+    ring = sc.LagrangianSystem.from_text(
         name="ring",
         coordinates=["q[N]"],
         lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/16)",
     )
     size = 16_000
     phase = 2 * np.pi * np.arange(size) / size
-    exact = sc.compile_indexed(ring, "gauss:4").integrate(np.sin(phase), velocity=np.cos(3 * phase), h=H, steps=STEPS)
+    exact = sc.compile_stepper(ring, "gauss:4").integrate(np.sin(phase), velocity=np.cos(3 * phase), h=H, steps=STEPS)
     one, two = (best(count, size)[0] for count in (1, 2))
     print("two processes have the bits of one:", bool((one == two).all()))
     print("and the states of the compiled integrator:", bool(np.abs(two - exact.q["q"][-1]).max() < 1e-14))

@@ -47,14 +47,12 @@ from scvi_codegen.frameworks.rebound import from_rebound as from_rebound
 from scvi_codegen.frameworks.rebound import to_rebound as to_rebound
 from scvi_codegen.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.frameworks.torch import torch_flow as torch_flow
-from scvi_codegen.indexed_compiler import compile_indexed as compile_indexed
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.indexed.rolling import RolledSums as RolledSums
 from scvi_codegen.mechanics.indexed.rolling import roll_sums as roll_sums
-from scvi_codegen.mechanics.indexed.system import IndexedSystem as IndexedSystem
 from scvi_codegen.mechanics.indexed.unrolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise

@@ -26,15 +26,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, cached_property, partial
+from typing import overload
 
+from numpy.typing import ArrayLike
 from sympy import Expr
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
+from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
@@ -44,8 +48,11 @@ from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.lowering.step_density import density_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
+from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
+from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, SYSTEM_OR_ARRAYS, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
@@ -66,10 +73,12 @@ from scvi_codegen.rendering.program_source import (
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
 from scvi_codegen.runtime.events import EventLike, as_events
+from scvi_codegen.runtime.indexed_interface import IndexedInterface
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.validation.argument_types import SWITCH, TEXT, TEXTS, checks_arguments
+from scvi_codegen.validation.argument_types import MAPPING, SWITCH, TEXT, TEXTS, checks_arguments
 
-__all__ = ["c_identifier", "compile_stepper", "describe", "generate_source", "program_of"]
+__all__ = ["c_identifier", "compile_stepper", "describe", "generate_array_source", "generate_source", "program_of"]
 
 LONGEST_PREFIX = 64
 C_HEADERS = frozenset(
@@ -81,7 +90,16 @@ C_HEADERS = frozenset(
 SOLVERS = ("auto", "explicit", "fixed-point", "newton")
 
 
-@checks_arguments(system=SYSTEM, solver=TEXT, flags=TEXTS, prefix=TEXT, symmetries=SYMMETRIES)
+@overload
+def compile_stepper(
+    system: ArraySystem,
+    method: Method | str,
+    *,
+    solver: str = "auto",
+    flags: tuple[str, ...] = TUNED_FLAGS,
+    prefix: str | None = None,
+) -> IndexedStepper: ...
+@overload
 def compile_stepper(
     system: MechanicalSystem,
     method: Method | str,
@@ -92,7 +110,31 @@ def compile_stepper(
     symmetries: Sequence[Symmetry] = (),
     events: EventLike | Sequence[EventLike] | None = None,
     time_transformation: str | Expr | None = None,
-) -> Stepper:
+    sizes: Mapping[str, int] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+) -> Stepper: ...
+@checks_arguments(
+    system=SYSTEM_OR_ARRAYS,
+    solver=TEXT,
+    flags=TEXTS,
+    prefix=TEXT,
+    symmetries=SYMMETRIES,
+    sizes=MAPPING,
+    tables=MAPPING,
+)
+def compile_stepper(
+    system: MechanicalSystem | ArraySystem,
+    method: Method | str,
+    *,
+    solver: str = "auto",
+    flags: tuple[str, ...] = TUNED_FLAGS,
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
+    time_transformation: str | Expr | None = None,
+    sizes: Mapping[str, int] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
+) -> Stepper | IndexedStepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
     Args:
@@ -112,11 +154,26 @@ def compile_stepper(
             :func:`~scvi_codegen.reparametrise`. Runs with h and t_end then take constant steps h in tau, dt = g dtau,
             by the reversible controller of Hairer and Soederlind; time-dependent and forced systems are supported.
             Momentum maps are preserved.
+        sizes: whole numbers for the sizes of arrays, ``{"N": 8}``: the system of all entries q_0, q_1, .. is compiled,
+            which has every feature. Without them arrays have the sizes that each run gives them: neither the length of
+            the C source nor its compile time depends on the number of coordinates, and the solver is ``"fixed-point"``,
+            without fallback, or ``"newton"``, Newton-GMRES with Jacobian-vector products of the forces, preconditioned
+            by the diagonal of the Jacobian or, on lattices, by its circulant (Fourier) average. Methods are explicit,
+            or have a fixed-point iteration over stage positions (SVI, SC, Runge-Kutta).
+        tables: with ``sizes``, index tables of shape (rows, columns) by name.
 
     Raises:
         BuildError: if there is no C compiler.
-        MethodError: if the solver is not available for the method.
+        MethodError: if the method, the solver or another argument is not available for the system.
     """
+    if sizes is not None or tables is not None:
+        system = unroll_sums(system, sizes or {}, tables=tables)
+    if isinstance(system, ArraySystem):
+        _check_sizes_not_needed(system, symmetries=symmetries, events=events, time_transformation=time_transformation)
+        array_sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
+        return IndexedStepper(
+            array_sources.plain, array_sources.interface, controlled=lambda: array_sources.controlled, flags=flags
+        )
     sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, time_transformation)
     own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
     source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
@@ -132,6 +189,17 @@ def compile_stepper(
         flags=flags,
         events=as_events(events),
     )
+
+
+def _check_sizes_not_needed(system: ArraySystem, **arguments: object) -> None:
+    """Raise an error for an argument that requires known sizes."""
+    for name, value in arguments.items():
+        if value:
+            sizes = ", ".join(f"'{size}': 8" for size in system.sizes)
+            raise MethodError(
+                f"{name} is not available for arrays of '{system.name}', whose sizes are known at run time only: omit "
+                f"it, or give sizes={{{sizes}}}"
+            )
 
 
 class _Sources:
@@ -229,6 +297,80 @@ class _Sources:
 
 def _json_of(source: Source | None) -> str:
     return "" if source is None else source.to_json()
+
+
+class _ArraySources:
+    """C sources of one integrator of arrays whose sizes are known at run time, derived on first use.
+
+    ArraySystem, Method -> lower -> Program (kernels of terms, tables of one coordinate) -> render -> Source.
+    """
+
+    def __init__(self, system: ArraySystem, method: Method, solver: str, prefix: str | None) -> None:
+        self.solver = "fixed-point" if solver == "auto" else solver
+        check_solver_of_arrays(self.solver)
+        system.check_run_time_sizes()
+        self.system, self.method = system, method
+        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
+
+    @cached_property
+    def program(self) -> Program:
+        """Lowered program with fixed step size."""
+        with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
+            return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
+
+    @cached_property
+    def plain(self) -> Source:
+        """C source with fixed step size."""
+        return Source.from_json(self._remembered("indexed", lambda: render(self.program).to_json()))
+
+    @cached_property
+    def controlled(self) -> Source | None:
+        """C source with adaptive steps; ``None`` if the method has no error estimate."""
+
+        def text() -> str:
+            control = control_of(self.program)
+            return render(self.program, control).to_json() if control else ""
+
+        found = self._remembered("indexed controlled", text)
+        return Source.from_json(found) if found else None
+
+    def _remembered(self, what: str, make: Callable[[], str]) -> str:
+        return cached_source((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
+
+    @property
+    def interface(self) -> IndexedInterface:
+        """Interface of the generated library."""
+        system, method = self.system, self.method
+        return IndexedInterface(
+            prefix=self.prefix,
+            title=f"{system.name}: {method.title}",
+            system=system.name,
+            method=method.name,
+            sizes=system.sizes,
+            coordinates=system.coordinates,
+            momenta=system.momenta,
+            fields=system.fields,
+            tables=system.tables,
+            parameters=tuple(parameter.name for parameter in system.parameters),
+            defaults=system.defaults,
+            field_defaults=system.field_defaults,
+            maps=momentum_maps(system),
+            accesses=system.accesses,
+            depends_on_time=system.depends_on_time,
+            inputs=system.inputs,
+            constraints=tuple(term.loops for term in system.constraints),
+            conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
+            continued=not (method.fractions or system.constraints),
+            solver="rattle" if system.constraints else self.solver,
+        )
+
+
+def generate_array_source(
+    system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
+) -> tuple[Source, IndexedInterface]:
+    """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
+    sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
+    return sources.plain, sources.interface
 
 
 @checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
@@ -368,9 +510,19 @@ def describe(
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,
+        arrays=_arrays_of(system),
         energy_parameter=system.clock.energy.name if system.clock else "",
         solver=_solver_of(program),
     )
+
+
+def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
+    """Return the declarations of the arrays whose entries are all of the coordinates, or parameters."""
+    names = [each.name for each in (*system.coordinates, *system.parameters)]
+    known = [array for array in system.arrays if set(array.elements) <= set(names)]
+    listed = [name for array in known for name in array.elements]
+    whole = listed[: system.dimension] == names[: system.dimension]
+    return tuple(str(array) for array in known if array.axes or whole) if whole else ()
 
 
 def _solver_of(program: Program) -> str:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 __all__ = ["Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
 
@@ -47,7 +48,10 @@ def offset_text(name: str, number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """Declaration of an array: name and size of each axis; the last axis of an index table is a whole number."""
+    """Declaration of an array: name and size of each axis; the last axis of an index table is a whole number.
+
+    A single coordinate is an array without axes.
+    """
 
     name: str
     axes: tuple[Size, ...]
@@ -62,7 +66,12 @@ class Array:
         return tuple(axis.name for axis in self.axes if axis.name)
 
     def __str__(self) -> str:
-        return f"{self.name}[{', '.join(map(str, self.axes))}]"
+        return f"{self.name}[{', '.join(map(str, self.axes))}]" if self.axes else self.name
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the entries of an array of known sizes, ``q_0``, .., the last axis running fastest."""
+        return tuple("_".join([self.name, *map(str, place)]) for place in product(*map(range, self.shape({}))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +137,7 @@ class Access:
         return frozenset(place.index for place in self.places if place.index)
 
     def __str__(self) -> str:
-        return f"{self.array.name}[{', '.join(map(str, self.places))}]"
+        return f"{self.array.name}[{', '.join(map(str, self.places))}]" if self.places else self.array.name
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from scvi_codegen.benchmark.drift import fitted_rate
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, breather, cloth, field, ring, waves
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["run_energies"]
@@ -63,7 +63,7 @@ def run_energies(plan: Plan, report_activity: ReportActivity) -> ResultTable:
 
 
 def _row(each: Lattice, method: str, h: float, steps: int) -> dict[str, Any]:
-    stepper = compile_indexed(each.system, method)
+    stepper = compile_stepper(each.system, method)
     arguments: dict[str, Any] = {"parameters": each.parameters, "tables": each.tables}
     began = time.process_time()
     run = stepper.integrate(

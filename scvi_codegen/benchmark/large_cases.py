@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Array
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 
 __all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "waves"]
 
@@ -25,7 +25,7 @@ class Lattice(NamedTuple):
     """
 
     name: str
-    system: IndexedSystem
+    system: ArraySystem
     q: Array
     v: Array
     span: float
@@ -47,7 +47,7 @@ def ring(count: int, span: float) -> Lattice:
 
     return Lattice(
         name="ring",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="ring",
             coordinates=["q[N]"],
             parameters={"beta": beta},
@@ -77,7 +77,7 @@ def field(side: int, span: float) -> Lattice:
 
     return Lattice(
         name="field",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="field",
             coordinates=["u[NX, NY]"],
             parameters={"w": 1 / dx**2},
@@ -106,7 +106,7 @@ def bodies(count: int, span: float) -> Lattice:
 
     return Lattice(
         name="bodies",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="bodies",
             coordinates=["r[N, 3]"],
             parameters={"m": 1, "e": softening},
@@ -137,7 +137,7 @@ def atoms(cells: int, span: float) -> Lattice:
 
     return Lattice(
         name="atoms",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="atoms",
             coordinates=["r[N, 3]"],
             lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(i < j in N, "
@@ -163,7 +163,7 @@ def waves(count: int, span: float) -> Lattice:
     phase = 2.0 * np.pi * np.arange(count) / count
     return Lattice(
         name="waves",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="waves",
             coordinates=["q[N]"],
             lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 - q[i]**4/4)- sum(i in N periodic, (q[i+1] - q[i])**2/2)",
@@ -190,7 +190,7 @@ def breather(count: int, span: float) -> Lattice:
     x = dx * (np.arange(count) - count // 2)
     return Lattice(
         name="breather",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="breather",
             coordinates=["u[N]"],
             parameters={"w": 1 / dx**2},
@@ -223,7 +223,7 @@ def cloth(side: int, span: float) -> Lattice:
 
     return Lattice(
         name="cloth",
-        system=IndexedSystem.from_text(
+        system=ArraySystem.from_text(
             name="cloth",
             coordinates=["r[N, 3]"],
             parameters={"k": 100},

@@ -23,7 +23,7 @@ from scvi_codegen.benchmark.machine_limits import machine_limits
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.benchmark.work_precision import Point, time_at
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
@@ -150,7 +150,7 @@ def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]
 
 
 def _ours(each: Lattice, method: Any, steps: int) -> Callable[[], Array]:
-    stepper, name = compile_indexed(each.system, method), each.system.coordinates[0].name
+    stepper, name = compile_stepper(each.system, method), each.system.coordinates[0].name
 
     def run() -> Array:
         result = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)

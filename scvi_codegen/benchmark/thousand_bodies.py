@@ -12,7 +12,7 @@ from scvi_codegen.benchmark.large_cases import Lattice, bodies
 from scvi_codegen.benchmark.lattices import reference_of, rms
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 
 __all__ = ["run_thousand_bodies"]
@@ -61,7 +61,7 @@ def _timed(settle: Callable[[], State]) -> tuple[float, State]:
 
 
 def _energies(each: Lattice) -> Callable[[State], float]:
-    stepper = compile_indexed(each.system, "stoermer-verlet")
+    stepper = compile_stepper(each.system, "stoermer-verlet")
     return lambda state: stepper.start(state[0], velocity=state[1], h=1.0, parameters=each.parameters).energy
 
 
@@ -78,7 +78,7 @@ def _contenders(each: Lattice, plan: Plan) -> Iterator[tuple[str, int | None, Ca
 
 
 def _ours(each: Lattice, method: str, steps: int) -> Callable[[], State]:
-    stepper = compile_indexed(each.system, method)
+    stepper = compile_stepper(each.system, method)
 
     def settle() -> State:
         run = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)

@@ -11,7 +11,7 @@ from scvi_codegen.benchmark.contenders.contenders import OURS
 from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, cloth, ring
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.indexed_run import IndexedRun
 
@@ -67,7 +67,7 @@ def _problems(plan: Plan) -> Iterator[tuple[Lattice, float]]:
 
 
 def _row(each: Lattice, method: str, h: float, numbers: list[int], plan: Plan) -> dict[str, Any]:
-    stepper = compile_indexed(each.system, method)
+    stepper = compile_stepper(each.system, method)
     arguments: dict[str, Any] = {"h": h, "parameters": each.parameters, "tables": each.tables}
     runs = {threads: stepper.start(each.q, velocity=each.v, threads=threads, **arguments) for threads in (1, *numbers)}
     for run in runs.values():

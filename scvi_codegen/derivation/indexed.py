@@ -15,7 +15,7 @@ from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import lower_arrays
 from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms, constraint_text
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.methods.method import Method
 
 __all__ = ["derive_sums"]
@@ -23,7 +23,7 @@ __all__ = ["derive_sums"]
 DIGITS = 17
 
 
-def derive_sums(system: IndexedSystem, method: Method, *, as_latex: bool = False) -> str:
+def derive_sums(system: ArraySystem, method: Method, *, as_latex: bool = False) -> str:
     """Return the compiled kernels, with the loops around them, and the equations of a step, as text or LaTeX.
 
     Raises:
@@ -35,7 +35,7 @@ def derive_sums(system: IndexedSystem, method: Method, *, as_latex: bool = False
     return "\n".join([*_text(system), "", *_step(program, method)])
 
 
-def _text(system: IndexedSystem) -> Iterator[str]:
+def _text(system: ArraySystem) -> Iterator[str]:
     yield str(system)
     yield ""
     yield "Terms of -H, and their derivatives:" if system.momenta else "Terms of -V, and what each adds to the forces:"
@@ -63,7 +63,7 @@ def _loops_text(loops: Sequence[object], formula: Expr) -> str:
     return f"for {', '.join(map(str, loops))}: {formula}" if loops else str(formula)
 
 
-def _latex(system: IndexedSystem) -> Iterator[str]:
+def _latex(system: ArraySystem) -> Iterator[str]:
     """Yield one line each, in display mode."""
     yield rf"\[ {system.latex} \]"
     for term, partials in system.kernels:

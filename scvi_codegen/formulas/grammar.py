@@ -47,7 +47,7 @@ _SPACE = re.compile(r"[ \t\r\n\f]*")
 
 _HINTS = {
     ".": "attribute access is not part of the grammar",
-    "[": "subscripts and lists are not part of the grammar; arrays, q[i], are those of IndexedSystem",
+    "[": "subscripts require arrays, declared among the coordinates or parameters, as q[N]",
     "^": "powers are written x**2",
     "=": "comparisons, assignments and keyword arguments are not part of the grammar",
     "<": "comparisons are not part of the grammar",

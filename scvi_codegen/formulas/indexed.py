@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
-__all__ = ["Bound", "IndexedParser", "IndexedTerm", "parse_array", "parse_indexed", "term_of"]
+__all__ = ["Bound", "IndexedParser", "IndexedTerm", "parse_array", "parse_coordinate", "parse_indexed", "term_of"]
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
@@ -62,6 +62,18 @@ def parse_array(text: str) -> Array:
         ExpressionError: for other text.
     """
     return _Declaration(text, {}).read()
+
+
+def parse_coordinate(text: str) -> Array:
+    """Parse the declaration of an array of coordinates, ``"q[N]"``, or the name of a single coordinate, ``"x"``.
+
+    Raises:
+        ExpressionError, SystemDefinitionError: for other text.
+    """
+    if "[" in text:
+        return parse_array(text)
+    check_name(text)
+    return Array(text, ())
 
 
 def parse_indexed(
@@ -221,7 +233,7 @@ class IndexedParser(_Indices):
                 break
             loops += self.loop()
         inner = any(isinstance(bound, Loop) for bound in self.bound.values())
-        if inner or all(not loop.first.name and not loop.end.name for loop in loops):
+        if inner or (self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)):
             return self.written_out(loops, column)
         self.bound |= {loop.index: loop for loop in loops}
         formula = self.sum()
@@ -307,9 +319,9 @@ class IndexedParser(_Indices):
 
     def entry(self, array: Array, column: int) -> Expr:
         """Parse ``[indices]`` after the name of an array."""
-        if self.peek().text != "[":
+        if array.axes and self.peek().text != "[":
             self.refuse(f"'{array.name}' is an array: write {array}", column)
-        places = self.brackets(array, column)
+        places = self.brackets(array, column) if array.axes else ()
         access = Access(array=array, places=places)
         slot = symbol(str(access))
         self.accesses[slot] = access

@@ -88,6 +88,8 @@ class _Target(IndexedParser):
             known = ", ".join(map(str, self.arrays.values()))
             self.refuse(f"a force must act on coordinates, {known}, not on '{token.text}'", token.column)
         array, bounds = self.arrays[token.text], dict[str, Size]()
+        if not array.axes:
+            return bounds
         self.expect("[")
         for number, axis in enumerate(array.axes):
             if number:

@@ -79,7 +79,7 @@ def name_of_key(key: object) -> str:
 def check_name(name: object) -> None:
     """Raise :class:`SystemDefinitionError` for names that are invalid in C or in formulas."""
     if not isinstance(name, str) or not IDENTIFIER.fullmatch(name):
-        arrays = "; arrays are those of IndexedSystem" if isinstance(name, str) and "[" in name else ""
+        arrays = "; arrays are declared among the coordinates, as q[N]" if isinstance(name, str) and "[" in name else ""
         raise SystemDefinitionError(
             f"{name!r} is not a valid name: use letters a-z, A-Z, digits and underscores, beginning "
             f"with a letter{arrays}"

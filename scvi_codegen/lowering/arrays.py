@@ -18,7 +18,7 @@ from scvi_codegen.lowering.solvers.selection import iteration_of
 from scvi_codegen.lowering.solvers.separable import separable_iteration
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
@@ -36,7 +36,7 @@ def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) ->
         raise error(f"unknown solver {solver!r} of an indexed system: use {' or '.join(map(repr, SOLVERS))}")
 
 
-def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
+def one_coordinate(system: ArraySystem) -> MechanicalSystem:
     """Return a system with one coordinate and the same form, from which a method's tables are taken."""
     if system.momenta:
         hamiltonian = "(x**2 + p_x**2)**2"  # of no special form
@@ -44,7 +44,7 @@ def one_coordinate(system: IndexedSystem) -> MechanicalSystem:
     return LagrangianSystem.from_text(name=system.name, coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
 
 
-def lower_arrays(system: IndexedSystem, method: Method, prefix: str, *, newton: bool = False) -> Program:
+def lower_arrays(system: ArraySystem, method: Method, prefix: str, *, newton: bool = False) -> Program:
     """Return the program of a system by a method, by fixed-point iteration or Newton's method.
 
     Raises:

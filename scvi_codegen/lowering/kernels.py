@@ -13,7 +13,7 @@ from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.mechanics.indexed.masses import MassTerm
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["comment_text", "damping_kernel", "integrand_kernel", "looped_kernel", "system_kernel"]
@@ -65,7 +65,7 @@ def system_kernel(
 
 
 def looped_kernel(
-    system: IndexedSystem,
+    system: ArraySystem,
     name: str,
     values: Iterable[Expr],
     of: IndexedTerm | IndexedForce | MassTerm,

@@ -41,7 +41,7 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
 def is_lattice(array: Array) -> bool:
     """Return whether an array has named axes, all before those of integer size."""
     named = [bool(axis.name) for axis in array.axes]
-    return named[0] and named == sorted(named, reverse=True)
+    return bool(named) and named[0] and named == sorted(named, reverse=True)
 
 
 def _same_loops(one: Access, other: Access) -> bool:

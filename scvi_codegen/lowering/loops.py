@@ -18,14 +18,13 @@ from scvi_codegen.ir.numbers import exact_number
 from scvi_codegen.ir.program import LoopedTerms, Program
 from scvi_codegen.lowering.kernels import looped_kernel
 from scvi_codegen.lowering.lattices import reach_of
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
-from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
 __all__ = ["looped_terms", "with_sums"]
 
 
-def looped_terms(system: IndexedSystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
+def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
     potentials = [_force(system, term, number) for number, term in enumerate(system.potentials)]
     products, diagonals = _jacobian(system) if newton else ((), ())
@@ -69,7 +68,7 @@ def looped_terms(system: IndexedSystem, constrained: ConstrainedSteps | None, *,
     )
 
 
-def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKernel:
+def _force(system: ArraySystem, term: IndexedTerm, number: int) -> LoopedKernel:
     """Return the derivatives of a term with respect to its coordinates and momenta, and the term itself."""
     moving = [pair for pair in term.slots if pair[1].array in system.state]
     partials = gradient(term.formula, [slot for slot, _ in moving])
@@ -81,14 +80,14 @@ def _force(system: IndexedSystem, term: IndexedTerm, number: int) -> LoopedKerne
     return replace(looped, scalar=scalar.kernel)
 
 
-def _jacobian(system: IndexedSystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
+def _jacobian(system: ArraySystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
     """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
     found = [_derived(system, term, number) for number, term in enumerate(_all_forces(system))]
     pairs = [pair for pair in found if pair]
     return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
 
 
-def _all_forces(system: IndexedSystem) -> Iterator[IndexedForce]:
+def _all_forces(system: ArraySystem) -> Iterator[IndexedForce]:
     """Yield all forces, those of the potentials by their slots."""
     for term in system.potentials:
         moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
@@ -98,7 +97,7 @@ def _all_forces(system: IndexedSystem) -> Iterator[IndexedForce]:
     yield from system.forces
 
 
-def _derived(system: IndexedSystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
+def _derived(system: ArraySystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
     """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on positions."""
     moving = [pair for pair in force.slots if pair[1].array in system.state]
     u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
@@ -129,38 +128,45 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
 
     ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
     """
-    rest, energy, sign = of.rest, program.quantities.energy, -1 if of.rest.auxiliaries else 1
-    forces, terms = [], []
-    for number, group in enumerate(of.term_groups):
-        first = ((0,),) * len(group.places)
-        forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
-        terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
-    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(tuple(forces)), program.splitting
+    forces = tuple(_forces(of, group, number) for number, group in enumerate(of.term_groups))
+    energies = tuple(_energy(of, group, number) for number, group in enumerate(of.term_groups))
+    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(forces), program.splitting
+    energy = program.quantities.energy
     if program.newton or energy is None or not (fixed_point or splitting):
         return None
     return replace(
         program,
-        quantities=replace(program.quantities, energy=energy.with_sums(tuple(terms))),
+        quantities=replace(program.quantities, energy=energy.with_sums(energies)),
         fixed_point=fixed_point,
-        splitting=replace(splitting, force=splitting.force.with_sums(tuple(forces))) if splitting else None,
+        splitting=replace(splitting, force=splitting.force.with_sums(forces)) if splitting else None,
     )
 
 
-def _over_terms(
-    system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+def _forces(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
+    return _summed(of, f"pull_{number}", group, group.partials, ())
+
+
+def _energy(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
+    value = -group.formula if of.rest.auxiliaries else group.formula
+    return _summed(of, f"term_{number}", group, (value,), ((0,),) * len(group.places))
+
+
+def _summed(
+    of: SplitSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
 ) -> LoopedKernel:
-    """Return the loop over the terms of a group."""
-    kernel = lower_kernel(
+    system = of.rest
+    places = {parameter: k for k, parameter in enumerate(system.parameters)}
+
+    def constant(value: Expr) -> Constant | Load:
+        return Load("parameters", places[value]) if value in places else Constant(exact_number(value))
+
+    term = lower_kernel(
         name,
         arguments=(*group.slots, *group.given),
         time=system.time,
         parameters=system.parameters,
-        values=values,
+        values=tuple(values),
         constants=len(group.given),
     )
-    index = {parameter: k for k, parameter in enumerate(system.parameters)}
-    given = tuple(
-        tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
-        for column in group.values
-    )
-    return LoopedKernel.over_rows(kernel, group.places, given, targets)
+    given = tuple(tuple(map(constant, column)) for column in group.values)
+    return LoopedKernel.over_rows(term, group.places, given, targets)

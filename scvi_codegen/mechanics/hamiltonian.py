@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import sympy
 from sympy import Expr, Symbol
@@ -24,6 +24,8 @@ from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
+from scvi_codegen.mechanics.indexed.elements import unrolled_fields
+from scvi_codegen.mechanics.indexed.system import ArrayHamiltonian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import legendre_dual
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
@@ -91,6 +93,7 @@ class HamiltonianSystem(MechanicalSystem):
         damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
+        tables=TEXTS,
     )
     def from_text(
         cls,
@@ -104,27 +107,46 @@ class HamiltonianSystem(MechanicalSystem):
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
+        tables: Sequence[str] = (),
     ) -> HamiltonianSystem:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
+        Arrays are declared and treated as in :meth:`LagrangianSystem.from_text`.
+
         Args:
             name: name of the system.
-            coordinates: names of the coordinates.
+            coordinates: names of the coordinates, and declarations of arrays, ``["x", "q[N]"]``.
             hamiltonian: the formula; it may span several lines.
-            momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
-            parameters: default value by name.
+            momenta: names of the momenta, declared as the coordinates are; by default ``p_`` before the name of the
+                coordinate.
+            parameters: default value by name, or of all entries by declaration of an array.
             forces: formula by coordinate, in coordinates, momenta and time, added to the rate of its momentum.
             damping: damping rate of all momenta, a number or a formula of parameters
                 (:mod:`scvi_codegen.mechanics.damping`).
             constraints: must be empty; :func:`lagrangian_of` accepts constraints.
             inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
+            tables: declarations of index tables.
 
         >>> HamiltonianSystem.from_text(
         ...     name="pendulum", coordinates=["q"], momenta=["p"], hamiltonian="p**2/2 - cos(q)"
         ... ).lagrangian
         -p**2/2 + p*q_dot + cos(q)
         """
+        if are_arrays(coordinates, parameters or (), tables):
+            found = ArraySystem.from_text(
+                name=name,
+                coordinates=coordinates,
+                hamiltonian=hamiltonian,
+                momenta=momenta,
+                parameters=parameters,
+                tables=tables,
+                forces=forces,
+                damping=damping,
+                inputs=inputs,
+                constraints=constraints,
+            )
+            return cast(HamiltonianSystem, found) if found.sizes else cls(**unrolled_fields(found, {}))
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
         values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs), names)
@@ -246,6 +268,9 @@ class HamiltonianSystem(MechanicalSystem):
 
     def _repr_latex_(self) -> str:
         return rf"$\displaystyle H = {sympy.latex(self.hamiltonian)}$"
+
+
+HamiltonianSystem.register(ArrayHamiltonian)
 
 
 @checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import sympy
 from sympy import Expr, Symbol
@@ -18,6 +18,8 @@ from scvi_codegen.formulas.translation import Translation, sympy_expression
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
+from scvi_codegen.mechanics.indexed.elements import unrolled_fields
+from scvi_codegen.mechanics.indexed.system import ArrayLagrangian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -99,6 +101,7 @@ class LagrangianSystem(MechanicalSystem):
         damping=FORMULA,
         constraints=TEXTS,
         inputs=NAMES,
+        tables=TEXTS,
     )
     def from_text(
         cls,
@@ -112,14 +115,20 @@ class LagrangianSystem(MechanicalSystem):
         damping: str | float | None = None,
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
+        tables: Sequence[str] = (),
     ) -> LagrangianSystem:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
+        With arrays the grammar is that of :mod:`scvi_codegen.formulas.indexed`. If all their sizes are numbers, their
+        entries are coordinates q_0, q_1, .. like all others. Otherwise the sizes follow from the arrays of a run, or
+        from ``sizes`` of :func:`~scvi_codegen.compile_stepper`.
+
         Args:
             name: name of the system.
-            coordinates: names of the coordinates; the velocity of ``q`` is written ``q_dot``, time ``t``.
+            coordinates: names of the coordinates, and declarations of arrays, ``["x", "q[N]", "r[N, 3]"]``, whose sizes
+                are names or whole numbers; the velocity of ``q`` is written ``q_dot``, time ``t``.
             lagrangian: the formula; it may span several lines.
-            parameters: default value by name.
+            parameters: default value by name, or of all entries by declaration of an array, ``{"k": 1, "m[N]": 1}``.
             forces: formula by coordinate, in coordinates, velocities and time (:mod:`scvi_codegen.mechanics.forces`).
             dissipation: Rayleigh's function D(q, q_dot, t), whose forces -dD/dq_dot are added to them.
             damping: damping rate of all momenta, a number or a formula of parameters
@@ -128,13 +137,34 @@ class LagrangianSystem(MechanicalSystem):
                 formulas linear in velocities are nonholonomic (:mod:`scvi_codegen.mechanics.constraints`).
             inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
+            tables: declarations of index tables with their columns, ``["bonds[B, 2]", "pins[P]"]``.
 
         >>> oscillator = LagrangianSystem.from_text(
         ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2",
         ...     parameters={"m": 1, "k": 2, "c": 0.1}, forces={"x": "cos(t)"}, dissipation="c*x_dot**2/2")
         >>> oscillator.lagrangian, oscillator.forces
         (-k*x**2/2 + m*x_dot**2/2, (-c*x_dot + cos(t),))
+        >>> chain = LagrangianSystem.from_text(
+        ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
+        ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
+        >>> print(chain)
+        chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
+        if are_arrays(coordinates, parameters or (), tables):
+            return cls._of_arrays(
+                ArraySystem.from_text(
+                    name=name,
+                    coordinates=coordinates,
+                    lagrangian=lagrangian,
+                    parameters=parameters,
+                    tables=tables,
+                    forces=forces,
+                    dissipation=dissipation,
+                    damping=damping,
+                    inputs=inputs,
+                    constraints=constraints,
+                )
+            )
         values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs))
         velocities = [coordinate + DOT for coordinate in coordinates]
@@ -171,13 +201,14 @@ class LagrangianSystem(MechanicalSystem):
         forces=MAPPED,
         constraints=FORMULAS,
         inputs=FORMULAS,
+        tables=TEXTS,
     )
     def from_sympy(
         cls,
         *,
         name: str,
         lagrangian: Expr,
-        coordinates: Sequence[Expr],
+        coordinates: Sequence[Expr | str],
         velocities: Sequence[Expr] | None = None,
         time: Symbol | None = None,
         parameters: Mapping[Any, float] | None = None,
@@ -186,6 +217,7 @@ class LagrangianSystem(MechanicalSystem):
         damping: Expr | float | None = None,
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
+        tables: Sequence[str] = (),
     ) -> LagrangianSystem:
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 
@@ -205,7 +237,30 @@ class LagrangianSystem(MechanicalSystem):
             damping: damping rate of all momenta, an expression in parameters.
             constraints: expressions in coordinates, time and, linearly, velocities that are 0, or equations ``Eq``.
             inputs: functions of time, symbols or names whose values are passed to each run.
+            tables: declarations of index tables, as of :meth:`from_text`.
+
+        With arrays, ``coordinates`` and ``parameters`` are as of :meth:`from_text`, and the Lagrangian consists of
+        ``Sum`` and ``Indexed``: a periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``,
+        a table entry is ``q[bonds[b, 0]]``, the velocity of ``q[i]`` is that of ``IndexedBase("q_dot")``.
+
+        >>> from sympy import IndexedBase, Sum, symbols
+        >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
+        >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
+        >>> LagrangianSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
+        LagrangianSystem(name='chain', coordinates=(q[N]))
         """
+        if are_arrays(c for c in coordinates if isinstance(c, str)):
+            if any(each for each in (velocities, forces, dissipation, damping, constraints, inputs)):
+                raise SystemDefinitionError(
+                    "from_sympy reads the Lagrangian, parameters and tables of a system with arrays: give the rest "
+                    "as text to from_text"
+                )
+            names: list[Any] = list(coordinates)
+            return cls._of_arrays(
+                ArraySystem.from_sympy(
+                    name=name, coordinates=names, lagrangian=lagrangian, parameters=parameters, tables=tables
+                )
+            )
         lagrangian = sympy_expression(lagrangian, "Lagrangian")
         acting = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
         friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
@@ -241,6 +296,11 @@ class LagrangianSystem(MechanicalSystem):
         )
         warn_of_mistakes(system)
         return system
+
+    @classmethod
+    def _of_arrays(cls, system: ArraySystem) -> LagrangianSystem:
+        """Return the system of named coordinates of arrays of known sizes, others as they are."""
+        return cast(LagrangianSystem, system) if system.sizes else cls(**unrolled_fields(system, {}))
 
     @classmethod
     @checks_arguments(SystemDefinitionError, method=LAGRANGES_METHOD)
@@ -335,6 +395,9 @@ class LagrangianSystem(MechanicalSystem):
             for coordinate, velocity in zip(self.coordinates, self.velocities, strict=True)
         }
         return rf"$\displaystyle L = {sympy.latex(self.lagrangian, symbol_names=dotted)}$"
+
+
+LagrangianSystem.register(ArrayLagrangian)
 
 
 def _forces(

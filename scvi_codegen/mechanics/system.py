@@ -34,8 +34,9 @@ from scvi_codegen.formulas.inputs import inputs_by_name
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.damping import check_damping
-from scvi_codegen.validation.argument_types import of
+from scvi_codegen.validation.argument_types import ArgumentType, of
 
 __all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "named_parameters"]
 
@@ -79,6 +80,7 @@ class MechanicalSystem(ABC):
         inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.constraints`).
+        arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
     """
 
     name: str
@@ -91,6 +93,7 @@ class MechanicalSystem(ABC):
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
     damping: Expr = sympy.S.Zero
+    arrays: tuple[Array, ...] = ()
 
     @property
     @abstractmethod
@@ -273,5 +276,12 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
     return given
 
 
-SYSTEM = of("a LagrangianSystem or a HamiltonianSystem (an IndexedSystem goes to compile_indexed)", MechanicalSystem)
+SYSTEM = ArgumentType(
+    "a LagrangianSystem or a HamiltonianSystem; of one with arrays the sizes must be known, as coordinates=['q[8]'] or "
+    "unroll_sums(system, {'N': 8})",
+    lambda value: MechanicalSystem in type(value).__mro__,  # systems of arrays of run-time sizes are registered only
+)
 """Type check of mechanical systems, for :func:`~scvi_codegen.validation.argument_types.takes`."""
+
+SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
+"""Type check of systems, also of those with arrays of run-time sizes."""

@@ -51,7 +51,7 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.indexed import parse_array
 from scvi_codegen.indices import Array
 from scvi_codegen.lowering.arrays import SOLVERS, one_coordinate
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.array_values import is_filled, read_array
 from scvi_codegen.models.indexed_model import IndexedModel
@@ -171,7 +171,7 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, str | list | dict)
 
 
-def _read_system(document: Document) -> IndexedSystem:
+def _read_system(document: Document) -> ArraySystem:
     section, parameters = document.get("system", {}), document["parameters"]
     check_one(section, "system", "lagrangian", "hamiltonian")
     kind = "hamiltonian" if "hamiltonian" in section else "lagrangian"
@@ -190,10 +190,10 @@ def _read_system(document: Document) -> IndexedSystem:
         "dissipation": text_of(section, "dissipation", "[system]") if "dissipation" in section else None,
         "constraints": names_of(section, "constraints") if "constraints" in section else (),
     }
-    return in_section("[system]", lambda: IndexedSystem.from_text(**given))
+    return in_section("[system]", lambda: ArraySystem.from_text(**given))
 
 
-def _state_entries(section: Section, system: IndexedSystem) -> dict[tuple[str, str], Entry]:
+def _state_entries(section: Section, system: ArraySystem) -> dict[tuple[str, str], Entry]:
     """Return the values of each array of coordinates, and of its velocities or momenta."""
     check_one(section, "initial", "p", "q_dot")
     required(section, "q", "[initial]")
@@ -215,7 +215,7 @@ def _state_entries(section: Section, system: IndexedSystem) -> dict[tuple[str, s
     return found
 
 
-def _read_sizes(section: Section, system: IndexedSystem) -> dict[str, int]:
+def _read_sizes(section: Section, system: ArraySystem) -> dict[str, int]:
     check_keys(section, system.sizes, "size", "[sizes]")
     return {
         name: checked_count(value, f"[sizes] {name}", least=1, error=ModelFileError) for name, value in section.items()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.lowering.arrays import SOLVERS, check_solver
-from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import (
     check_adaptive,
@@ -43,7 +43,7 @@ class IndexedModel:
     Attributes:
         system: the indexed system.
         method: its discretisation.
-        solver: of the stage equations, as of :func:`~scvi_codegen.compile_indexed`.
+        solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
         q: initial positions by the name of their array; their shapes determine the sizes.
         p, velocity: initial momenta or velocities by the same names, at most one of both; default: 0.
         h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps.
@@ -61,7 +61,7 @@ class IndexedModel:
         ModelFileError: naming the field; arrays are validated when a run begins.
     """
 
-    system: IndexedSystem
+    system: ArraySystem
     method: Method
     q: Mapping[str, Any]
     solver: str = SOLVERS[0]
@@ -79,7 +79,7 @@ class IndexedModel:
     document: Mapping[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        check_kind(INDEXED, self.system, "system", ModelFileError)
+        check_kind(ARRAYS, self.system, "system", ModelFileError)
         check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
@@ -150,10 +150,10 @@ class IndexedModel:
         return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def stepper(self) -> IndexedStepper:
-        """Compile a stepper for runs of any size; raises as :func:`~scvi_codegen.compile_indexed`."""
-        from scvi_codegen.indexed_compiler import compile_indexed  # imported here: not needed for reading a model
+        """Compile a stepper for runs of any size; raises as :func:`~scvi_codegen.compile_stepper`."""
+        from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        return compile_indexed(self.system, self.method, solver=self.solver)
+        return compile_stepper(self.system, self.method, solver=self.solver)
 
     def start(
         self,

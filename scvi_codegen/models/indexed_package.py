@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.indexed_compiler import generate_indexed
+from scvi_codegen.compiler import generate_array_source
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.indexed_document import model_texts
 from scvi_codegen.models.indexed_model import IndexedModel
@@ -39,7 +39,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
         StateError: for arrays of wrong shape.
     """
     target = Path(folder)
-    source, interface = generate_indexed(model.system, model.method, solver=model.solver, prefix=prefix_of(target))
+    source, interface = generate_array_source(model.system, model.method, solver=model.solver, prefix=prefix_of(target))
     problem = read_arrays(interface, model.q, model.parameters, model.tables)
     arrays = {"q": _flat(problem.state)}
     moving = "p" if model.velocity is None else "velocity"
@@ -77,7 +77,7 @@ def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedSte
     """
     target = Path(folder)
     prefix = prefix_of(target)
-    _, interface = generate_indexed(model.system, model.method, solver=model.solver, prefix=prefix)
+    _, interface = generate_array_source(model.system, model.method, solver=model.solver, prefix=prefix)
     return IndexedStepper(source_in(target, prefix), interface)
 
 

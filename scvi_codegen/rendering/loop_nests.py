@@ -75,12 +75,7 @@ class Nest:
         return self.depth_of(access) == len(self.looped.loops)
 
     def text(
-        self,
-        *,
-        prepare: Lines = lambda k: [],
-        innermost: Sequence[str],
-        finish: Lines = lambda k: [],
-        behind: Sequence[Sequence[str]] = (),
+        self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]] = ()
     ) -> list[str]:
         """Return the lines of the nested loops.
 
@@ -197,7 +192,7 @@ class Nest:
             here = self.index(place)
             first = text if text.isidentifier() or text.endswith(")") else f"({text})"
             text = f"{first} * {size_text(axis)} + {here}" if text else here
-        return text
+        return text or "0"
 
     def index(self, place: Place) -> str:
         """Return an index on an axis."""

@@ -13,7 +13,7 @@ __all__ = ["count_text", "product_text", "size_text", "sizes_text"]
 
 def product_text(array: Array) -> str:
     """Return the number of entries of an array, in C."""
-    return " * ".join(map(size_text, array.axes))
+    return " * ".join(map(size_text, array.axes)) or "1"
 
 
 def count_text(loops: Sequence[Loop]) -> str:

@@ -185,6 +185,8 @@ class Interface:
         energy_parameter: of a time-transformed system, the parameter that is the energy of the initial state, else "".
         time_transformation: time-rescaling function g in dt = g dtau that determines its step sizes, or "".
         conserves_energy: whether energy is a first integral; unknown for folders of version 0.1.
+        arrays: declarations of arrays of known sizes, first those whose entries are the coordinates in order, then
+            those whose entries are parameters; none without arrays.
         solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
             version 0.1.
     """
@@ -212,6 +214,7 @@ class Interface:
     inputs: tuple[str, ...] = ()
     conserves_energy: bool = False
     solver: str = ""
+    arrays: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.arrays import entries_by_name, flat_state
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.inputs import Array, check_inputs_given, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
@@ -66,7 +67,7 @@ def start_of_ensemble(
 
 def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
     """Return a validated (k, m) array of finite numbers."""
-    array = real_array(value, name)
+    array = real_array(flat_state(stepper.interface, value, name), name)
     if array.ndim == 1:
         array = array[np.newaxis]
     if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
@@ -82,7 +83,7 @@ def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count:
     names = stepper.parameters
     values = np.tile(stepper.defaults, (count, 1))
     if isinstance(argument, Mapping):
-        for name, value in argument.items():
+        for name, value in entries_by_name(stepper.interface, argument).items():
             column = real_array(value, f"the parameter {name}")
             if column.shape not in ((), (count,)):
                 raise StateError(

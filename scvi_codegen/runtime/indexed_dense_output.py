@@ -71,7 +71,7 @@ def states_between(
 def _shaped(states: Sequence[State], saved: State, shape: tuple[int, ...]) -> dict[str, Numbers]:
     """Return arrays by name, stacked to the shape of the times."""
     return {
-        name: np.array([state[name] for state in states]).reshape(*shape, *values.shape[1:])
+        name: np.array([state[name] for state in states]).reshape((*shape, *values.shape[1:]))
         for name, values in saved.items()
     }
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scvi_codegen.errors import StateError, closest
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays import entries_by_name, flat_state
 
 __all__ = [
     "BINARY64",
@@ -33,8 +34,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 BINARY64, FEW = np.dtype(np.float64), 64
-Parameters = Mapping[str, float] | Sequence[float] | Array | None
-"""Parameters by name (others have their defaults), or all in order."""
+Parameters = Mapping[str, Any] | Sequence[float] | Array | None
+"""Parameters, also arrays of known sizes, by name (others have their defaults), or all in order."""
 
 
 class TakesInputs(Protocol):
@@ -63,7 +64,7 @@ def checked_vector(interface: Interface, value: ArrayLike, name: str) -> Array:
         and all(map(math.isfinite, value.tolist()))
     ):
         return value.copy()
-    array, coordinates = real_array(value, name), interface.coordinates
+    array, coordinates = real_array(flat_state(interface, value, name), name), interface.coordinates
     if array.ndim == 0 and interface.dimension == 1:
         array = array.reshape(1)
     if array.shape != (interface.dimension,):
@@ -79,6 +80,7 @@ def checked_states(
     interface: Interface, q: ArrayLike, p: ArrayLike, t: ArrayLike, *, second: str = "p"
 ) -> tuple[Array, Array, Array]:
     """Return (n,) times and contiguous (n, m) positions and momenta (or what ``second`` names) of one or n states."""
+    q, p = flat_state(interface, q, "q"), flat_state(interface, p, second)
     positions, momenta = real_array(q, "q"), real_array(p, second)
     if positions.ndim <= 1:
         positions, momenta = checked_vector(interface, q, "q"), checked_vector(interface, p, second)
@@ -102,7 +104,7 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
     if parameters is None:
         return values
     if isinstance(parameters, Mapping):
-        for name, value in parameters.items():
+        for name, value in entries_by_name(interface, parameters).items():
             values[parameter_index(interface, name)] = checked_number(value, f"the parameter {name}")
     else:
         given = real_array(parameters, "parameters")

@@ -15,6 +15,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.native.arguments import checked_number, checked_step, real_array
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
+from scvi_codegen.runtime.arrays import flat_state, state_by_name
 from scvi_codegen.runtime.inputs import (
     Array,
     Parameters,
@@ -146,7 +147,10 @@ class Integrator(LinearisedMethod):
         Raises:
             StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
         """
-        p, v = self._transform("momentum", q, velocity, t, parameters, "velocity"), np.asarray(velocity, dtype=float)
+        p, v = (
+            self._transform("momentum", q, velocity, t, parameters, "velocity"),
+            np.asarray(flat_state(self.interface, velocity, "velocity"), dtype=float),
+        )
         dropped = (p == 0.0) & (v != 0.0)
         if dropped.any():
             try:
@@ -349,7 +353,7 @@ class Integrator(LinearisedMethod):
     def _transform(
         self, name: str, q: ArrayLike, other: ArrayLike, t: ArrayLike, parameters: Parameters, label: str
     ) -> Array:
-        if real_array(q, "q").ndim == 1:
+        if real_array(flat_state(self.interface, q, "q"), "q").ndim == 1:
             at, values = checked_number(t, "the time t"), self._parameters(parameters)
             return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
         times, positions, others = checked_states(self.interface, q, other, t, second=label)
@@ -385,6 +389,13 @@ class Integrator(LinearisedMethod):
             hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
             raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
         return result
+
+    def arrays(self, values: Array) -> dict[str, Array]:
+        """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.
+
+        States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
+        """
+        return state_by_name(self.interface, values)
 
     def _vector(self, value: ArrayLike, name: str) -> Array:
         return checked_vector(self.interface, value, name)

@@ -1,4 +1,4 @@
-"""Accuracy warnings of runs: too large steps, missed tolerances, correct digits, chaos."""
+"""What is said of a run is checked on that run: long steps, broken promises, digits that are known, chaos."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class TestLongSteps:
             sc.compile_stepper(unstable, "svi:1").integrate([0.0], [1e-6], h=1.0, steps=steps)
 
     def test_close_encounter_from_far_warns(self):
-        """Positions shrink to a fortieth of the previous ones; momenta are at their maximum."""
+        """There positions are a fortieth of those before; momenta are the largest of all."""
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
@@ -123,12 +123,12 @@ class TestLongSteps:
     @pytest.mark.parametrize("solver", ["fixed-point", "newton"])
     @pytest.mark.parametrize("method", ["svi:2", "svi:3"])
     def test_array_systems_from_rest_at_the_origin_do_not_warn(self, method, solver):
-        chain = sc.IndexedSystem.from_text(
+        chain = sc.LagrangianSystem.from_text(
             name="pushed chain",
             coordinates=["x[N]"],
             lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2) - sum(i in N-1, (x[i+1] - x[i])**2/2) + x[0]*cos(t)",
         )
-        run = sc.compile_indexed(chain, method, solver=solver).integrate(np.zeros(40), h=0.1, steps=200)
+        run = sc.compile_stepper(chain, method, solver=solver).integrate(np.zeros(40), h=0.1, steps=200)
         assert 0.0 < run.step_error < 1e-4
 
     def test_missing_error_estimate_is_reported(self):
@@ -166,7 +166,7 @@ class TestAnotherRoot:
 
 @pytest.fixture(scope="module")
 def pair():
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="falling",
         coordinates=["x[N, 2]"],
         lagrangian="""
@@ -197,7 +197,7 @@ class TestLostEnergy:
         assert abs(energy[-1] - energy[0]) > 1.0
 
     def test_energy_loss_of_one_trajectory_of_an_ensemble_is_reported(self, kepler):
-        """The orbit that is nearly a line is reported; the other conserves its energy."""
+        """Of the one whose orbit is nearly a line; the other keeps its energy."""
         starts = [[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1e-3]]
         with pytest.warns(
             sc.AccuracyWarning, match=r"energy of trajectory 1 changed from -1 to \S+ although every step"
@@ -214,7 +214,7 @@ class TestLostEnergy:
     def test_energy_loss_of_array_systems_is_reported(self, pair, method, steps, message):
         """Two bodies that fall onto each other: the step jumps over where they meet."""
         with pytest.warns(sc.AccuracyWarning, match=rf"energy changed from -0.5\d* to \S+ {message}"):
-            run = sc.compile_indexed(pair, method).integrate([[-0.987, 0.0], [1.0, 0.0]], **steps)
+            run = sc.compile_stepper(pair, method).integrate([[-0.987, 0.0], [1.0, 0.0]], **steps)
         assert abs(run.energy()[-1] - run.energy()[0]) > 10
 
     @pytest.mark.filterwarnings("error")
@@ -222,7 +222,7 @@ class TestLostEnergy:
     def test_array_systems_that_conserve_energy_are_not_reported(self, pair, method):
         steps = {"t_end": 4.0, "tolerance": 1e-6} if method == "svi:8" else {"h": 0.3, "steps": 60}
         start = {"q": [[-1.0, 0.0], [1.0, 0.0]], "velocity": [[0.0, 0.5], [0.0, -0.5]]}
-        sc.compile_indexed(pair, method).integrate(**start, **steps)
+        sc.compile_stepper(pair, method).integrate(**start, **steps)
 
 
 class TestTolerances:
@@ -250,7 +250,7 @@ class TestTolerances:
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
     )
     def test_overestimated_error_is_not_a_violation(self, name, method):
-        """If a force passes through zero on a step, its leading coefficient overestimates the error."""
+        """Where a force passes through zero on a step, its highest coefficient is taken for more than it is."""
         problem, tolerance = sc.problem(name), 1e-9
         stepper = sc.compile_stepper(problem.system, method)
         p = stepper.momentum(problem.q, problem.velocity) if problem.p is None else problem.p
@@ -264,7 +264,7 @@ class TestTolerances:
         assert "a second run with other steps differs by" in missed_tolerance(problem.system, found, error / 5)
 
     def test_underestimated_errors_are_detected(self):
-        """The second run detects the growth of errors, which the local error estimate does not contain."""
+        """Where a second run is at hand: a step's error says nothing of how errors grow."""
         system = sc.problem("kepler").system
         trajectory = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0], [0.0, 1.2], h=0.2, steps=2000)
         known = known_digits(system, trajectory, most=20_000)
@@ -373,7 +373,7 @@ def test_wrong_steps_are_rejected_or_reported(seed):
 
 
 def _report_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.ndarray, h: float) -> bool | None:
-    """Return whether a step with an error above a hundredth was reported; ``None`` if the step is accurate."""
+    """Of a step off by more than a hundredth whether that was said."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sc.AccuracyWarning)
         try:

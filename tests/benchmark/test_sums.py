@@ -7,7 +7,7 @@ from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import indexed_energies, lattices, thousand_bodies, threads
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import Composition
 
 QUICK = bench.Plan(quick=True, peers=())
@@ -33,9 +33,9 @@ def test_lattices_by_hand_move_as_generated_ones(lattice):
     ids=lambda each: each.name,
 )
 def test_accelerations_by_numpy_are_those_of_the_formula(each):
-    """Compare with one step of leapfrog."""
+    """By a step of leapfrog."""
     h, given = 1e-3, {"parameters": each.parameters, "tables": each.tables}
-    run = compile_indexed(each.system, "stoermer-verlet").integrate(each.q, velocity=each.v, h=h, steps=1, **given)
+    run = compile_stepper(each.system, "stoermer-verlet").integrate(each.q, velocity=each.v, h=h, steps=1, **given)
     ((_, q),) = run.q.values()
     ((_, velocity),) = run.velocity.values()
     kick = h / 2 * (each.accelerations(each.q) + each.accelerations(q))

@@ -1,4 +1,4 @@
-"""Shell completion, tested in the shells."""
+"""What shells complete, asked of the shells."""
 
 from __future__ import annotations
 

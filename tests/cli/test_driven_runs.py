@@ -143,15 +143,15 @@ def test_failing_step_saves_the_preceding_segments(model):
 
 
 def test_signal_stops_a_run_between_chunks(model, monkeypatch):
-    advance, sent = Run._advance, []
+    record, sent = Run.record, []
 
-    def interrupted(run, steps, save_every, arrays):
-        status = advance(run, min(steps, 2), save_every, arrays)
+    def interrupted(run, steps=None, **settings):
+        found = record(run, steps, **settings)
         if run.t > 1.2 and not sent:
             sent.append(os.kill(os.getpid(), signal.SIGTERM))
-        return status
+        return found
 
-    monkeypatch.setattr(Run, "_advance", interrupted)
+    monkeypatch.setattr(Run, "record", interrupted)
     outcome = integrate_model(model)
     assert outcome.interrupted
     assert outcome.failure is None

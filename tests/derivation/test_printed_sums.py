@@ -1,4 +1,4 @@
-"""Printed derivations of array systems, read back from text and LaTeX: gradients, masses and complete steps."""
+"""What ``derive`` prints of array systems, text and LaTeX, is read back: slopes of terms, masses, and whole steps."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from scvi_codegen.derivation.indexed import derive_sums
 
 COUNT, H, T, K = 5, 0.125, 0.375, 0.6875
 MASSES = [1.25, 0.75, 1.5, 2.0, 0.875]
-RING = sc.IndexedSystem.from_text(
+RING = sc.LagrangianSystem.from_text(
     name="ring",
     coordinates=["q[N]"],
     parameters={"k": 1.0, "m[N]": 1.0},
     lagrangian="sum(i in N, m[i]*q_dot[i]**2/2 - cos(t)*q[i]**2/3)"
     " - sum(i in N periodic, k*(q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
 )
-ROTORS = sc.IndexedSystem.from_text(
+ROTORS = sc.HamiltonianSystem.from_text(
     name="rotors",
     coordinates=["q[N]"],
     momenta=["p[N]"],
@@ -102,7 +102,7 @@ def test_gradients_of_terms_sum_to_forces(system):
 def stepped(system: Any, method: Any) -> tuple[Any, Any]:
     """The C's step."""
     parameters = {"k": K, "m": MASSES} if system is RING else {"k": K}
-    run = sc.compile_indexed(system, method).start(Q, P, h=H, t=T, parameters=parameters)
+    run = sc.compile_stepper(system, method).start(Q, P, h=H, t=T, parameters=parameters)
     run.advance(1)
     return run.q["q"], run.p["q"]
 

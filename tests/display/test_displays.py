@@ -1,4 +1,4 @@
-"""Notebook displays of systems, methods, equations, steppers and trajectories."""
+"""What notebooks show of systems, methods, equations, steppers and trajectories."""
 
 from __future__ import annotations
 

@@ -50,8 +50,8 @@ def runs(folder: Path) -> Iterator[Any]:
     pushed = sc.LagrangianSystem.from_text(NAME, ["q"], "q_dot**2/2", forces={"q": "u"}, inputs=["u"])
     data = {"u": ([0.0, 0.5, 1.0], [0.0, 1.0, 0.0])}
     yield sc.compile_stepper(pushed, "svi:2", flags=QUICK_FLAGS).integrate([0.1], [0.0], inputs=data, h=0.1, t_end=1.0)
-    ring = sc.IndexedSystem.from_text(NAME, ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
-    many = sc.compile_indexed(ring, "svi:2", flags=QUICK_FLAGS)
+    ring = sc.LagrangianSystem.from_text(NAME, ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
+    many = sc.compile_stepper(ring, "svi:2", flags=QUICK_FLAGS)
     yield from (ring, many, many.start(np.ones(5), h=0.1), many.integrate(np.ones(5), h=0.1, steps=3))
     yield sc.IndexedModel(system=ring, method=sc.SVI(2), q={"q": np.ones(5)}, h=0.1, steps=3)
 

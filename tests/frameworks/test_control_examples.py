@@ -1,4 +1,4 @@
-"""Scripts in ``examples/optimal_control`` reproduce their page and agree with direct collocation."""
+"""The scripts of ``examples/optimal_control`` find what their page says, as collocation of their own does."""
 
 import os
 import re

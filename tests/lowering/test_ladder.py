@@ -1,4 +1,4 @@
-"""Predictor tables of adaptive steps and the precision of their coefficients."""
+"""Tables of steps that choose their length, and the digits of the coefficients they stand on."""
 
 from __future__ import annotations
 

@@ -32,8 +32,8 @@ def stepper(kind, method, degree):
     else:
         group, given = sc.LagrangianSystem, {"lagrangian": f"{kinetic} - {potential} + {pushed}"}
     if "array" in kind:
-        system = sc.IndexedSystem.from_text(name=kind, coordinates=["x[N]"], **given)
-        return sc.compile_indexed(system, method, solver="fixed-point"), [mass] * 3
+        system = group.from_text(name=kind, coordinates=["x[N]"], **given)
+        return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * 3
     names = ["x", "y"] if "y" in coordinates else ["x"]
     system = group.from_text(name=kind, coordinates=names, **given)
     return sc.compile_stepper(system, method, solver="fixed-point"), [mass] * len(names)

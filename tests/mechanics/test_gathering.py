@@ -63,7 +63,7 @@ def test_rolled_system_has_equal_trajectories(system):
     found = sc.roll_sums(system)
     q, v = np.random.default_rng(3).normal(size=(2, len(system.coordinates)))
     start = {"p" if system.auxiliaries else "velocity": v}
-    run = sc.compile_indexed(found.system, "gauss:4").integrate(
+    run = sc.compile_stepper(found.system, "gauss:4").integrate(
         q, **start, h=0.01, steps=5, tables=found.tables, parameters=found.parameters
     )
     other = sc.compile_stepper(system, "gauss:4").integrate(q, **start, h=0.01, steps=5)
@@ -126,12 +126,12 @@ def test_inputs_retain_their_names():
     assert found.system.inputs == ("u",)
     assert (
         found.system.parameters
-        == sc.IndexedSystem.from_text(
+        == sc.LagrangianSystem.from_text(
             name="u", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + u*q[i])", inputs=["u"]
         ).parameters
     )
     data = {"u": (np.linspace(0, 1, 11), np.sin(np.linspace(0, 1, 11)))}
-    run = sc.compile_indexed(found.system, "svi:3").integrate(
+    run = sc.compile_stepper(found.system, "svi:3").integrate(
         np.zeros(4), inputs=data, h=0.1, steps=5, tables=found.tables, parameters=found.parameters
     )
     other = sc.compile_stepper(system, "svi:3").integrate(
@@ -148,7 +148,7 @@ def test_terms_without_coordinates_give_a_runnable_system(term):
         f"at{k}": 1 for k in range(len(found.tables))
     }
     data = {"tables": found.tables, "parameters": found.parameters}
-    own = sc.compile_indexed(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
+    own = sc.compile_stepper(found.system, "svi:2").integrate([1.0, 2.0], h=0.1, steps=3, **data)
     other = sc.compile_stepper(written, "svi:2").integrate([1.0, 2.0], [0.0, 0.0], h=0.1, steps=3)
     assert np.abs(own.q["q"] - other.q).max() < 1e-15
     assert np.abs(own.energy() - other.energy()).max() < 1e-14
@@ -158,7 +158,7 @@ def test_terms_without_coordinates_give_a_runnable_system(term):
 def test_parameter_names_differ_from_names_of_arrays_and_tables(name):
     written = lagrangian(["x", "y"], f"x_dot**2/2 + y_dot**2/2 - {name}*x**2/2 - 3*{name}*y**2/2", **{name: 1.3})
     found = sc.roll_sums(written)
-    own = sc.compile_indexed(found.system, "stoermer-verlet").integrate(
+    own = sc.compile_stepper(found.system, "stoermer-verlet").integrate(
         [1.0, 2.0], h=0.1, steps=3, tables=found.tables, parameters={**found.parameters, name: 1.7}
     )
     other = sc.compile_stepper(written, "stoermer-verlet")

@@ -5,17 +5,19 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "
 DISTANCE = "sqrt(sum(a in 3, (r[i, a] - r[j, a])**2))"
 
 
-def system(coordinates: str, lagrangian: str, **extra: object) -> IndexedSystem:
+def system(coordinates: str, lagrangian: str, **extra: object) -> ArraySystem:
     """A system of one array."""
-    return IndexedSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **extra)
+    return LagrangianSystem.from_text(name="system", coordinates=[coordinates], lagrangian=lagrangian, **extra)
 
 
 @pytest.mark.parametrize(
@@ -31,9 +33,9 @@ def system(coordinates: str, lagrangian: str, **extra: object) -> IndexedSystem:
     ],
 )
 def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
-    """The error shows the accepted form."""
+    """Which the error shows."""
     with pytest.raises(SystemDefinitionError, match=message.replace("*", r"\*")):
-        system("q[N]", lagrangian)
+        system("q[N]", lagrangian).check_run_time_sizes()
 
 
 @pytest.mark.parametrize(
@@ -62,7 +64,7 @@ def test_momentum_maps_of_bodies_in_space() -> None:
 
 
 def test_rotation_requires_equal_masses() -> None:
-    """Rotation mixes two components."""
+    """Of the two components."""
     kinetic = "sum(i in N, r_dot[i, 0]**2 + w*r_dot[i, 1]**2)"
     round_trap = " - sum(i in N, r[i, 0]**2 + r[i, 1]**2)"
     assert not momentum_maps(system("r[N, 2]", kinetic + round_trap, parameters={"w": 2}))
@@ -78,7 +80,7 @@ def test_a_chain_between_walls_has_no_momentum() -> None:
 
 def test_unrolled_system_has_one_coordinate_per_element() -> None:
     """Every element with its own coordinates, parameters and places."""
-    net = IndexedSystem.from_text(
+    net = LagrangianSystem.from_text(
         name="net",
         coordinates=["q[N]"],
         parameters={"k[B]": 1, "c": 2},
@@ -107,7 +109,7 @@ def test_systems_that_cannot_be_unrolled_are_rejected(
     sizes: dict[str, int], extra: dict[str, object], message: str
 ) -> None:
     """Sizes, tables and parameters are those of the system."""
-    chain = IndexedSystem.from_text(
+    chain = LagrangianSystem.from_text(
         name="chain", coordinates=["q[N]"], parameters={"m[N]": 1}, lagrangian="sum(i in N, m[i]*q_dot[i]**2) - q[1]**2"
     )
     with pytest.raises(SystemDefinitionError, match=message):
@@ -115,7 +117,7 @@ def test_systems_that_cannot_be_unrolled_are_rejected(
 
 
 def test_derived_terms_are_displayed() -> None:
-    """Each read has a derivative; the formula has mathematical notation."""
+    """A slope for every slot; the formula as a mathematician writes it."""
     net = system(
         "q[N]",
         "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends_of[b, 0]] - q[ends_of[b, 1]])) - q[N-1]**2"
@@ -148,7 +150,7 @@ def test_sympy_sums_are_read() -> None:
     pairs = sympy.Sum(1 / sympy.sqrt((q[i] - q[j]) ** 2 + e**2), (j, i + 1, N - 1), (i, 0, N - 2))
     ring = sympy.Sum(sympy.cos(q[sympy.Mod(i - 1, N)] - q[i]), (i, 0, N - 1))
     net = sympy.Sum(k[b] * (q[bonds[b, 0]] - q[bonds[b, 1]]) ** 2, (b, 0, B - 1))
-    found = IndexedSystem.from_sympy(
+    found = LagrangianSystem.from_sympy(
         name="system",
         coordinates=["q[N]"],
         parameters={"e": 1, "k[B]": 1},
@@ -183,14 +185,14 @@ def test_unsupported_sympy_sums_are_rejected(index: str, limits: str) -> None:
     place, spans = sympy.sympify(index, locals=names), sympy.sympify(f"[{limits}]", locals=names)
     kinetic = sympy.Sum(v[i] ** 2 / 2, (i, 0, N - 1))
     with pytest.raises(SystemDefinitionError):
-        IndexedSystem.from_sympy(
+        LagrangianSystem.from_sympy(
             name="x", coordinates=["q[N]"], lagrangian=kinetic - sympy.Sum(q[place] ** 2, *map(tuple, spans))
         )
 
 
 def test_momentum_maps_of_a_hamiltonian() -> None:
     """Shifts, turns of positions with their momenta, and phases."""
-    bodies = IndexedSystem.from_text(
+    bodies = HamiltonianSystem.from_text(
         name="charges",
         coordinates=["r[N, 2]"],
         parameters={"B": 1},
@@ -198,7 +200,7 @@ def test_momentum_maps_of_a_hamiltonian() -> None:
         f"- sum(i < j in N, 1/{DISTANCE.replace('3', '2', 1)})",
     )
     assert [each.name for each in momentum_maps(bodies)] == ["angular momentum of r[.., 0], r[.., 1]"]
-    oscillators = IndexedSystem.from_text(
+    oscillators = HamiltonianSystem.from_text(
         name="oscillators", coordinates=["q[N]"], hamiltonian="sum(i in N, (q[i]**2 + p_q[i]**2)**2)"
     )
     assert [each.name for each in momentum_maps(oscillators)] == ["norm of q"]
@@ -218,7 +220,7 @@ def test_momentum_maps_of_a_hamiltonian() -> None:
 def test_exactly_one_of_lagrangian_and_hamiltonian_is_required(given: dict[str, object], message: str) -> None:
     """One of both, with what belongs to it."""
     with pytest.raises(SystemDefinitionError, match=message):
-        IndexedSystem.from_text(name="x", coordinates=["q[N]"], **given)
+        ArraySystem.from_text(name="x", coordinates=["q[N]"], **given)
 
 
 KINETIC = "sum(i in N, q_dot[i]**2/2)"
@@ -260,6 +262,6 @@ def test_forces_are_unrolled() -> None:
     ],
 )
 def test_invalid_forces_are_rejected(extra: dict[str, object], message: str) -> None:
-    """The parser or the checks of forces reject them."""
+    """By the parser, or by what they are."""
     with pytest.raises(SystemDefinitionError, match=message):
         system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **extra)

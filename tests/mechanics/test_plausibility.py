@@ -27,7 +27,7 @@ def hamiltonian(formula, **given):
 
 
 def arrays(formula, **given):
-    return sc.IndexedSystem.from_text("system", ["q[N]"], formula, **given)
+    return sc.LagrangianSystem.from_text("system", ["q[N]"], formula, **given)
 
 
 def messages(define, *given, **named):

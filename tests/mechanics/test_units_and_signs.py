@@ -72,10 +72,10 @@ def test_multipliers_of_an_orbit_are_those_of_its_variations():
 
 @pytest.mark.parametrize(("metre", "second", "factor"), [(1000.0, 1.0, 1.0), (1e-3, 60.0, 1.0), (1.0, 1.0, 1e6)])
 def test_constraints_of_arrays_accept_any_units(metre, second, factor):
-    """Compare two rods in other units of length and time, and with scaled constraints."""
+    """The same two rods in other units of length and time, and with their constraints multiplied."""
 
     def states(metre, second, factor):
-        system = sc.IndexedSystem.from_text(
+        system = sc.LagrangianSystem.from_text(
             name="rods",
             coordinates=["r[N, 2]"],
             parameters={"m[N]": 1.0, "l[B]": 1.0, "g": 1.0, "u": 1.0},
@@ -83,7 +83,7 @@ def test_constraints_of_arrays_accept_any_units(metre, second, factor):
             lagrangian="sum(i in N, m[i]*sum(a in 2, r_dot[i, a]**2)/2 - m[i]*g*r[i, 1])",
             constraints=["sum(a in 2, u*(r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = u*l[b]**2 for b in B"],
         )
-        stepper = sc.compile_indexed(system, sc.SVI(1, "gauss-lobatto:2"))
+        stepper = sc.compile_stepper(system, sc.SVI(1, "gauss-lobatto:2"))
         q = np.array([[0.0, 0.0], [0.6, 0.8], [1.4, 0.2]]) * metre
         velocity = np.array([[0.5, 0.0], [0.5, 0.0], [0.5, 0.0]]) * metre / second
         run = stepper.start(

@@ -28,7 +28,6 @@ FLOORS = """
     methods native pictures
     lowering exact runtime
     compiler frameworks results
-    indexed_compiler
     derivation models advice verification
     benchmark reproduce
     package distributed __init__

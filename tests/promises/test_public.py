@@ -1,4 +1,4 @@
-"""Public names, signatures and options of the command line change only on purpose."""
+"""What is public changes on purpose alone: names, what they take, options of the command line."""
 
 from difflib import unified_diff
 

@@ -1,4 +1,4 @@
-"""Selection of combinations for the default and the full tier."""
+"""What the default tier leaves to the full one covers what it should."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unknown keywords raise an error with the intended keyword or its location."""
+"""Keywords that a function does not have: an error that says what was meant, or where it belongs."""
 
 from functools import partial
 
@@ -25,14 +25,14 @@ def stepper():
 
 @pytest.fixture(scope="module")
 def chain():
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="pushed chain",
         coordinates=["q[N]"],
         lagrangian="sum(i in N, q_dot[i]**2/2)",
         forces={"q[0]": "u"},
         inputs=["u"],
     )
-    return sc.compile_indexed(system, "svi:2")
+    return sc.compile_stepper(system, "svi:2")
 
 
 def test_inputs_are_arguments_of_integrate(stepper, chain):
@@ -84,7 +84,7 @@ def test_functions_suggest_the_intended_keyword(function, wrong, meant):
 
 
 def test_no_synonym_hides_a_keyword():
-    """A known keyword is never reported as a synonym, and every suggested location exists."""
+    """What a function has is never said to be another, and every place that is named is one."""
     assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
     assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
     assert not [here for here, elsewhere in SYNONYMS.items() if {*here.split()} & {*elsewhere.split()}]

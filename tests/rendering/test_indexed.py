@@ -4,11 +4,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from either_system import either_system
 from style import check_style
 
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.lowering.solvers.predictor_tables import control_of
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.program_source import render
@@ -49,7 +49,7 @@ FORCES = {"damped": {"q[i]": "-m[i]*q_dot[i]*q[i]", "q[N-1]": "cos(t)"}}
 def rendered(name: str, method: str, *, newton: bool = False) -> Source:
     """The text of an integrator."""
     coordinates, formula = FORMULAS[name]
-    system = IndexedSystem.from_text(
+    system = either_system(
         name=name,
         coordinates=coordinates,
         **{"hamiltonian" if name == "hamiltonian" else "lagrangian": formula},
@@ -74,12 +74,12 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["bodies", "all forms", "lattices"])
 def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
-    """Newton's iteration compiles as strict C."""
+    """The same."""
     check_strict(rendered(name, "svi:4", newton=True), tmp_path)
 
 
 def check_strict(source: Source, tmp_path: Path) -> None:
-    """Compile as a library with strict flags."""
+    """As one compiles a library."""
     for path, text in source.files.items():
         (tmp_path / path).parent.mkdir(exist_ok=True)
         (tmp_path / path).write_text(text)
@@ -91,7 +91,7 @@ def check_strict(source: Source, tmp_path: Path) -> None:
 
 
 def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
-    """Reads are before, and sums after, the loop over the second index."""
+    """Before and behind the loop over the second."""
     code = rendered("bodies", "svi:4").code
     outer = code.index(
         "for (long long index_i = here->of.first; index_i < here->of.end; index_i++)",

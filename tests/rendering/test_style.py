@@ -1,4 +1,4 @@
-"""Support headers satisfy ``.clang-format``; generated sources are short, and amalgamation does not change results."""
+"""Support headers are laid out as ``.clang-format`` says; generated sources are short, amalgamated or not the same."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def test_different_arguments_are_derived_again(made, other):
 
 
 def keys(change: dict, **options) -> tuple[str, ...]:
-    """Return the parts of a cache key."""
+    """What the name of a text is made from."""
     given = {
         "name": "pair",
         "coordinates": ["q", "r"],
@@ -229,7 +229,7 @@ def driven() -> sc.LagrangianSystem:
 
 def described() -> list:
     """One of each kind of what texts are made from, with all fields in use."""
-    lattice = sc.IndexedSystem.from_text(
+    lattice = sc.LagrangianSystem.from_text(
         name="ring",
         coordinates=["q[N]"],
         lagrangian="sum(a in N, m[a]*q_dot[a]**2/2 - k*q[a]**2/2) - sum(b in B, q[bonds[b, 0]]*q[bonds[b, 1]])",

@@ -49,7 +49,7 @@ def orbit(e, anomaly=0.3):
 
 
 def exact_position(q, p, t):
-    """Return the position from Kepler's equation in 40 digits, with Lagrange coefficients."""
+    """By Kepler's equation from exactly these doubles, in 40 digits, with Lagrange's coefficients."""
     with mp.workdps(40):
         (x, y), (u, v) = map(mp.mpf, q), map(mp.mpf, p)
         r = mp.hypot(x, y)
@@ -106,7 +106,7 @@ def test_end_of_a_step_has_the_requested_accuracy(tolerance, degree):
 
 @pytest.mark.parametrize(("degree", "e", "tolerance"), [(8, 0.9, 1e-12), (8, 0.999, 1e-12), (12, 0.9, None)])
 def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
-    """Step sizes change a thousandfold before the pericentre; a third of the trials was rejected."""
+    """On the way to the pericentre from step to step a thousandfold; a third of the trials was in vain."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(degree))
     run = stepper.integrate(*orbit(e, math.pi), t_end=SPAN, **({"tolerance": tolerance} if tolerance else {}))
     assert run.rejected_steps < 0.08 * run.steps
@@ -288,7 +288,7 @@ MASSES = {
             "momenta": ["p[N]"],
             "hamiltonian": "sum(a in N, sqrt(1 + p[a]**2*(1 + x[a]**2)) + x[a]**4/4)",
         },
-        sc.IndexedSystem,
+        sc.HamiltonianSystem,
     ),
 }
 
@@ -302,8 +302,8 @@ def test_equal_velocities_at_both_points_give_no_error_estimate(name, solver, me
     """The momenta of a Lobatto IIIA-IIIB pair of two stages are the same at both, whatever the forces are."""
     text, kind = MASSES[name]
     system = kind.from_text(name="quartic", **text)
-    if kind is sc.IndexedSystem:
-        stepper, start = sc.compile_indexed(system, method), ({"x": [0.5]}, {"x": [0.3]})
+    if name == "of arrays":
+        stepper, start = sc.compile_stepper(system, method), ({"x": [0.5]}, {"x": [0.3]})
     else:
         stepper = sc.compile_stepper(system, method, solver=solver)
         start = ([0.5] * system.dimension, [0.3] * system.dimension)
@@ -386,7 +386,7 @@ def test_initial_step_size_is_found_for_zero_velocity(method):
 
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
 def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
-    """At rest the force is initially constant: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
+    """From rest the force does not change at first: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
     pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     run = sc.compile_stepper(pendulum, "svi:2").integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance)
     k = math.sin(0.5)
@@ -438,7 +438,7 @@ def far_away():
     text = {"name": "oscillator", "coordinates": ["q"], "lagrangian": "q_dot**2/2 - q**2/2"}
     system = sc.LagrangianSystem.from_text(**text)
     pushed = sc.LagrangianSystem.from_text(**text, forces={"q": "u"}, inputs=["u"])
-    summed = sc.IndexedSystem.from_text(
+    summed = sc.LagrangianSystem.from_text(
         name="oscillators", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
     )
     adaptive, reversible, clocked, driven, indexed = (
@@ -446,7 +446,7 @@ def far_away():
         sc.compile_stepper(system, "svi:3", time_transformation="1/(1 + q**2)"),
         sc.compile_stepper(sc.reparametrise(system, "1/(1 + q**2)"), "svi:3"),
         sc.compile_stepper(pushed, "svi:3"),
-        sc.compile_indexed(summed, "svi:3"),
+        sc.compile_stepper(summed, "svi:3"),
     )
 
     def inputs(t):
@@ -485,10 +485,10 @@ def test_runs_end_at_t_end_including_the_low_word_of_time(far_away, way, span):
 def oscillators():
     """A stepper and an indexed one, with the names that their event functions use."""
     system = sc.LagrangianSystem.from_text(name="o", coordinates=["q"], lagrangian="q_dot**2/2 - q**2/2")
-    summed = sc.IndexedSystem.from_text(
+    summed = sc.LagrangianSystem.from_text(
         name="o", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)"
     )
-    return {"q": sc.compile_stepper(system, "svi:4"), "q[0]": sc.compile_indexed(summed, "svi:4")}
+    return {"q": sc.compile_stepper(system, "svi:4"), "q[0]": sc.compile_stepper(summed, "svi:4")}
 
 
 @pytest.mark.parametrize("name", ["q", "q[0]"])

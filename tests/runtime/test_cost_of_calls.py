@@ -1,4 +1,4 @@
-"""Overhead of calls of ``integrate`` in function calls instead of seconds, and the reuse of runs."""
+"""What a call of ``integrate`` costs beside its steps, in function calls instead of seconds, and the reuse of runs."""
 
 from __future__ import annotations
 

@@ -17,9 +17,7 @@ from sympy.physics.mechanics import dynamicsymbols
 
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import EventError, ExpressionError, StateError, StepFailedError
-from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
@@ -69,7 +67,7 @@ def at_perihelion(e: float) -> dict[str, list[float]]:
 
 
 def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
-    """Return the crossings of a function of t along one step from 0."""
+    """Of a function of t alone, along one step from 0."""
     stepper = compile_stepper(FREE, StoermerVerlet(), flags=FLAGS)
     return stepper.integrate([0.0], [1.0], h=h, steps=1, events=function).events[0].t
 
@@ -155,7 +153,7 @@ def test_all_roots_of_polynomials_of_degree_four_are_found(polynomials, numbers,
 
 
 def test_few_roots_of_polynomials_of_degree_eight_are_missed(polynomials):
-    """Polynomials of degree 4 cannot resolve all of eight roots in one step: a measured share is found."""
+    """Eight roots within one step are more than polynomials of degree 4 can promise to see: a measured share."""
     generator = np.random.default_rng(8)
     found = 0
     for _ in range(500):
@@ -411,11 +409,11 @@ def test_a_stepper_may_be_compiled_with_events():
 
 
 BALL = LagrangianSystem.from_text(name="ball", coordinates=["y"], lagrangian="y_dot**2/2 - g*y", parameters={"g": 9.81})
-BALLS = IndexedSystem.from_text(
+BALLS = LagrangianSystem.from_text(
     name="balls", coordinates=["y[N]"], lagrangian="sum(i in N, y_dot[i]**2/2 - g*y[i])", parameters={"g": 9.81}
 )
 DISC = LagrangianSystem.from_text(name="puck", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2)/2")
-DISCS = IndexedSystem.from_text(name="pucks", coordinates=["r[N]"], lagrangian="sum(i in N, r_dot[i]**2/2)")
+DISCS = LagrangianSystem.from_text(name="pucks", coordinates=["r[N]"], lagrangian="sum(i in N, r_dot[i]**2/2)")
 CORNERS = [(0.5, (0.5, 0.5), (1, 1)), (5.0, (0.5, 0.5), (1, 1)), (0.5, (0.25, 0.5), (0.7, 1.4))]
 WALLS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -438,7 +436,7 @@ def until_event(stepper, events, q, v, t, h):
 def thrown(request):
     """Steppers of a ball and a puck with the names of their coordinates, scalar and indexed."""
     if request.param == "arrays":
-        return compile_indexed(BALLS, "svi:2"), compile_indexed(DISCS, "svi:2"), ("y[0]", "r[0]", "r[1]")
+        return compile_stepper(BALLS, "svi:2"), compile_stepper(DISCS, "svi:2"), ("y[0]", "r[0]", "r[1]")
     return compiled_plainly(BALL, SVI(2)), compiled_plainly(DISC, SVI(2)), ("y", "x", "y")
 
 
@@ -453,7 +451,7 @@ def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h
     q, v, t, times = np.array([floor + 1.0]), np.zeros(1), 0.0, []
 
     def bounce():
-        """Integrate until bounces can no longer be resolved."""
+        """Until no bounce is told from the next."""
         nonlocal t, q, v
         for _ in range(100):
             t, q, v, met = until_event(ball, [Event(f"{height} - {floor}", -1, terminal=True)], q, v, t, h)
@@ -498,7 +496,7 @@ def test_simultaneous_crossings_are_ordered_within_the_step():
 
 
 def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Events of many calls do not exhaust the memory."""
+    """And those of many calls do not fill the memory."""
     system = LagrangianSystem.from_text(name="falling", coordinates=["q"], lagrangian="q_dot**2/2 - q")
     stepper = compile_stepper(system, "svi:2")
     first = stepper.with_events("q - 1")

@@ -34,8 +34,8 @@ def stepper(kind: str, method: str):
         system = sc.LagrangianSystem.from_text(coordinates=["x"], lagrangian=text, **given)
         return sc.compile_stepper(system, method, solver=SCALAR[method])
     text = f"sum(i in N, q_dot[i]**2/2 - {POTENTIAL.format(x='q[i]')})"
-    system = sc.IndexedSystem.from_text(coordinates=["q[N]"], lagrangian=text, **given)
-    return sc.compile_indexed(system, method, solver=ARRAY[method])
+    system = sc.LagrangianSystem.from_text(coordinates=["q[N]"], lagrangian=text, **given)
+    return sc.compile_stepper(system, method, solver=ARRAY[method])
 
 
 @pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])

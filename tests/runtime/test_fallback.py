@@ -1,4 +1,4 @@
-"""Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
+"""Newton's iteration borrowed from a second library where sweeps fail: equal to one's own, compiled when needed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.indexed_compiler import compile_indexed
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
@@ -34,7 +33,7 @@ each_method = pytest.mark.parametrize(
 
 @cache
 def both(method):
-    """Return a stepper with a fallback library and one with a built-in iteration."""
+    """One that borrows, anew from its text, and one with an iteration of its own."""
     chosen = problem("double-pendulum")
     source, interface = generate_source(chosen.system, method)
     return compile_stepper(chosen.system, method, flags=PORTABLE_FLAGS), Stepper(
@@ -124,7 +123,7 @@ def test_recorded_run_continues_with_its_fallback(start, tmp_path):
 
 
 def test_low_words_do_not_depend_on_the_split_of_a_run():
-    """Low words of fixed-point and Newton steps are separate, for one call as for many."""
+    """Those of a step by sweeps are not those of the next one by Newton's iteration, in one call as in many."""
     stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)
     whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
     whole.advance(40)
@@ -146,10 +145,10 @@ def test_prepare_compiles_everything_later_calls_need(tmp_path, monkeypatch):
     monkeypatch.setenv("SCVI_CODEGEN_CACHE", str(tmp_path))
     swing, flags = problem("planar-pendulum").system, ("-O0",)
     stepper, state = compile_stepper(swing, "svi:2", flags=flags), ([1.0], [0.0])
-    lattice = IndexedSystem.from_text(
+    lattice = LagrangianSystem.from_text(
         name="chain", coordinates=["q[N]"], lagrangian="sum(a in N, q_dot[a]**2/2 - q[a]**2/2)"
     )
-    chain = compile_indexed(lattice, "svi:2", flags=flags)
+    chain = compile_stepper(lattice, "svi:2", flags=flags)
     stepper.prepare(tangent=True, second=True, ensemble=True, events=["q", "q_dot"])
     chain.prepare()
     compile_stepper(problem("kepler").system, "stoermer-verlet", flags=flags).prepare()  # nothing to borrow

@@ -417,13 +417,13 @@ class TestOtherRuns:
         """x'' = -x + u with u = 1 - t/2 until t = 2, then 0, from t = 0.5: exact."""
         table = (np.array([0.5, 2.0, 6.0]), np.array([0.75, 0.0, 0.0]))
         if indexed:
-            system = sc.IndexedSystem.from_text(
+            system = sc.LagrangianSystem.from_text(
                 name="i",
                 coordinates=["q[N]"],
                 lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2 + u*q[i])",
                 inputs=["u"],
             )
-            stepper = sc.compile_indexed(system, "svi:6")
+            stepper = sc.compile_stepper(system, "svi:6")
         else:
             stepper = sc.compile_stepper(made("i", ["q"], "q_dot**2/2 - q**2/2 + u*q", inputs=["u"]), "svi:6")
         run = stepper.integrate([0.3], [0.1], inputs={"u": table}, t=0.5, t_end=6.0, error=1e-9)
@@ -441,7 +441,7 @@ class TestOtherRuns:
         assert run.confirmed_until == 6.0
 
     def test_confirmed_runs_of_arrays(self):
-        system = sc.IndexedSystem.from_text(
+        system = sc.LagrangianSystem.from_text(
             name="chain",
             coordinates=["q[N]"],
             lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N - 1, (q[i+1] - q[i])**2/2 + k*(q[i+1] - q[i])**4/4)"
@@ -449,7 +449,7 @@ class TestOtherRuns:
             parameters={"k": 0.0},
         )
         start = [0.5, -0.3, 0.8, 0.1]
-        stepper = sc.compile_indexed(system, "svi:6")
+        stepper = sc.compile_stepper(system, "svi:6")
         run = stepper.integrate(start, [0.0] * 4, t=2.0, t_end=12.0, parameters={"k": 0.3}, error=1e-9)
         exact = integrated(chain, [*start, *[0.0] * 4], [2.0, *run.t[1:]])
         size = np.linalg.norm(exact[:, :4], axis=1).max()
@@ -459,12 +459,12 @@ class TestOtherRuns:
             stepper.integrate(start, t_end=12.0, observe=lambda run: run.energy, error=1e-9)
 
     def test_chaotic_arrays_warn(self):
-        system = sc.IndexedSystem.from_text(
+        system = sc.LagrangianSystem.from_text(
             name="pendulums",
             coordinates=["q[N]"],
             lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i])) + sum(i in N - 1, cos(q[i] - q[i + 1]))",
         )
-        stepper = sc.compile_indexed(system, "svi:8")
+        stepper = sc.compile_stepper(system, "svi:8")
         for more in ({}, {"save_every": 5}):
             with pytest.warns(sc.AccuracyWarning, match="amplifies errors"):
                 stepper.integrate([2.5, -1.0, 1.0], [0.5, 1.5, -0.3], t_end=300.0, **more)
@@ -522,7 +522,7 @@ class TestCommandLine:
 
     @pytest.mark.parametrize("where", ["file", "option", "folder"])
     def test_printed_run_equals_the_confirmed_one_bitwise(self, tmp_path, where):
-        """A file or an option requests the confirmation, in memory and in a folder."""
+        """Whether a file or an option asks for it, in memory and in a folder."""
         path = self._kepler(tmp_path)
         output = tmp_path / ("orbit.run" if where == "folder" else "orbit.npz")
         chosen = ["kepler", "--span", "20", "--error", "1e-9"] if where == "option" else [str(path)]

@@ -16,7 +16,7 @@ KINETIC = "sum(i in N, q_dot[i]**2/2)"
 class Case:
     """A system with sizes, data and a state."""
 
-    system: sc.IndexedSystem
+    system: sc.LagrangianSystem
     q: Any
     velocity: Any
     h: float
@@ -25,7 +25,7 @@ class Case:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Return the sizes from the shape of the only array and the rows of the only table."""
+        """From the shape of the only array, and the rows of the only table."""
         found = dict(zip(self.system.coordinates[0].names, self.q.shape, strict=False))
         return found | {table.names[0]: len(self.tables[table.name]) for table in self.system.tables}
 
@@ -38,7 +38,7 @@ def random(*shape: int) -> Any:
 def case(coordinates: str, lagrangian: str, q: Any, velocity: Any, h: float, **extra: Any) -> Case:
     """A system of one array."""
     declared = {key: extra.pop(key) for key in ("declared", "places") if key in extra}
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="case",
         coordinates=[coordinates],
         lagrangian=lagrangian,
@@ -100,7 +100,7 @@ CASES = {
 def test_array_system_equals_the_unrolled_system(name: str, method: str) -> None:
     """States, energies, momentum maps and errors of steps are those of the system written out, to round-off."""
     each = CASES[name]
-    own = sc.compile_indexed(each.system, method).integrate(
+    own = sc.compile_stepper(each.system, method).integrate(
         each.q,
         velocity=each.velocity,
         h=each.h,
@@ -125,7 +125,7 @@ def test_array_system_equals_the_unrolled_system(name: str, method: str) -> None
 @pytest.mark.parametrize("method", ["svi:4", "gauss:3", "svi:9"])
 def test_hamiltonian_array_system_equals_the_unrolled_system(method: str) -> None:
     """The discrete nonlinear Schroedinger equation on a net; its norm, an angular momentum of all phases, is kept."""
-    field = sc.IndexedSystem.from_text(
+    field = sc.HamiltonianSystem.from_text(
         name="field",
         coordinates=["q[N]"],
         momenta=["p[N]"],
@@ -136,7 +136,7 @@ def test_hamiltonian_array_system_equals_the_unrolled_system(method: str) -> Non
     )
     bonds = {"bonds": [[0, 1], [1, 2], [2, 0], [2, 3]]}
     q, p = 0.5 * random(2, 4)
-    stepper = sc.compile_indexed(field, method)
+    stepper = sc.compile_stepper(field, method)
     run = stepper.integrate(q, p, h=0.05, steps=100, save_every=25, tables=bonds)
     written = sc.unroll_sums(field, {"N": 4, "B": 4}, tables=bonds)
     other = sc.compile_stepper(written, method).integrate(q, p, h=0.05, steps=100, save_every=25)
@@ -156,8 +156,8 @@ def test_hamiltonian_array_system_equals_the_unrolled_system(method: str) -> Non
 @pytest.mark.parametrize("count", [2, 3, 64, 1000])
 def test_one_library_is_used_for_every_size(count: int) -> None:
     """A ring of coupled oscillators against its normal modes; momentum to round-off."""
-    stepper = sc.compile_indexed(
-        sc.IndexedSystem.from_text(
+    stepper = sc.compile_stepper(
+        sc.LagrangianSystem.from_text(
             name="ring",
             coordinates=["q[N]"],
             lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
@@ -177,12 +177,12 @@ def test_one_library_is_used_for_every_size(count: int) -> None:
 def test_energy_does_not_drift() -> None:
     """Over 20 000 steps of a variational method; an explicit one of its order oscillates."""
     each = CASES["ring"]
-    ring = sc.IndexedSystem.from_text(
+    ring = sc.LagrangianSystem.from_text(
         name="ring",
         coordinates=["q[N]"],
         lagrangian=f"{KINETIC} - sum(i in N periodic, (q[i+1] - q[i])**2/2 + (q[i+1] - q[i])**4/4)",
     )
-    run = sc.compile_indexed(ring, "svi:6").integrate(each.q, h=0.05, steps=20_000, save_every=200)
+    run = sc.compile_stepper(ring, "svi:6").integrate(each.q, h=0.05, steps=20_000, save_every=200)
     changes = run.energy() - run.energy()[0]
     assert run.energy_error() < 1e-13
     assert abs(changes[-20:].mean() - changes[:20].mean()) < 3e-14
@@ -192,7 +192,7 @@ def test_energy_does_not_drift() -> None:
 def test_energy_has_the_terms_without_coordinates(method: str) -> None:
     """Terms of parameters, fields and time, of one sum or two, as of the system written out; they are no forces."""
     extra = "3*sin(t) + a**2 + sum(i in N, a*f[i]*cos(t)) - sum(i in N, j in N, f[i]*f[j]) + sum(i in 0..N-2, 7*a)"
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="level",
         coordinates=["q[N]"],
         parameters={"a": 2, "f[N]": 1},
@@ -201,7 +201,7 @@ def test_energy_has_the_terms_without_coordinates(method: str) -> None:
     written = sc.compile_stepper(sc.unroll_sums(system, {"N": 3}), method)
     f = {"f_0": 0.3, "f_1": -0.7, "f_2": 1.9}
     start = {"velocity": random(3), "h": 0.1, "steps": 4, "t": 0.7}
-    own = sc.compile_indexed(system, method).integrate(random(3), parameters={"a": 1.5, "f": list(f.values())}, **start)
+    own = sc.compile_stepper(system, method).integrate(random(3), parameters={"a": 1.5, "f": list(f.values())}, **start)
     other = written.integrate(random(3), parameters={"a": 1.5, **f}, **start)
     assert np.abs(own.q["q"] - other.q).max() < 1e-15
     assert np.abs(own.energy() - other.energy()).max() < 1e-14 * np.abs(other.energy()).max()
@@ -209,9 +209,9 @@ def test_energy_has_the_terms_without_coordinates(method: str) -> None:
 
 
 def test_consecutive_runs_equal_one_run() -> None:
-    """Steps in one or several calls are bitwise equal; a stepper survives pickling."""
+    """So many steps at once or one after the other give the same bits; a stepper survives a pickle."""
     each = CASES["bodies"]
-    stepper = pickle.loads(pickle.dumps(sc.compile_indexed(each.system, "svi:4")))
+    stepper = pickle.loads(pickle.dumps(sc.compile_stepper(each.system, "svi:4")))
     runs = [stepper.start(each.q, velocity=each.velocity, h=0.05, parameters=each.parameters) for _ in range(2)]
     runs[0].advance(30)
     for _ in range(30):
@@ -224,9 +224,9 @@ def test_consecutive_runs_equal_one_run() -> None:
 
 @pytest.mark.parametrize("method", ["svi:4", "composition:8"])
 def test_restored_run_continues_bitwise(method: str) -> None:
-    """Tables and parameters are restored bitwise; other bytes are rejected."""
+    """To the bit, with its tables and parameters; other bytes are refused."""
     each = CASES["net"]
-    stepper = sc.compile_indexed(each.system, method)
+    stepper = sc.compile_stepper(each.system, method)
     run = stepper.start(each.q, velocity=each.velocity, h=0.1, tables=each.tables, parameters=each.parameters)
     run.advance(7)
     again = stepper.from_checkpoint(run.checkpoint())
@@ -239,13 +239,13 @@ def test_restored_run_continues_bitwise(method: str) -> None:
         with pytest.raises(sc.StateError, match="invalid saved run"):
             stepper.from_checkpoint(wrong)
     with pytest.raises(sc.StateError, match="the saved run is one of"):
-        sc.compile_indexed(each.system, "svi:2").from_checkpoint(run.checkpoint())
+        sc.compile_stepper(each.system, "svi:2").from_checkpoint(run.checkpoint())
 
 
 def test_observed_runs_save_the_requested_quantities() -> None:
-    """The first and the last state are saved."""
+    """And the first and the last state."""
     each = CASES["ring"]
-    stepper = sc.compile_indexed(each.system, "svi:2")
+    stepper = sc.compile_stepper(each.system, "svi:2")
     run = stepper.integrate(each.q, h=0.01, steps=25, save_every=10, observe=lambda run: run.q["q"][:2])
     assert run.observed is not None
     assert run.observed.shape == (3, 2)
@@ -263,16 +263,16 @@ def test_observed_runs_save_the_requested_quantities() -> None:
     ],
 )
 def test_unsupported_observations_are_rejected(observe: Any, message: str) -> None:
-    """Errors name the observation; they are neither NumPy errors nor NaN."""
+    """By name, not by NumPy, and not as NaN."""
     each = CASES["ring"]
     with pytest.raises(sc.StateError, match=message):
-        sc.compile_indexed(each.system, "svi:2").integrate(each.q, h=0.1, steps=2, observe=observe)
+        sc.compile_stepper(each.system, "svi:2").integrate(each.q, h=0.1, steps=2, observe=observe)
 
 
 def test_velocities_depend_on_masses() -> None:
-    """Velocities of saved states and of a run; representations fit one line."""
+    """Of the states that are kept, and of a run; what they show of themselves is a line."""
     each = CASES["bodies"]
-    stepper = sc.compile_indexed(each.system, "svi:2")
+    stepper = sc.compile_stepper(each.system, "svi:2")
     given = {"velocity": each.velocity, "h": 0.05, "parameters": each.parameters}
     run, going = stepper.integrate(each.q, steps=3, **given), stepper.start(each.q, **given)
     assert run.velocity["r"].shape == (4, 4, 2)
@@ -284,18 +284,18 @@ def test_velocities_depend_on_masses() -> None:
     shown = [repr(one) for one in (run, going, each.system)]
     assert shown[0] == "<IndexedTrajectory of 3 steps of 0.05: r (4, 4, 2)>"
     assert shown[1].endswith("; t = 0.15 after 3 steps of 0.05, solver fixed-point>")
-    assert shown[2] == "IndexedSystem(name='case', coordinates=(r[N, 2]))"
+    assert shown[2] == "LagrangianSystem(name='case', coordinates=(r[N, 2]))"
 
 
 def test_table_with_one_column_may_be_a_list() -> None:
-    """For example, fixed positions."""
-    constrained = sc.IndexedSystem.from_text(
+    """What is held in place, say."""
+    constrained = sc.LagrangianSystem.from_text(
         name="held",
         coordinates=["q[N]"],
         tables=["pins[P, 1]"],
         lagrangian=f"{KINETIC} - sum(p in P, q[pins[p, 0]]**2/2)",
     )
-    stepper = sc.compile_indexed(constrained, "svi:4")
+    stepper = sc.compile_stepper(constrained, "svi:4")
     runs = [stepper.integrate(random(4), h=0.1, steps=5, tables={"pins": pins}) for pins in ([1, 3], [[1], [3]])]
     assert np.array_equal(runs[0].q["q"], runs[1].q["q"])
     assert np.array_equal(runs[0].q["q"][-1, ::2], random(4)[::2])
@@ -303,10 +303,10 @@ def test_table_with_one_column_may_be_a_list() -> None:
 
 
 def test_energies_are_drawn() -> None:
-    """The energies may share axes with other trajectories."""
+    """As of other trajectories, whose axes they may share."""
     pytest.importorskip("matplotlib")
     each = CASES["ring"]
-    run = sc.compile_indexed(each.system, "svi:2").integrate(each.q, h=0.1, steps=20)
+    run = sc.compile_stepper(each.system, "svi:2").integrate(each.q, h=0.1, steps=20)
     line = sc.plot_energy([run, run]).get_lines()[0]
     assert line.get_ydata()[1:] == pytest.approx(abs(run.energy() / run.energy()[0] - 1)[1:], abs=1e-15)
 
@@ -343,8 +343,8 @@ def test_energies_are_drawn() -> None:
     ],
 )
 def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message: str) -> None:
-    """Arrays are checked before the run."""
-    net = sc.IndexedSystem.from_text(
+    """Before anything is done."""
+    net = sc.LagrangianSystem.from_text(
         name="net",
         coordinates=["r[N, 3]"],
         parameters={"k[B]": 1},
@@ -352,29 +352,29 @@ def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message
         lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2) - sum(b in B, k[b]*r[bonds[b, 0], 0]*r[bonds[b, 1], 1])",
     )
     with pytest.raises(sc.StateError, match=message):
-        sc.compile_indexed(net, "svi:2").start(q, **{"h": 0.1, **given})
+        sc.compile_stepper(net, "svi:2").start(q, **{"h": 0.1, **given})
 
 
 def test_failures_of_array_runs() -> None:
-    """A too large step fails and the preceding states are saved; a coordinate without mass is reported."""
+    """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
     each = CASES["ring"]
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
-        sc.compile_indexed(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
+        sc.compile_stepper(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
     assert len(caught.value.trajectory.t) == 1
-    bare = sc.IndexedSystem.from_text(
+    bare = sc.LagrangianSystem.from_text(
         name="bare", coordinates=["q[N]"], lagrangian="sum(i in 0..N-2, q_dot[i]**2/2) - sum(i in N, q[i]**2)"
     )
     with pytest.raises(sc.StateError, match="coordinate 2 of 3 has no positive mass"):
-        sc.compile_indexed(bare, "svi:2").start(np.ones(3), h=0.1)
+        sc.compile_stepper(bare, "svi:2").start(np.ones(3), h=0.1)
     with pytest.raises(sc.MethodError, match="not supported for indexed systems"):
-        sc.compile_indexed(bare, "scvi:4")
+        sc.compile_stepper(bare, "scvi:4")
     with pytest.warns(sc.AccuracyWarning):
-        sc.compile_indexed(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)
+        sc.compile_stepper(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)
 
 
 def test_index_out_of_range_of_a_table_is_rejected() -> None:
     """A loop over another size than the table's rows, found before a row is read."""
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="x",
         coordinates=["q[N]"],
         tables=["bonds[B, 2]"],
@@ -382,7 +382,7 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
     )
     message = r"bonds\[i, 0\] runs from 0 to 4, but bonds\[B, 2\] has B = 1 entries"
     with pytest.raises(sc.StateError, match=message):
-        sc.compile_indexed(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
+        sc.compile_stepper(system, "svi:2").start(np.ones(5), h=0.1, tables={"bonds": [[0, 1]]})
     with pytest.raises(sc.SystemDefinitionError, match="out of bounds"):
         sc.unroll_sums(system, {"N": 5, "B": 1}, tables={"bonds": [[0, 1]]})
 
@@ -390,20 +390,21 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
 def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method: str, most: float) -> None:
-    """For an oscillator, also where positions or momenta pass through 0; the energy is conserved."""
+    """Of an oscillator, also where positions or momenta pass through 0; its energy is kept."""
     formulas = {
         "lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
         "hamiltonian": "sum(i in N, (p_q[i]**2 + q[i]**2)/2)",
     }
-    system = sc.IndexedSystem.from_text(name="o", coordinates=["q[N]"], **{form: formulas[form]})
-    run = sc.compile_indexed(system, method).start(np.ones(3), 0.3 * np.ones(3), h=0.95 * most)
+    kind = sc.LagrangianSystem if form == "lagrangian" else sc.HamiltonianSystem
+    system = kind.from_text("o", ["q[N]"], formulas[form])
+    run = sc.compile_stepper(system, method).start(np.ones(3), 0.3 * np.ones(3), h=0.95 * most)
     before = run.energy
     run.advance(50)
     assert run.energy == pytest.approx(before, rel=1e-13)
     assert np.isnan(run.step_error) == (method == "svi:1" and form == "hamiltonian")
 
 
-FORCED = sc.IndexedSystem.from_text(
+FORCED = sc.LagrangianSystem.from_text(
     name="forced net",
     coordinates=["r[N, 2]"],
     parameters={"m[N]": 1, "c": 0.3, "w": 2},
@@ -423,7 +424,7 @@ def test_velocity_forces_equal_those_of_the_unrolled_system(method: str) -> None
     bonds, masses = {"bonds": [[0, 1], [1, 2], [2, 3], [0, 3]]}, {"m": [1, 2, 3, 4]}
     q, velocity = random(2, 4, 2)
     written = sc.unroll_sums(FORCED, {"N": 4, "B": 4}, tables=bonds, parameters=masses)
-    stepper = sc.compile_indexed(FORCED, method)
+    stepper = sc.compile_stepper(FORCED, method)
     run = stepper.integrate(q, velocity=velocity, h=0.05, steps=40, tables=bonds, parameters=masses)
     other = sc.compile_stepper(written, method).integrate(
         q.reshape(-1), velocity=velocity.reshape(-1), h=0.05, steps=40
@@ -439,22 +440,22 @@ def test_forces_of_position_and_time(method: str) -> None:
     """Explicit methods take them; those of velocities are refused."""
     chain = {"name": "chain", "coordinates": ["q[N]"], "parameters": {"c": 0.3}}
     lagrangian = f"{KINETIC} - sum(i in 0..N-2, (q[i+1] - q[i])**2)"
-    driven = sc.IndexedSystem.from_text(
+    driven = sc.LagrangianSystem.from_text(
         **chain, lagrangian=lagrangian, forces={"q[N-1]": "cos(t)", "q[i]": "-c*q[i]**3"}
     )
     q, velocity = random(2, 3)
-    run = sc.compile_indexed(driven, method).integrate(q, velocity=velocity, h=0.1, steps=30)
+    run = sc.compile_stepper(driven, method).integrate(q, velocity=velocity, h=0.1, steps=30)
     other = sc.compile_stepper(sc.unroll_sums(driven, {"N": 3}), method)
     assert run.q["q"] == pytest.approx(other.integrate(q, velocity=velocity, h=0.1, steps=30).q, abs=1e-14)
-    damped = sc.IndexedSystem.from_text(**chain, lagrangian=lagrangian, forces={"q[i]": "-c*q_dot[i]"})
+    damped = sc.LagrangianSystem.from_text(**chain, lagrangian=lagrangian, forces={"q[i]": "-c*q_dot[i]"})
     with pytest.raises(sc.MethodError, match="does not support velocity-dependent forces"):
-        sc.compile_indexed(damped, "stoermer-verlet")
+        sc.compile_stepper(damped, "stoermer-verlet")
 
 
 @pytest.mark.full
 def test_forces_depending_on_momenta() -> None:
     """Beside a Hamiltonian."""
-    system = sc.IndexedSystem.from_text(
+    system = sc.HamiltonianSystem.from_text(
         name="waves",
         coordinates=["q[N]"],
         parameters={"c": 0.3},
@@ -462,14 +463,14 @@ def test_forces_depending_on_momenta() -> None:
         forces={"q[i]": "-c*p_q[i] + cos(t)"},
     )
     q, p = 0.3 * random(2, 3)
-    run = sc.compile_indexed(system, "gauss:3").integrate(q, p, h=0.1, steps=30)
+    run = sc.compile_stepper(system, "gauss:3").integrate(q, p, h=0.1, steps=30)
     other = sc.compile_stepper(sc.unroll_sums(system, {"N": 3}), "gauss:3").integrate(q, p, h=0.1, steps=30)
     assert run.q["q"] == pytest.approx(other.q, abs=1e-14)
 
 
 def test_friction_damps_at_the_exact_rate() -> None:
     """A damped oscillator at every place, in closed form."""
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="damped",
         coordinates=["q[N]"],
         parameters={"c[N]": 1},
@@ -477,7 +478,7 @@ def test_friction_damps_at_the_exact_rate() -> None:
         dissipation="sum(i in N, c[i]*q_dot[i]**2/2)",
     )
     c = np.array([0.1, 0.5, 1.5])
-    run = sc.compile_indexed(system, "svi:5").integrate(np.ones(3), h=0.2, steps=50, parameters={"c": c})
+    run = sc.compile_stepper(system, "svi:5").integrate(np.ones(3), h=0.2, steps=50, parameters={"c": c})
     w = np.sqrt(1 - c**2 / 4)
     exact = np.exp(-5 * c) * (np.cos(10 * w) + c / (2 * w) * np.sin(10 * w))
     assert run.q["q"][-1] == pytest.approx(exact, abs=1e-12)
@@ -485,13 +486,13 @@ def test_friction_damps_at_the_exact_rate() -> None:
 
 def test_table_with_one_axis() -> None:
     """Springs at some places only."""
-    pinned = sc.IndexedSystem.from_text(
+    pinned = sc.LagrangianSystem.from_text(
         name="pinned",
         coordinates=["q[N]"],
         tables=["pins[P]"],
         lagrangian=f"{KINETIC} - sum(p in P, q[pins[p]]**2/2)",
     )
-    run = sc.compile_indexed(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
+    run = sc.compile_stepper(pinned, "svi:6").integrate(np.ones(4), h=0.1, steps=10, tables={"pins": [1, 3]})
     assert run.q["q"][-1] == pytest.approx([1, np.cos(1), 1, np.cos(1)], abs=1e-12)
     written = str(sc.unroll_sums(pinned, {"N": 2, "P": 1}, tables={"pins": [1]}).formula)
     assert "q_1**2" in written
@@ -501,10 +502,10 @@ def test_table_with_one_axis() -> None:
 def test_error_estimate_of_a_step_from_rest_at_the_origin() -> None:
     """Where nothing but a drive moves anything, it is a part of where that leads; it is held against the coefficient
     below the highest, which is far too much for so short a step."""
-    driven = sc.IndexedSystem.from_text(
+    driven = sc.LagrangianSystem.from_text(
         name="driven", coordinates=["q[N]"], lagrangian=f"{KINETIC} - sum(i in N, q[i]**2/2)", forces={"q[0]": "cos(t)"}
     )
-    run = sc.compile_indexed(driven, "svi:4").start(np.zeros(3), h=0.2)
+    run = sc.compile_stepper(driven, "svi:4").start(np.zeros(3), h=0.2)
     run.advance(1)
     error = abs(run.q["q"][0] - 0.1 * np.sin(0.2)) / 0.02
     assert 0.1 * error < run.step_error < 1e5 * error

@@ -17,7 +17,7 @@ ROUNDING = 2.0**-52
 
 def net(axes=2):
     """Masses in weight, rods between them by a table, pins."""
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="net",
         coordinates=[f"r[N, {axes}]"],
         parameters={"m[N]": 1, "l[B]": 1, "g": 9.81, f"x[P, {axes}]": 0},
@@ -59,7 +59,7 @@ def residuals(run):
 
 @pytest.fixture(scope="module")
 def stepper():
-    return sc.compile_indexed(net(), RATTLE)
+    return sc.compile_stepper(net(), RATTLE)
 
 
 def test_steps_states_and_multipliers_equal_those_of_the_unrolled_system(stepper):
@@ -106,7 +106,7 @@ def test_chain_needs_one_product_per_correction(stepper):
 
 
 def test_cloth_conserves_rod_lengths_and_energy():
-    stepper = sc.compile_indexed(net(3), "stoermer-verlet")
+    stepper = sc.compile_stepper(net(3), "stoermer-verlet")
     q, velocity, data = cloth(12)
     run = stepper.start(*stepper.project(q, velocity=velocity, **data), h=0.004, **data)
     before, kinetic, changes = run.energy, run.energies[0], []
@@ -121,7 +121,7 @@ def test_cloth_conserves_rod_lengths_and_energy():
 
 
 def test_compositions_have_their_order_and_satisfy_constraints():
-    stepper = sc.compile_indexed(net(), "composition:8")
+    stepper = sc.compile_stepper(net(), "composition:8")
     q, data = chain(3)
     exact = stepper.integrate(q, h=1 / 400, steps=400, save_every=400, **data).q["r"][-1]
     errors = [
@@ -171,16 +171,16 @@ def test_observed_and_restored_runs_continue_bitwise(stepper):
 
 def test_momentum_maps_compatible_with_constraints_are_conserved():
     """Free rods turn in space; pins hold them, by whose constraints nothing is kept."""
-    free = sc.IndexedSystem.from_text(
+    free = sc.LagrangianSystem.from_text(
         name="molecule",
         coordinates=["r[N, 3]"],
         tables=["bonds[B, 2]"],
         lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2)/2)",
         constraints=["sum(a in 3, (r[bonds[b, 0], a] - r[bonds[b, 1], a])**2) = 1 for b in B"],
     )
-    stepper = sc.compile_indexed(free, "stoermer-verlet")
+    stepper = sc.compile_stepper(free, "stoermer-verlet")
     assert len(stepper.momentum_map_names) == 6
-    assert sc.compile_indexed(net(), "stoermer-verlet").momentum_map_names == ()
+    assert sc.compile_stepper(net(), "stoermer-verlet").momentum_map_names == ()
     q = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
     velocity = np.random.default_rng(2).normal(size=q.shape)
     tables = {"bonds": [[0, 1], [1, 2], [2, 3]]}
@@ -191,13 +191,13 @@ def test_momentum_maps_compatible_with_constraints_are_conserved():
 
 def test_time_dependent_constraints_are_satisfied():
     """A pendulum whose pivot shakes is that written out in its angle."""
-    shaken = sc.IndexedSystem.from_text(
+    shaken = sc.LagrangianSystem.from_text(
         name="shaken",
         coordinates=["r[N, 2]"],
         lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",
         constraints=["(r[i, 0] - sin(3*t)/10)**2 + r[i, 1]**2 = 1 for i in N"],
     )
-    stepper = sc.compile_indexed(shaken, "composition:8")
+    stepper = sc.compile_stepper(shaken, "composition:8")
     run = stepper.integrate([[0.0, -1.0]], velocity=[[0.3, 0.0]], h=0.02, steps=100, save_every=100)
     angle = sc.LagrangianSystem.from_text(
         name="angle",
@@ -279,17 +279,21 @@ def test_discontinuous_constraint_parameters_are_rejected(stepper):
     ],
 )
 def test_invalid_constraints_are_rejected(text, message):
-    with pytest.raises(SystemDefinitionError, match=message):
-        sc.IndexedSystem.from_text(
+    def compiled():
+        system = sc.LagrangianSystem.from_text(
             name="x",
             coordinates=["r[N, 2]"],
             parameters={"g": 1},
             lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
             constraints=[text],
         )
+        return sc.compile_stepper(system, "stoermer-verlet")
+
+    with pytest.raises(SystemDefinitionError, match=message):
+        compiled()
 
 
 @pytest.mark.parametrize("method", ["svi:2", "gauss:2", sc.StoermerVerlet("drift-kick-drift")])
 def test_methods_without_constraint_support_are_rejected(method):
     with pytest.raises(MethodError, match="RATTLE"):
-        sc.compile_indexed(net(), method)
+        sc.compile_stepper(net(), method)

@@ -23,7 +23,7 @@ K = np.array([1.0, 2.0])
 
 @pytest.fixture(scope="module")
 def chain() -> sc.IndexedStepper:
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="chain",
         coordinates=["q[N]"],
         tables=["bonds[B, 2]"],
@@ -32,19 +32,19 @@ def chain() -> sc.IndexedStepper:
         lagrangian="sum(i in N, q_dot[i]**2/2) - sum(b in B, k[b]*(q[bonds[b, 1]] - q[bonds[b, 0]])**2/2)",
         forces={"q[0]": "F"},
     )
-    return sc.compile_indexed(system, "svi:3", flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, "svi:3", flags=QUICK_FLAGS)
 
 
 @pytest.fixture(scope="module")
 def pendulums() -> sc.IndexedStepper:
-    """Return pendulums with constraints, whose memory depends on positions."""
-    system = sc.IndexedSystem.from_text(
+    """With constraints, whose memory has places, too."""
+    system = sc.LagrangianSystem.from_text(
         name="pendulums",
         coordinates=["x[N]", "y[N]"],
         lagrangian="sum(i in N, x_dot[i]**2/2 + y_dot[i]**2/2 - y[i])",
         constraints=["x[i]**2 + y[i]**2 - 1 for i in N"],
     )
-    return sc.compile_indexed(system, "stoermer-verlet", flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, "stoermer-verlet", flags=QUICK_FLAGS)
 
 
 def start(stepper: sc.IndexedStepper, **given: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Newton's iteration for array systems agrees with that of the unrolled system where fixed-point iterations fail."""
+"""Newton's iteration for sums over indices: where sweeps fail it ends where that of the system written out does."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ ROUNDING = 2.0**-52
 
 def field(strength):
     """A lattice of stiff places, with a force that depends on time, and one on the neighbours."""
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="field",
         coordinates=["q[N]"],
         parameters={"w": strength, "m[N]": 1},
@@ -24,7 +24,7 @@ def field(strength):
 
 def molecules():
     """Stiff bonds between soft ones, in the plane, by a table."""
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="molecules",
         coordinates=["r[N, 2]"],
         parameters={"k[B]": 1, "length[B]": 1},
@@ -38,7 +38,7 @@ def molecules():
 @pytest.mark.parametrize(("strength", "h"), [(1.0, 0.1), (400.0, 0.5), (1e4, 0.5)])
 def test_newton_steps_equal_those_of_the_unrolled_system(method, strength, h):
     system, masses = field(strength), np.linspace(1.0, 2.0, 5)
-    own = sc.compile_indexed(system, method, solver="newton")
+    own = sc.compile_stepper(system, method, solver="newton")
     small = sc.unroll_sums(system, {"N": 5}, parameters={"m": masses})
     other = sc.compile_stepper(small, method, solver="newton")
     q, v = RANDOM.normal(size=(2, 5))
@@ -60,8 +60,8 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
     start = np.stack([np.arange(count), np.zeros(count)], axis=1)
     velocity = np.stack([np.zeros(count), np.repeat(np.sin(np.arange(count // 2) / 3.0), 2) / 10], axis=1)
     data = {"tables": {"bonds": chain}, "parameters": {"k": k}}
-    newton = sc.compile_indexed(molecules(), "svi:4", solver="newton")
-    iterations = sc.compile_indexed(molecules(), "svi:4")
+    newton = sc.compile_stepper(molecules(), "svi:4", solver="newton")
+    iterations = sc.compile_stepper(molecules(), "svi:4")
     with pytest.raises(StepFailedError, match="solver='newton'"):
         iterations.integrate(start, velocity=velocity, h=0.05, steps=1, **data)
     run = newton.integrate(start, velocity=velocity, h=0.05, steps=20, **data)
@@ -75,13 +75,13 @@ def test_stiff_bonds_at_rest_do_not_limit_the_step_size():
 def test_newton_supports_adaptive_steps():
     system = field(100.0)
     q, v = RANDOM.normal(size=(2, 6))
-    own, other = (sc.compile_indexed(system, "svi:6", solver=solver) for solver in ("newton", "fixed-point"))
+    own, other = (sc.compile_stepper(system, "svi:6", solver=solver) for solver in ("newton", "fixed-point"))
     ends = [each.integrate(q, velocity=v, t_end=1.0, tolerance=1e-10).q["q"][-1] for each in (own, other)]
     assert np.abs(ends[0] - ends[1]).max() < 1e-7
 
 
 def test_saved_runs_continue_with_newton_only():
-    own, other = (sc.compile_indexed(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
+    own, other = (sc.compile_stepper(field(1.0), "svi:4", solver=solver) for solver in ("newton", "fixed-point"))
     run = own.start(np.sin(np.arange(8.0)), h=0.1)
     run.advance(3)
     saved = run.checkpoint()
@@ -95,12 +95,12 @@ def test_saved_runs_continue_with_newton_only():
 
 
 def test_step_without_convergence_fails():
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="long waves",
         coordinates=["q[N]"],
         lagrangian="sum(i in N, q_dot[i]**2/2) - 1e12*sum(i in N periodic, (q[i+1] - q[i])**2/2 - cos(q[i]))",
     )
-    stepper, q = sc.compile_indexed(system, "svi:4", solver="newton"), RANDOM.normal(size=3000)
+    stepper, q = sc.compile_stepper(system, "svi:4", solver="newton"), RANDOM.normal(size=3000)
     run = stepper.start(q, h=1.0)
     with pytest.raises(StepFailedError, match="GMRES"):
         run.advance(1)
@@ -108,11 +108,11 @@ def test_step_without_convergence_fails():
 
 
 def test_methods_without_newton_are_rejected():
-    damped = sc.IndexedSystem.from_text(
+    damped = sc.LagrangianSystem.from_text(
         name="damped", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2)", forces={"q[i]": "-q_dot[i]"}
     )
     for system, method in ((field(1.0), "stoermer-verlet"), (damped, "svi:4")):
         with pytest.raises(MethodError, match="leave out solver"):
-            sc.compile_indexed(system, method, solver="newton").integrate(np.zeros(3), h=0.1, steps=1)
+            sc.compile_stepper(system, method, solver="newton").integrate(np.zeros(3), h=0.1, steps=1)
     with pytest.raises(MethodError, match="use 'fixed-point' or 'newton'"):
-        sc.compile_indexed(field(1.0), "svi:4", solver="krylov")
+        sc.compile_stepper(field(1.0), "svi:4", solver="krylov")

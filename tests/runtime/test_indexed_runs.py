@@ -22,7 +22,7 @@ def written(system):
 
 @pytest.fixture(scope="module")
 def ring():
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="FPUT ring",
         coordinates=["q[N]"],
         parameters={"beta": 0.25},
@@ -32,12 +32,12 @@ def ring():
 
 @pytest.fixture(scope="module")
 def steppers(ring):
-    return sc.compile_indexed(ring, "svi:6"), written(ring)
+    return sc.compile_stepper(ring, "svi:6"), written(ring)
 
 
 @pytest.fixture(scope="module")
 def driven():
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="driven",
         coordinates=["q[N]"],
         parameters={"c": 0.1},
@@ -95,13 +95,13 @@ class TestControlledSteps:
         assert np.abs(back.q["q"][-1] - Q).max() < 1e-13
 
     def test_adaptive_steps_of_hamiltonians(self):
-        system = sc.IndexedSystem.from_text(
+        system = sc.HamiltonianSystem.from_text(
             name="field",
             coordinates=["q[N]"],
             momenta=["p[N]"],
             hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
         )
-        run = sc.compile_indexed(system, "gauss:4").integrate(Q, V, t_end=3.0, tolerance=1e-10)
+        run = sc.compile_stepper(system, "gauss:4").integrate(Q, V, t_end=3.0, tolerance=1e-10)
         other = sc.compile_stepper(sc.unroll_sums(system, {"N": N}), "gauss:4").integrate(Q, V, t_end=3.0)
         assert np.abs(run.q["q"][-1] - other.q[-1]).max() < 1e-8
 
@@ -120,7 +120,7 @@ class TestControlledSteps:
     def test_unsupported_adaptive_arguments_are_rejected(self, steppers, ring):
         stepper, _ = steppers
         with pytest.raises(MethodError, match="adaptive steps are unavailable"):
-            sc.compile_indexed(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
+            sc.compile_stepper(ring, "stoermer-verlet").integrate(Q, t_end=1.0)
         for given, message in (
             ({}, "give either h .fixed step size. or t_end"),
             ({"h": 0.1}, "h requires steps or t_end"),
@@ -206,13 +206,13 @@ class TestInputs:
     def test_runs_with_inputs_equal_those_of_the_unrolled_system(self, driven, way):
         own, other = (
             each.integrate(Q, velocity=V, inputs=DATA, save_every=4, **way)
-            for each in (sc.compile_indexed(driven, "svi:6"), written(driven))
+            for each in (sc.compile_stepper(driven, "svi:6"), written(driven))
         )
         assert np.abs(own.q["q"][-1] - other.q[-1]).max() < 1e-13
         assert np.abs(own.at(3.2)[0]["q"] - other.at(3.2)[0]).max() < 1e-13
 
     def test_inputs_are_constant_between_samples(self, driven):
-        stepper, other = sc.compile_indexed(driven, "svi:6"), written(driven)
+        stepper, other = sc.compile_stepper(driven, "svi:6"), written(driven)
         runs = (stepper.start(Q, velocity=V, h=0.1), other.start(Q, velocity=V, h=0.1))
         for force in (1.0, -2.0):
             for run in runs:
@@ -225,8 +225,8 @@ class TestInputs:
 
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
-        """Equal samples need no additional iteration; different ones need fewer than without a predictor."""
-        stepper = sc.compile_indexed(driven, method)
+        """Samples of the same number cost no sweep more than none; of another, fewer than from nothing."""
+        stepper = sc.compile_stepper(driven, method)
         runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
         for run in runs:
             run.set_inputs(F=0.3)
@@ -247,7 +247,7 @@ class TestInputs:
         assert np.abs(others.q["q"] - none.q["q"]).max() < 1e-13
 
     def test_missing_inputs_are_reported(self, driven):
-        stepper = sc.compile_indexed(driven, "svi:6")
+        stepper = sc.compile_stepper(driven, "svi:6")
         with pytest.raises(StateError, match="the input 'F' is not set"):
             stepper.integrate(Q, h=0.1, steps=1)
         run = stepper.start(Q, h=0.1)
@@ -267,10 +267,10 @@ class TestInputs:
 
 def test_parameters_affect_the_first_kick_of_an_explicit_method():
     """Whose force is kept from the step before, which had another."""
-    spring = sc.IndexedSystem.from_text(
+    spring = sc.LagrangianSystem.from_text(
         name="spring", coordinates=["q[N]"], parameters={"k": 1}, lagrangian="sum(i in N, q_dot[i]**2/2 - k*q[i]**2/2)"
     )
-    stepper = sc.compile_indexed(spring, "stoermer-verlet")
+    stepper = sc.compile_stepper(spring, "stoermer-verlet")
     run = stepper.start([1.0, 0.5], h=0.1)
     run.advance(3)
     run.update(parameters={"k": 5.0})
@@ -282,10 +282,10 @@ def test_parameters_affect_the_first_kick_of_an_explicit_method():
 
 def test_error_estimate_survives_a_zero_of_one_coefficient() -> None:
     """One quartic oscillator, whose highest coefficient vanishes now and then: no step changes the energy by more."""
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="quartic", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**4/4)"
     )
-    stepper, worst = sc.compile_indexed(system, "svi:4"), 0.0
+    stepper, worst = sc.compile_stepper(system, "svi:4"), 0.0
     for phase in np.linspace(0.0, 6.0, 12):
         run = stepper.integrate([np.cos(phase)], velocity=[np.sin(phase)], t_end=30.0, tolerance=1e-4)
         worst = max(worst, np.abs(np.diff(run.energy())).max() / run.energy()[0])

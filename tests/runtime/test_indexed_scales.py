@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from either_system import either_system
 
 import scvi_codegen as sc
 
@@ -27,10 +28,10 @@ def springs(form):
     energy = "sum(i in N periodic, (q[i+1] - q[i])**2)/2 + sum(i in N, q[i]**2)/2"
     if form == "hamiltonian":
         momenta = "sum(i in N, p[i]**2)/2 + sum(i in N, q[i]*p[i])/8"
-        return sc.IndexedSystem.from_text(
+        return sc.HamiltonianSystem.from_text(
             name="springs", coordinates=["q[N]"], momenta=["p[N]"], hamiltonian=f"{momenta} + {energy}"
         )
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="springs", coordinates=["q[N]"], lagrangian=f"sum(i in N, q_dot[i]**2)/2 - ({energy})"
     )
 
@@ -38,7 +39,7 @@ def springs(form):
 @cache
 def run_of(method, solver, h, scale):
     form = "hamiltonian" if method == "hamiltonian" else ""
-    made = sc.compile_indexed(springs(form), "svi:4" if form else method, solver=solver)
+    made = sc.compile_stepper(springs(form), "svi:4" if form else method, solver=solver)
     run = made.start(scale * Q, scale * P, h=h)
     run.advance(STEPS)
     return run
@@ -63,12 +64,12 @@ def test_iteration_counts_are_those_recorded(method, solver, h):
 @pytest.mark.parametrize(("method", "solver"), WAYS)
 @pytest.mark.parametrize("force", [0.0, 2.0**-90])
 def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, force):
-    """The initial state is 0, so no relative change is defined."""
+    """Where there is nothing yet, beside which a change would be small."""
     hamiltonian = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/2 + q[i]**2/2) - e*cos(t)*q[0]"}
     lagrangian = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + e*cos(t)*q[0]"}
     form = hamiltonian if method == "hamiltonian" else lagrangian
-    driven = sc.IndexedSystem.from_text(name="driven", coordinates=["q[N]"], parameters={"e": 1}, **form)
-    made = sc.compile_indexed(driven, "svi:4" if method == "hamiltonian" else method, solver=solver)
+    driven = either_system(name="driven", coordinates=["q[N]"], parameters={"e": 1}, **form)
+    made = sc.compile_stepper(driven, "svi:4" if method == "hamiltonian" else method, solver=solver)
     ends = []
     for e in (1.0, force):
         run = made.start(np.zeros(6), h=0.1, parameters={"e": e})
@@ -79,10 +80,10 @@ def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, forc
 
 def test_nan_momentum_fails_the_step():
     """The last kick of a leapfrog step is at a wall, which the positions just reach."""
-    wall = sc.IndexedSystem.from_text(
+    wall = sc.LagrangianSystem.from_text(
         name="wall", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2)/2 - sum(i in N, 1/(q[i] - 1))"
     )
-    run = sc.compile_indexed(wall, "stoermer-verlet").start([0.0], [0.5], h=1.0)
+    run = sc.compile_stepper(wall, "stoermer-verlet").start([0.0], [0.5], h=1.0)
     with pytest.raises(sc.StepFailedError, match="finite"):
         run.advance(1)
     assert run.q["q"][0] == 0.0
@@ -97,10 +98,10 @@ def test_light_stiff_mass_conserves_energy_next_to_a_slow_one(form):
     else:
         text = {"lagrangian": "sum(i in N, m[i]*q_dot[i]**2 - k[i]*q[i]**2 - c[i]*q[i]**4)/2"}
     parameters = {"m[N]": 1, "k[N]": 1, "c[N]": 1}
-    system = sc.IndexedSystem.from_text(name="pair", coordinates=["q[N]"], parameters=parameters, **text)
+    system = either_system(name="pair", coordinates=["q[N]"], parameters=parameters, **text)
     stiffness = light * frequency**2
     data = {"m": [1.0, light], "k": [1.0, stiffness], "c": [0.5, 0.0]}
-    run = sc.compile_indexed(system, "svi:8").start([1.0, amplitude], np.zeros(2), h=0.05, parameters=data)
+    run = sc.compile_stepper(system, "svi:8").start([1.0, amplitude], np.zeros(2), h=0.05, parameters=data)
     run.advance(2000)
     energy = run.p["q"][1] ** 2 / light + stiffness * run.q["q"][1] ** 2
     assert abs(energy / (stiffness * amplitude**2) - 1) < 2e-14
@@ -118,7 +119,7 @@ def test_squares_of_states_neither_overflow_nor_underflow(method, solver, h, exp
 @pytest.mark.parametrize(("method", "solver"), [way for way in WAYS if way[0] != "stoermer-verlet"])
 def test_adaptive_steps_are_controlled_at_every_scale(method, solver, exponent):
     form = "hamiltonian" if method == "hamiltonian" else ""
-    made = sc.compile_indexed(springs(form), "svi:4" if form else method, solver=solver)
+    made = sc.compile_stepper(springs(form), "svi:4" if form else method, solver=solver)
     one, scaled = (made.integrate(s * Q, s * P, t_end=2.0, tolerance=1e-9) for s in (1.0, 2.0**exponent))
     assert scaled.steps == pytest.approx(one.steps, abs=2)
     assert np.abs(np.ldexp(scaled.q["q"][-1], -exponent) - one.q["q"][-1]).max() < 1e-8

@@ -16,8 +16,8 @@ import pytest
 from programs import needs
 
 import scvi_codegen as sc
+from scvi_codegen.compiler import generate_array_source
 from scvi_codegen.errors import MethodError, StateError
-from scvi_codegen.indexed_compiler import generate_indexed
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
@@ -109,11 +109,11 @@ CASES = {
 }
 
 
-def system_of(case: Case) -> sc.IndexedSystem:
-    """Return a system with unit masses."""
+def system_of(case: Case) -> sc.LagrangianSystem:
+    """With unit masses."""
     axes = "i in N, j in N" if "N, N" in case.coordinates else "i in N, j in M" if "M" in case.coordinates else "i in N"
     velocity = "q_dot[i, j]" if "j" in axes else "q_dot[i]"
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name="shared",
         coordinates=[case.coordinates],
         tables=[each for each in ("bonds[B, 2]", "pins[P]") if each.split("[")[0] in case.potential],
@@ -124,7 +124,7 @@ def system_of(case: Case) -> sc.IndexedSystem:
 
 @cache
 def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.IndexedStepper:
-    return sc.compile_indexed(system_of(CASES[name]), method, solver=solver)
+    return sc.compile_stepper(system_of(CASES[name]), method, solver=solver)
 
 
 def start_of(name: str) -> Any:
@@ -169,7 +169,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) 
 
 
 def test_iterative_methods_agree_with_leapfrog() -> None:
-    """Both methods take small steps."""
+    """By short steps of both."""
     for name in ("ring", "pairs", "net"):
         case = CASES[name]
         ends = [
@@ -196,20 +196,20 @@ def test_adaptive_steps_with_threads() -> None:
 
 
 def test_hamiltonians_and_velocity_dependent_forces_with_threads() -> None:
-    field = sc.IndexedSystem.from_text(
+    field = sc.HamiltonianSystem.from_text(
         name="field",
         coordinates=["q[N]"],
         momenta=["p[N]"],
         hamiltonian="sum(i in N periodic, ((q[i+1] - q[i])**2 + (p[i+1] - p[i])**2)/2 - (q[i]**2 + p[i]**2)**2/4)",
     )
-    damped = sc.IndexedSystem.from_text(
+    damped = sc.LagrangianSystem.from_text(
         name="damped",
         coordinates=["q[N]"],
         lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)",
         forces={"q[i]": "-q_dot[i]**3", "q[0]": "cos(t)"},
     )
     for system, method in ((field, "gauss:4"), (damped, "svi:4")):
-        stepper, q = sc.compile_indexed(system, method), np.sin(0.1 * np.arange(5000))
+        stepper, q = sc.compile_stepper(system, method), np.sin(0.1 * np.arange(5000))
         found = [bits(stepper.integrate(q, np.cos(0.2 * q), h=0.1, steps=4, threads=threads)) for threads in THREADS]
         assert found[1:] == found[:1] * (len(THREADS) - 1)
 
@@ -268,14 +268,14 @@ def test_invalid_thread_counts_are_rejected() -> None:
     for threads in (0, -1, 65):
         with pytest.raises(StateError, match="threads"):
             stepper.start(q, h=0.1, threads=threads)
-    rods = sc.IndexedSystem.from_text(
+    rods = sc.LagrangianSystem.from_text(
         name="rods",
         coordinates=["r[N, 2]"],
         lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2)",
         constraints=["sum(a in 2, r[i, a]**2) = 1 for i in N"],
     )
     with pytest.raises(MethodError, match="one thread"):
-        sc.compile_indexed(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
+        sc.compile_stepper(rods, "stoermer-verlet").start(np.array([[1.0, 0.0]]), h=0.1, threads=2)
 
 
 WINDOWS = """
@@ -306,9 +306,9 @@ int main(void)
 
 @pytest.fixture(scope="module")
 def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
-    """Return rounds and windows of term groups of several sizes, as computed in C."""
+    """Rounds and windows of families of several sizes, as C says them."""
     folder = tmp_path_factory.mktemp("windows")
-    source, _ = generate_indexed(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
+    source, _ = generate_array_source(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
     for path, text in {**source.files, "main.c": WINDOWS}.items():
         (folder / path).parent.mkdir(exist_ok=True)
         (folder / path).write_text(text)
@@ -321,7 +321,7 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], l
 
 
 def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tuple[str, int], list[list[int]]]) -> None:
-    """Blocks of a round are disjoint, and every index is in one block."""
+    """Of a round; and every index is in one block."""
     several = 0
     for (what, size), each in windows.items():
         if what == "tiles":
@@ -390,7 +390,7 @@ static int create(pthread_t *thread, const pthread_attr_t *attributes, void *(*g
 
 def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -> None:
     """Write the source of a run with threads, and the C program that makes it."""
-    source, interface = generate_indexed(system_of(CASES[name]), method, solver=solver, prefix="shared")
+    source, interface = generate_array_source(system_of(CASES[name]), method, solver=solver, prefix="shared")
     for path, text in source.files.items():
         (folder / path).parent.mkdir(exist_ok=True)
         (folder / path).write_text(text)
@@ -422,7 +422,7 @@ def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
     + [("ring", "svi:4", "newton")],
 )
 def test_threads_have_no_data_races(name: str, method: str, solver: str, tmp_path: Path) -> None:
-    """The thread sanitizer is used if the compiler has it."""
+    """By the thread sanitizer, where the compiler has it."""
     needs("setarch")
     program(name, method, solver, tmp_path, threads=3, steps=4)
     flags = ["-std=c99", "-O1", "-g", "-fsanitize=thread", "-DSCVI_THREADS", "-pthread", "-Wno-psabi"]

@@ -1,4 +1,4 @@
-"""Circulant preconditioner: steps on lattices far beyond the limit of fixed-point iterations need few products."""
+"""What waves precondition: steps on lattices far beyond the limit of sweeps, with few products."""
 
 from functools import cache
 
@@ -28,12 +28,12 @@ COUNTS = [("ring to the fourth", 1000, 5), ("chain", 1000, 40), ("beam", 500, 30
 
 @cache
 def stepper_of(name, method="svi:4", solver="newton"):
-    return sc.compile_indexed(lattice(name), method, solver=solver)
+    return sc.compile_stepper(lattice(name), method, solver=solver)
 
 
 def lattice(name):
     potential = LATTICES[name]
-    return sc.IndexedSystem.from_text(
+    return sc.LagrangianSystem.from_text(
         name=name,
         coordinates=["q[NX, NY]" if "NX" in potential else "q[N]"],
         parameters={"k": 1},
@@ -47,7 +47,7 @@ def smooth(shape):
 
 
 def products_of(stepper, q, h, *, steps=1, **given):
-    """Return the number of products of steps, which must converge."""
+    """How many products steps take, which must converge."""
     run = stepper.start(q, h=h, **given)
     report = run._binding.new("report *")
     assert run._steps(steps, report) == 0
@@ -57,7 +57,7 @@ def products_of(stepper, q, h, *, steps=1, **given):
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
 def test_fourier_modes_of_a_linear_ring_decouple(size, method):
-    """With the transform of each size and the exact symbol, one product leaves only rounding."""
+    """With the right transform of every size, and the right symbol, a product leaves nothing but rounding."""
     q = RANDOM.normal(size=size)
     assert products_of(stepper_of("ring", method), q, 1.0, parameters={"k": 1e3}) <= 3
 
@@ -70,14 +70,14 @@ def test_fourier_modes_of_a_plane_decouple(shape):
 
 def test_each_array_has_its_circulant_preconditioner():
     """Components, and arrays of other axes: all are asked at a time, and none answers for another."""
-    arrays = sc.IndexedSystem.from_text(
+    arrays = sc.LagrangianSystem.from_text(
         name="arrays",
         coordinates=["r[N, 3]", "u[NX, NY]"],
         lagrangian="sum(i in N, sum(a in 3, r_dot[i, a]**2/2)) + sum(i in NX, j in NY, u_dot[i, j]**2/2)"
         "- sum(i in N periodic, 9*(r[i+1, 0] - r[i, 0])**2 + 900*(r[i+2, 1] - r[i, 1])**2 + r[i, 2]**2)"
         "- sum(i in NX periodic, j in NY periodic, 300*(u[i+1, j] - u[i, j+1])**2)",
     )
-    stepper = sc.compile_indexed(arrays, "svi:4", solver="newton")
+    stepper = sc.compile_stepper(arrays, "svi:4", solver="newton")
     start = {"r": RANDOM.normal(size=(60, 3)), "u": RANDOM.normal(size=(20, 33))}
     assert products_of(stepper, start, 1.0) <= 3
 
@@ -91,7 +91,7 @@ def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("k", [1e2, 1e5])
 def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
-    """Compare with Newton's iteration with full matrices; very small lattices have no preconditioner."""
+    """By Newton's iteration with whole matrices; the least lattices are too small to be asked for waves."""
     for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
         sizes = dict(zip(("NX", "NY"), shape, strict=True)) if "plane" in name else {"N": shape}
         small = sc.unroll_sums(lattice(name), sizes)
@@ -108,7 +108,7 @@ def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
 
 @pytest.mark.parametrize("name", ["chain", "beam"])
 def test_corrections_are_accurate_in_badly_scaled_systems(name):
-    """The size has a factor that is not transformed, and the diagonal is a poor preconditioner for long waves."""
+    """The size has a factor beyond those that are transformed, and the diagonal says nothing of long waves."""
     run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
     with pytest.raises(StepFailedError, match="GMRES"):
         run.advance(1)
@@ -125,13 +125,13 @@ def test_results_do_not_depend_on_the_number_of_threads():
 
 def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     """Places that differ by a factor of a million, with springs between them that are soft to most."""
-    places = sc.IndexedSystem.from_text(
+    places = sc.LagrangianSystem.from_text(
         name="places",
         coordinates=["q[N]"],
         parameters={"w[N]": 1},
         lagrangian="sum(i in N, q_dot[i]**2/2 - w[i]*q[i]**2/2) - sum(i in N periodic, 2*(q[i+1] - q[i])**2)",
     )
-    stepper, w = sc.compile_indexed(places, "svi:4", solver="newton"), 10.0 ** RANDOM.uniform(0, 6, size=400)
+    stepper, w = sc.compile_stepper(places, "svi:4", solver="newton"), 10.0 ** RANDOM.uniform(0, 6, size=400)
     assert products_of(stepper, RANDOM.normal(size=400), 1.0, parameters={"w": w}) <= 120
 
 
@@ -149,7 +149,7 @@ def test_diagonal_preconditioner_is_used_for_nonuniform_lattices():
     ],
 )
 def test_systems_with_a_circulant_preconditioner(term, reach):
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="some",
         coordinates=["u[N, 2]"],
         parameters={"w[B]": 1},

@@ -56,8 +56,8 @@ def rod() -> sc.LagrangianSystem:
     )
 
 
-def array() -> sc.IndexedSystem:
-    return sc.IndexedSystem.from_text(
+def array() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
         name="bodies of an array",
         coordinates=["q[N]"],
         parameters={"m[N]": 1.0},
@@ -87,7 +87,7 @@ ARRAYS = [name for name, (system, *_) in CASES.items() if system is array]
 def compiled(name: str) -> Any:
     system, method, solver = CASES[name]
     method = sc.methods.method_from_specification(method) if isinstance(method, dict) else method
-    make = sc.compile_indexed if system is array else sc.compile_stepper
+    make = sc.compile_stepper
     return make(system(), method, solver=solver, flags=QUICK_FLAGS)
 
 
@@ -131,7 +131,7 @@ class Begun:
         return momentum, places
 
     def off(self, start: tuple[Fraction, Fraction, Fraction]) -> tuple[float, float]:
-        """Return the deviations of the momentum and of the centre of mass."""
+        """By how much the momentum, and the centre of mass, are not where they belong."""
         momentum, places = self.invariants()
         t, first, begun = start
         return float(momentum - first), float(places - begun - first * (self.time() - t))
@@ -202,7 +202,7 @@ def test_last_step_ends_at_the_sum_of_both_words_of_time(lengths: str, sign: flo
 
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:
-    """Adaptive steps, the last of which ends at t_end, and segments between breakpoints."""
+    """Of steps that choose their length, the last of which ends at t_end; and of pieces between breakpoints."""
     own = Begun("svi")
     if lengths == "tolerance":
         own.run = own.stepper.start(own.q, own.p, t_end=1.7, tolerance=1e-6, t=1 / 3)
@@ -227,7 +227,7 @@ def tables(code: str) -> dict[str, list[float]]:
 
 @pytest.mark.parametrize("text", ["svi", "gauss", "ensemble", "array"])
 def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
-    """For Gauss-Legendre points, compare c, A^2, b A and b of the tableau in 50 digits."""
+    """Of Gauss-Legendre points: c, A^2, b A and b of the tableau in 50 digits."""
     stepper = compiled(text if text != "ensemble" else "svi")
     code = stepper.ensemble.code if text == "ensemble" else stepper.source.code
     found, own = tables(code), collocation_tableau(points("gauss", 3))

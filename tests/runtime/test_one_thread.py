@@ -25,10 +25,10 @@ def stepper() -> sc.Stepper:
 
 @pytest.fixture(scope="module")
 def arrays() -> sc.IndexedStepper:
-    system = sc.IndexedSystem.from_text(
+    system = sc.LagrangianSystem.from_text(
         name="pendulums", coordinates=["q[N]"], lagrangian="sum(i in N, q_dot[i]**2/2 + cos(q[i]))"
     )
-    return sc.compile_indexed(system, "svi:2", flags=QUICK_FLAGS)
+    return sc.compile_stepper(system, "svi:2", flags=QUICK_FLAGS)
 
 
 class Holder:
@@ -62,7 +62,7 @@ class Holder:
 
 
 def entries(run: Any) -> dict[str, Callable[[], Any]]:
-    """Return the calls that a second thread may attempt, by name."""
+    """What a second thread may try, by name."""
     found = {
         "advance": lambda: run.advance(1),
         "update": lambda: run.update(h=0.2),

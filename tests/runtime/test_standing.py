@@ -1,4 +1,4 @@
-"""One-line representations of runs and results: system, method, current state and steps."""
+"""Runs and their results say in a line what they are: system, method, where they stand, by which steps."""
 
 import numpy as np
 import pytest
@@ -64,14 +64,14 @@ def test_display_names_missing_inputs():
 
 
 def test_display_of_array_runs():
-    chain = sc.IndexedSystem.from_text(
+    chain = sc.LagrangianSystem.from_text(
         name="chain",
         coordinates=["q[N]"],
         lagrangian="sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
         forces={"q[0]": "u"},
         inputs=["u"],
     )
-    run = sc.compile_indexed(chain, "svi:2").start(np.zeros(5), h=0.1)
+    run = sc.compile_stepper(chain, "svi:2").start(np.zeros(5), h=0.1)
     assert repr(run).startswith("<IndexedRun of chain, svi-2")
     assert "; t = 0 after 0 steps of 0.1, solver" in repr(run)
     assert repr(run).endswith("inputs not set: u>")

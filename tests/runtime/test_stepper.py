@@ -12,9 +12,7 @@ import pytest
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, ExplicitEuler, Gauss, RadauIIA, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.problems import problem
@@ -278,7 +276,7 @@ def test_step_beyond_the_domain_fails_with_a_message(compiled):
 
 
 def test_a_step_without_solution_fails_with_advice(compiled):
-    """q'' = q^2 by the midpoint rule requires a root of h^2 x^2 / 2 - 2 x + 2 q + h v: none exists for this h."""
+    """Of q'' = q^2, the midpoint rule asks for a root of h^2 x^2 / 2 - 2 x + 2 q + h v: there is none for this h."""
     with pytest.raises(StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
         compiled("runaway", SVI(1)).step([1.0], [1.0], 2.0, 1.5)
     assert caught.value.status in ("not converged", "singular")
@@ -569,7 +567,7 @@ def test_a_stepper_shows_system_and_method(kepler):
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
 @pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
 def test_fixed_point_iteration_starts_from_rest(name, method):
-    """The first iteration from rest has no velocity as a scale for changes."""
+    """The first sweep from rest has no velocity to measure changes by."""
     chosen = problem(name)
     rest = np.zeros(chosen.system.dimension)
     ends = [
@@ -584,12 +582,12 @@ def test_fixed_point_iteration_starts_from_rest(name, method):
 )
 def test_shortened_last_step_to_t_end_is_counted_as_for_arrays(t_end, more, steps):
     scalar = LagrangianSystem.from_text(name="o", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2")
-    arrays = IndexedSystem.from_text(
+    arrays = LagrangianSystem.from_text(
         name="o", coordinates=["x[N]"], lagrangian="sum(i in N, x_dot[i]**2/2 - x[i]**2/2)"
     )
     given = {"h": math.copysign(0.3, t_end), "t_end": t_end, **more}
     run = compile_stepper(scalar, SVI(2)).integrate([1.0], velocity=[0.0], **given)
-    other = compile_indexed(arrays, "svi:2").integrate([1.0, 0.5], **given)
+    other = compile_stepper(arrays, "svi:2").integrate([1.0, 0.5], **given)
     assert (run.t[-1], other.t[-1]) == pytest.approx((t_end, t_end), abs=1e-15)
     assert run.steps == other.steps == steps
 

@@ -11,7 +11,7 @@ __all__ = ["TooMuchWorkError", "at_most"]
 
 
 class TooMuchWorkError(BaseException):
-    """Base exception, so that code under test does not catch it."""
+    """Not an ``Exception``, so that nothing under test mistakes it for one of its own."""
 
 
 @contextmanager

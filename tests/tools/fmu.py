@@ -1,4 +1,4 @@
-"""Minimal importer of FMUs for tests: the library called through ctypes, as specified by FMI 3.0."""
+"""An importer of FMUs for tests: the library driven through ctypes, as FMI 3.0 says."""
 
 from __future__ import annotations
 

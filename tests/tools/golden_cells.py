@@ -18,11 +18,10 @@ from pathlib import Path
 import samples
 from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
 
-from scvi_codegen.compiler import _Sources, generate_source
-from scvi_codegen.indexed_compiler import _IndexedSources
+from scvi_codegen.compiler import _ArraySources, _Sources, generate_source
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -101,7 +100,7 @@ def single(
 
 def arrays(
     name: str,
-    system: Callable[[], IndexedSystem],
+    system: Callable[[], ArraySystem],
     *,
     method: str,
     sizes: tuple[int, ...],
@@ -116,7 +115,7 @@ def arrays(
 ) -> Program:
     """A run of a system with array coordinates."""
     found = system()
-    sources = _IndexedSources(found, as_method(method, one_coordinate(found)), name, solver)
+    sources = _ArraySources(found, as_method(method, one_coordinate(found)), solver, name)
     main = arrays_driver(
         name,
         sizes,
@@ -169,8 +168,8 @@ def rubbed() -> LagrangianSystem:
     )
 
 
-def ring() -> IndexedSystem:
-    return IndexedSystem.from_text(
+def ring() -> ArraySystem:
+    return LagrangianSystem.from_text(
         name="ring",
         coordinates=["q[N]"],
         parameters={"beta": 0.25},
@@ -179,8 +178,8 @@ def ring() -> IndexedSystem:
     )
 
 
-def forms() -> IndexedSystem:
-    return IndexedSystem.from_text(
+def forms() -> ArraySystem:
+    return LagrangianSystem.from_text(
         name="forms",
         coordinates=["u[NX, NY]", "q[N]"],
         parameters={"m[N]": 1, "k[B]": 1, "g": 0.5},
@@ -192,8 +191,8 @@ def forms() -> IndexedSystem:
     )
 
 
-def rubbed_ring() -> IndexedSystem:
-    return IndexedSystem.from_text(
+def rubbed_ring() -> ArraySystem:
+    return LagrangianSystem.from_text(
         name="rubbed ring",
         coordinates=["q[N]"],
         parameters={"c": 0.01},
@@ -202,8 +201,8 @@ def rubbed_ring() -> IndexedSystem:
     )
 
 
-def rotors() -> IndexedSystem:
-    return IndexedSystem.from_text(
+def rotors() -> ArraySystem:
+    return HamiltonianSystem.from_text(
         name="rotors",
         coordinates=["q[N]"],
         parameters={"m[N]": 1},
@@ -212,8 +211,8 @@ def rotors() -> IndexedSystem:
     )
 
 
-def swings() -> IndexedSystem:
-    return IndexedSystem.from_text(
+def swings() -> ArraySystem:
+    return LagrangianSystem.from_text(
         name="swings",
         coordinates=["r[N, 2]"],
         lagrangian="sum(i in N, sum(a in 2, r_dot[i, a]**2)/2 - r[i, 1])",

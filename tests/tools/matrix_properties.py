@@ -47,7 +47,7 @@ def _stepper(problem: Problem, method: int) -> Any:
     name, solver, _ = problem.methods[method]
     made = sc.methods.method_from_specification(name) if isinstance(name, dict) else name
     if problem.kind == "array":
-        return sc.compile_indexed(problem.system(), made, solver=solver, flags=QUICK_FLAGS)
+        return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS)
     time_transformation = {"time_transformation": problem.time_transformation} if problem.kind == "reversible" else {}
     return sc.compile_stepper(problem.system(), made, solver=solver, flags=QUICK_FLAGS, **time_transformation)
 
@@ -96,7 +96,7 @@ class Case:
         return self.problem.values(self.given.own)
 
     def parameters(self, values: dict[str, float] | None = None) -> dict[str, Any]:
-        """Return the parameters as the package accepts them: arrays by name."""
+        """As the package takes them: arrays by name."""
         known = dict(values or self.values)
         for name, array in self.problem.fields.items():
             known[name] = np.array([known.pop(f"{name}{i}") for i in range(len(array))])
@@ -107,7 +107,7 @@ class Case:
         return {"p" if "hamiltonian" in self.problem.text else "velocity": np.array(x)}
 
     def motion(self, values: dict[str, float] | None = None, start: float | None = None, state: Any = None) -> Motion:
-        """Integrate from a state at a time, twice as far as the run."""
+        """From a state at a time, twice as far as the run goes."""
         begin = self.given.t if start is None else start
         q, x = state or (self.problem.q, self.problem.x)
         reach = begin + 2.0 * self.span
@@ -262,7 +262,7 @@ def between(case: Case) -> None:
 
 
 def _as_array(case: Case, text: str) -> str:
-    """Return a function of q0, q1, .. as a function of q[0], q[1]."""
+    """Of a function of q0, q1, ..: of q[0], q[1]."""
     import re
 
     return re.sub(r"\bq(\d)\b", r"q[\1]", text) if case.kind == "array" else text
@@ -294,7 +294,7 @@ def events(case: Case) -> None:
 
 
 def failure(case: Case) -> None:
-    """Return number and time of a step that fails far beyond the first chunk, and the preceding states."""
+    """The number and the time of a step that fails far behind the first portion, and the states before."""
     steps, h = 700, case.h / 100
     values = {**case.values, STOP: case.given.t + 512.5 * h}
     parameters = case.parameters(values)
@@ -446,7 +446,7 @@ def _velocity_of(case: Case, truth: Any, t: float, state: Any, values: dict[str,
 
 
 def controlled(case: Case) -> None:
-    """Adaptive steps: ends, dense output, and the estimate of the worst step."""
+    """Steps that choose their length: where they end, between them, and what is said of the worst."""
     end = case.given.t + case.span
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_loop, "CALL_SECONDS", 1e-9)
@@ -466,7 +466,7 @@ def controlled(case: Case) -> None:
 
 
 def _differences(case: Case, names: list[str], width: float) -> dict[str, np.ndarray]:
-    """Return the (n, 2m) differences of all states of a run by its initial data."""
+    """(n, 2m) slopes of all states of a run by numbers that it starts from."""
 
     def ends(name: str, change: float) -> np.ndarray:
         q, p, t, h = base.q[0].copy(), base.p[0].copy(), case.given.t, base.h
@@ -613,12 +613,12 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
 
 
 def _conserves_balance(case: Case) -> bool:
-    """Return whether the code has Newton's iteration along a curve, which recomputes steps for the balance."""
+    """Whether the text has Newton's iteration, by which steps are taken again, along a curve."""
     if case.problem.methods[case.method][1] == "fixed-point":
         return False
     return str(case.problem.methods[case.method][0]).startswith(("svi", "scvi", "gauss"))
 
 
 def _estimates_errors(case: Case) -> bool:
-    """Return whether adaptive steps are available: with an error estimate by a curve, not for RATTLE."""
+    """Whether steps choose their length: by a curve, and not of RATTLE."""
     return not isinstance(case.problem.methods[case.method][0], dict) and case.error < LOW

@@ -59,9 +59,9 @@ class Problem:
 
     def system(self) -> Any:
         """The system as the package reads it."""
+        made = sc.HamiltonianSystem if "hamiltonian" in (self.array or self.text) else sc.LagrangianSystem
         if self.array is not None:
-            return sc.IndexedSystem.from_text(name=self.name, **self.array)
-        made = sc.HamiltonianSystem if "hamiltonian" in self.text else sc.LagrangianSystem
+            return made.from_text(name=self.name, **self.array)
         system = made.from_text(name=self.name, **self.text)
         return sc.reparametrise(system, self.time_transformation) if self.kind == "slowed" else system
 
@@ -140,7 +140,7 @@ class Truth:
         return np.asarray(x), solved[: self.m], solved[self.m :]
 
     def motion(self, start: float, end: float, q: Any, x: Any, parameters: Mapping[str, float]) -> Motion:
-        """Integrate (q, x) from start to end."""
+        """From (q, x) at start to end."""
         return Motion(self, start, end, tuple(q), tuple(x), tuple(parameters.values()))
 
 

@@ -183,7 +183,7 @@ class _Parser:
         return found
 
     def several(self) -> list[Tree]:
-        """Return the comma-separated entries between brackets."""
+        """What stands between brackets, commas between."""
         found = [self.sum()]
         while self.next == ",":
             self.take()

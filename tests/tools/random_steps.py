@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import scvi_codegen as sc
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 
 Array = NDArray[np.float64]
 PERIODS, DECADES = 3.0, 5.0
@@ -52,7 +53,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of the trials of a method: estimate (NaN: none or rejected) and error of each trial."""
+    """What became of the trials of a method: per trial the estimate (NaN: none, or refused) and the error."""
 
     refused: Array
     estimates: Array
@@ -93,7 +94,7 @@ def _slow(random: np.random.Generator) -> tuple[Array, Array, float]:
 
 def _families() -> Mapping[str, Family]:
     text, known = sc.LagrangianSystem.from_text, lambda name: sc.problem(name).system
-    chain = sc.IndexedSystem.from_text(
+    chain = sc.LagrangianSystem.from_text(
         name="chain",
         coordinates=["x[N]"],
         lagrangian="sum(a in N, x_dot[a]**2/2 - x[a]**2/2) - sum(a in N-1, (x[a+1] - x[a])**4/4)",
@@ -104,7 +105,7 @@ def _families() -> Mapping[str, Family]:
 
     def rows(name: str, terms: str) -> Any:
         lagrangian = f"sum(a in N, {terms})"
-        return sc.IndexedSystem.from_text(name=name, coordinates=["x[N, 2]"], lagrangian=lagrangian)
+        return sc.LagrangianSystem.from_text(name=name, coordinates=["x[N, 2]"], lagrangian=lagrangian)
 
     ellipses = rows("ellipses", "(x_dot[a,0]**2 + x_dot[a,1]**2)/2 + 1/sqrt(x[a,0]**2 + x[a,1]**2)")
     pendulums = rows("pendulums", "(x_dot[a,0]**2 + x_dot[a,1]**2)/2 + cos(x[a,0]) + cos(x[a,1])")
@@ -153,8 +154,8 @@ FAMILIES = _families()
 def compiled(name: str, method: Any, solver: str = "auto") -> Any:
     """The stepper of a family."""
     system = FAMILIES[name].system
-    if isinstance(system, sc.IndexedSystem):
-        return sc.compile_indexed(system, method, solver=solver.replace("auto", "fixed-point"))
+    if isinstance(system, ArraySystem):
+        return sc.compile_stepper(system, method, solver=solver.replace("auto", "fixed-point"))
     return sc.compile_stepper(system, method, solver=solver)
 
 
@@ -170,7 +171,7 @@ def displaced(q: Array, end: Array, other: Array) -> float:
 
 @cache
 def trials(name: str, count: int, seed: int = 1) -> list[Trial]:
-    """Return random trials of a system, without those whose reference is doubtful."""
+    """So many random trials of a family, less those whose reference is doubtful."""
     family, random, found = FAMILIES[name], np.random.default_rng([seed, sum(map(ord, name))]), []
     system = family.written_out or family.system
     exact, other = (sc.compile_stepper(system, sc.SVI(degree)) for degree in (12, 9))
@@ -202,7 +203,7 @@ def taken(stepper: Any, trial: Trial) -> tuple[Array, float]:
 
 
 def outcome(stepper: Any, of: list[Trial]) -> Outcome:
-    """Return the results of the trials."""
+    """What became of them."""
     refused, estimates, errors = np.zeros(len(of), bool), np.full(len(of), np.nan), np.zeros(len(of))
     for k, trial in enumerate(of):
         with warnings.catch_warnings():

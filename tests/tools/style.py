@@ -1,4 +1,4 @@
-"""C style as specified by clang-format."""
+"""Whether C is set as clang-format sets it."""
 
 from __future__ import annotations
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from either_system import either_system
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen import indexed_compiler
+from scvi_codegen import compiler
 from scvi_codegen.cli import main
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
@@ -71,9 +72,9 @@ SYSTEMS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 def certificate(name: str, method: str) -> sc.Certificate:
-    """Return the certificate of one of the systems."""
+    """Of one of the systems."""
     given, start = SYSTEMS[name]
-    system = sc.IndexedSystem.from_text(name=name, **given)
+    system = either_system(name=name, **given)
     return sc.verify_indexed(system, method, **start, flags=QUICK_FLAGS)
 
 
@@ -83,7 +84,7 @@ def certificate(name: str, method: str) -> sc.Certificate:
     [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2"), ("damped", "svi:2")],
 )
 def test_correct_integrators_pass(name: str, method: str) -> None:
-    """Every property is measured except velocities of a Hamiltonian."""
+    """Each promise is measured, but for velocities of a Hamiltonian."""
     found = certificate(name, method)
     assert found.passed, found.to_text()
     assert {check.name for check in found.checks} >= {
@@ -124,9 +125,9 @@ QUICK = ("a ring that closes one place off",)
 
 @pytest.mark.parametrize(("name", "method"), sorted({fault[:2] for fault in FAULTS.values()}))
 def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
-    """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
-    system = sc.IndexedSystem.from_text(name=name, **SYSTEMS[name][0])
-    code = indexed_compiler.generate_indexed(system, method)[0].amalgamated().code
+    """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
+    system = either_system(name=name, **SYSTEMS[name][0])
+    code = compiler.generate_array_source(system, method)[0].amalgamated().code
     here = {what: fault[2] for what, fault in FAULTS.items() if fault[:2] == (name, method)}
     assert [what for what, pattern in here.items() if not re.search(pattern, code)] == []
 
@@ -139,14 +140,15 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     name, method, pattern, replacement = FAULTS[fault]
     edits = 0
 
-    def rendered(program: Program, control: Control | None = None) -> Source:
+    def rendered(program: Program, control: Control | None = None, **options: str) -> Source:
         nonlocal edits
-        source = render(program, control).amalgamated()
-        code, edits = re.subn(pattern, replacement, source.code, count=1)
+        source = render(program, control, **options).amalgamated()
+        code, made = re.subn(pattern, replacement, source.code, count=1)
+        edits += made
         return replace(source, code=code)
 
-    monkeypatch.setattr(indexed_compiler, "render", rendered)
-    monkeypatch.setattr(indexed_compiler, "cached_source", lambda *given: given[-1]())
+    monkeypatch.setattr(compiler, "render", rendered)
+    monkeypatch.setattr(compiler, "cached_source", lambda *given: given[-1]())
     found = certificate(name, method)
     assert edits == 1
     assert found.violated, found.to_text()

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from scvi_codegen.benchmark.large_cases import field, ring
-from scvi_codegen.indexed_compiler import compile_indexed
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
@@ -26,7 +26,7 @@ def _one_size(method: str, name: str, size: int) -> str:
     began = time.perf_counter()
     each = {"ring": ring, "field": field}[name](size, 1.0)
     count = each.q.size
-    run = compile_indexed(each.system, method).start(each.q, velocity=each.v, h=STEP_SIZES[name])
+    run = compile_stepper(each.system, method).start(each.q, velocity=each.v, h=STEP_SIZES[name])
     run.advance(1)
     first = time.perf_counter() - began
     run.advance(3)

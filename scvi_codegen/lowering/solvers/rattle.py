@@ -46,7 +46,7 @@ from scvi_codegen.mechanics.indexed.constraints import (
     constraint_text,
     coordinate_accesses,
 )
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities
@@ -82,7 +82,7 @@ def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
     )
 
 
-def constrained_steps(system: IndexedSystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
+def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
     """Return the kernels and fractions of constrained steps.
 
     Raises:
@@ -111,7 +111,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
     )
 
 
-def _kernels(system: IndexedSystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
+def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
     """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
     for number, term in enumerate(system.constraints):
         u = coordinate_accesses(term, system.coordinates)

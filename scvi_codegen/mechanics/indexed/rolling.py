@@ -20,7 +20,7 @@ from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArrayHamiltonian, ArrayLagrangian, ArraySystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary
@@ -40,7 +40,7 @@ class RolledSums:
         parameters: arrays of numbers, one per element, by name; both in the form that runs accept.
     """
 
-    system: IndexedSystem
+    system: ArraySystem
     tables: dict[str, NDArray[np.int32]]
     parameters: dict[str, NDArray[np.float64]]
 
@@ -86,7 +86,8 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     used = {name for each in found for name in each.group.formula.free_symbols}
     numbers = with_inputs({each.name: value for each, value in defaults.items() if each in used}, system.inputs)
     fields = {array: values for each in found for array, values in each.fields(defaults)}
-    rolled = IndexedSystem(
+    kind = ArrayHamiltonian if system.auxiliaries else ArrayLagrangian
+    rolled = kind(
         name=system.name,
         coordinates=(q,),
         momenta=(p,) if system.auxiliaries else (),
@@ -105,6 +106,7 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
         ),
         inputs=system.inputs,
     )
+    rolled.check_run_time_sizes()
     tables = {each.table.name: each.places for each in found}
     return RolledSums(rolled, tables, {array.name: values for array, values in fields.items()})
 

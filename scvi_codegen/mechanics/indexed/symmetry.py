@@ -17,9 +17,9 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
-from scvi_codegen.indices import Access, Array, IndexedMap, Place
+from scvi_codegen.indices import Access, Array, IndexedMap, Place, Size
 from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["momentum_maps"]
@@ -32,7 +32,7 @@ MAX_ROTATED_COMPONENTS = 3
 """Largest number of components for which rotations are tested (points in space)."""
 
 
-def momentum_maps(system: IndexedSystem) -> tuple[IndexedMap, ...]:
+def momentum_maps(system: ArraySystem) -> tuple[IndexedMap, ...]:
     """Return all momentum maps of these kinds that a system has."""
     return tuple(found for array in system.coordinates for found in _maps(system, array))
 
@@ -45,7 +45,7 @@ class _ForceTerms:
     slots: tuple[Symbol, ...]
 
 
-def _force_terms(system: IndexedSystem) -> Iterator[_ForceTerms]:
+def _force_terms(system: ArraySystem) -> Iterator[_ForceTerms]:
     for term in system.potentials:
         moved = [(slot, access) for slot, access in term.slots if access.array in system.state]
         partials = gradient(term.formula, [slot for slot, _ in moved])
@@ -58,9 +58,9 @@ def _force_terms(system: IndexedSystem) -> Iterator[_ForceTerms]:
         yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
 
 
-def _maps(system: IndexedSystem, array: Array) -> Iterator[IndexedMap]:
-    last, force_terms = array.axes[-1], list(_force_terms(system))
-    components: Sequence[int | None] = [None] if last.name else range(last.number)
+def _maps(system: ArraySystem, array: Array) -> Iterator[IndexedMap]:
+    last, force_terms = array.axes[-1] if array.axes else Size("", 0), list(_force_terms(system))
+    components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
         if all(_is_zero(*_shift(system, each, array, component)) for each in force_terms):
             yield IndexedMap(array.name, component)
@@ -86,14 +86,14 @@ def _whole(component: int) -> Place:
 
 
 def _shift(
-    system: IndexedSystem, force_terms: _ForceTerms, array: Array, component: int | None
+    system: ArraySystem, force_terms: _ForceTerms, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
     parts = [derivative for access, derivative in force_terms.entries if _component(access, array, component)]
     return parts, _symbols(system, force_terms)
 
 
 def _turn(
-    system: IndexedSystem, force_terms: _ForceTerms, array: Array, plane: tuple[int, int]
+    system: ArraySystem, force_terms: _ForceTerms, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
@@ -103,7 +103,7 @@ def _turn(
     return _rotated_terms(system, force_terms, pairs)
 
 
-def _phase(system: IndexedSystem, force_terms: _ForceTerms, array: Array) -> tuple[list[Expr], list[Symbol]]:
+def _phase(system: ArraySystem, force_terms: _ForceTerms, array: Array) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
     return _rotated_terms(
@@ -111,7 +111,7 @@ def _phase(system: IndexedSystem, force_terms: _ForceTerms, array: Array) -> tup
     )
 
 
-def _conjugate(system: IndexedSystem, array: Array) -> tuple[Array, ...]:
+def _conjugate(system: ArraySystem, array: Array) -> tuple[Array, ...]:
     return system.momenta and (system.momenta[system.coordinates.index(array)],)
 
 
@@ -120,7 +120,7 @@ Entry: TypeAlias = tuple[Array, Place | None]
 
 
 def _rotated_terms(
-    system: IndexedSystem, force_terms: _ForceTerms, pairs: Sequence[tuple[Entry, Entry, int]]
+    system: ArraySystem, force_terms: _ForceTerms, pairs: Sequence[tuple[Entry, Entry, int]]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of the derivative along the motion of entries of the first kind by those of the second."""
     parts: list[Expr] = []
@@ -136,7 +136,7 @@ def _rotated_terms(
     return parts, known
 
 
-def _symbols(system: IndexedSystem, force_terms: _ForceTerms) -> list[Symbol]:
+def _symbols(system: ArraySystem, force_terms: _ForceTerms) -> list[Symbol]:
     return [*force_terms.slots, *system.parameters, system.time]
 
 
@@ -156,7 +156,7 @@ def _is_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
     return tried >= SAMPLES
 
 
-def _same_masses(system: IndexedSystem, array: Array, a: int, b: int) -> bool:
+def _same_masses(system: ArraySystem, array: Array, a: int, b: int) -> bool:
     """Return whether two components have equal masses in all elements."""
     masses: tuple[dict[object, Expr], ...] = ({}, {})
     for mass in system.masses:

@@ -1,15 +1,16 @@
-"""Indexed systems: Lagrangians in index notation, of few kinds of terms (lattices, fields, N bodies).
+"""Systems of arrays: Lagrangians in index notation, of few kinds of terms (lattices, fields, N bodies).
 
     L = sum_f sum_(e in loops of f) l_f(array entries at e, parameters, t)
 
 Only the kernels l_f are differentiated, so neither compile time nor code size depends on the number of coordinates,
-which is determined by the arrays that a run starts from. Kinetic energy is a sum of m v**2/2 with constant m that may
-differ between elements.
+which is determined by the arrays that a run starts from; kinetic energy is then a sum of m v**2/2 with constant m that
+may differ between elements. With known sizes they are systems of named coordinates
+(:mod:`scvi_codegen.mechanics.indexed.elements`), without restrictions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
@@ -19,7 +20,8 @@ from sympy import Expr, S, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_coordinate, parse_indexed
 from scvi_codegen.formulas.indexed_constraints import parse_constraint
 from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
 from scvi_codegen.formulas.indexed_latex import latex_sum
@@ -28,22 +30,24 @@ from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Size
+from scvi_codegen.mechanics.damping import check_damping, damping_rate
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
 from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.validation.argument_types import MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation.argument_types import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
-__all__ = ["INDEXED", "IndexedSystem"]
+__all__ = ["ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem", "are_arrays"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedSystem:
-    """Lagrangian or Hamiltonian in index notation, validated on construction: :meth:`from_text`, :meth:`from_sympy`.
+class ArraySystem:
+    """Lagrangian or Hamiltonian in index notation; ``LagrangianSystem.from_text(coordinates=["q[N]"])`` returns it.
 
     Attributes:
         name: name of the system.
-        coordinates: arrays of coordinates; the array of the velocities of ``q`` is called ``q_dot``.
+        coordinates: arrays of coordinates, single ones without axes; the array of the velocities of ``q`` is called
+            ``q_dot``.
         momenta: of a Hamiltonian, arrays parallel to ``coordinates``; empty for a Lagrangian.
         time: the symbol ``t``.
         parameters, defaults: adjustable numbers and their default values.
@@ -54,6 +58,7 @@ class IndexedSystem:
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.indexed.constraints`).
+        damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
     """
 
     name: str
@@ -69,34 +74,56 @@ class IndexedSystem:
     forces: tuple[IndexedForce, ...] = ()
     inputs: tuple[str, ...] = ()
     constraints: tuple[IndexedTerm, ...] = ()
+    damping: Expr = S.Zero
 
     def __repr__(self) -> str:
-        return clipped(
-            f"IndexedSystem(name={self.name!r}, coordinates=({', '.join(map(str, self.coordinates))}))", LONGEST
-        )
+        shown = ", ".join(map(str, self.coordinates))
+        return clipped(f"{self.function}System(name={self.name!r}, coordinates=({shown}))", LONGEST)
 
     def __post_init__(self) -> None:
         self._check_names()
         for term in self.terms:
             if problem := unsupported_part(term.formula):
                 raise SystemDefinitionError(f"in the {self.function} of '{self.name}': {problem}")
-            check_form(term, self._velocities, self.time)
         for force in self.forces:
             for access, formula in force.targets:
                 if problem := unsupported_part(formula):
                     raise SystemDefinitionError(f"in the force on {access} of '{self.name}': {problem}")
         if self.constraints and self.momenta:
             raise SystemDefinitionError(
-                "constraints of an indexed system require a lagrangian: write the system by its lagrangian"
+                f"'{self.name}' is a Hamiltonian with constraints, which are supported for Lagrangians only: write the "
+                "system by its Lagrangian"
             )
-        for term in self.constraints:
-            check_constraint(term, self.coordinates, self.fields, "|".join(f"{name}_[0123t]" for name in self.inputs))
+        used = {access.array.name for term in self.terms for _, access in term.slots}
         for array in () if self.momenta else self.coordinates:
-            if not any(mass.access.array == array for mass in self.masses):
+            if array.name + DOT not in used:
+                entry = f"sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)" if array.axes else f"{array}{DOT}**2/2"
                 raise SystemDefinitionError(
-                    f"no term contains {array.name}{DOT}: add a kinetic energy for '{array.name}', "
-                    f"such as sum(i in {array.axes[0]}, {array.name}{DOT}[i]**2/2)"
+                    f"no term contains {array.name}{DOT}: add a kinetic energy for '{array.name}', such as {entry}"
                 )
+        check_damping(self.name, self.damping, self.parameters)
+
+    def check_run_time_sizes(self) -> None:
+        """Raise :class:`SystemDefinitionError` for a system that cannot be compiled for sizes known at run time."""
+        try:
+            for term in self.terms:
+                check_form(term, self._velocities, self.time)
+            inputs = "|".join(f"{name}_[0123t]" for name in self.inputs)
+            for term in self.constraints:
+                check_constraint(term, self.coordinates, self.fields, inputs)
+            if self.damping != 0:
+                raise SystemDefinitionError("damping requires known sizes: write it as forces")
+            for array in self.coordinates:
+                if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
+                    raise SystemDefinitionError(
+                        f"of the axes of {array} only the last may be a number: name the others"
+                    )
+        except SystemDefinitionError as error:
+            sizes = ", ".join(f"'{name}': 8" for name in self.sizes)
+            raise SystemDefinitionError(
+                f"'{self.name}' cannot be compiled for sizes known at run time: {error}. Or give the sizes, as "
+                f"compile_stepper(system, method, sizes={{{sizes}}})"
+            ) from error
 
     @classmethod
     @checks_arguments(
@@ -110,6 +137,7 @@ class IndexedSystem:
         tables=TEXTS,
         forces=MAPPING,
         dissipation=TEXT,
+        damping=FORMULA,
         inputs=NAMES,
         constraints=TEXTS,
     )
@@ -125,14 +153,15 @@ class IndexedSystem:
         tables: Sequence[str] = (),
         forces: Mapping[str, str] | None = None,
         dissipation: str | None = None,
+        damping: str | float | None = None,
         inputs: Sequence[str] = (),
         constraints: Sequence[str] = (),
-    ) -> IndexedSystem:
+    ) -> ArraySystem:
         """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
 
         Args:
             name: name of the system.
-            coordinates: declarations, as ``["q[N]"]`` or ``["r[N, 3]"]``; sizes are names or whole numbers.
+            coordinates: declarations, as ``["x", "q[N]", "r[N, 3]"]``; sizes are names or whole numbers.
             lagrangian: the formula; the velocity of ``q[i]`` is written ``q_dot[i]``, time ``t``.
             hamiltonian: in place of ``lagrangian``, H in coordinates and momenta, of any form.
             momenta: of H, declarations like those of the coordinates; by default ``["p_q[N]"]``.
@@ -141,21 +170,22 @@ class IndexedSystem:
             tables: declarations of index tables with their columns, as ``["bonds[B, 2]"]``, or ``["pins[P]"]``.
             forces: formula by coordinate, ``{"q[i]": "-c*q_dot[i]"}`` for every index, ``{"q[0]": "cos(t)"}`` for one.
             dissipation: Rayleigh's function, a sum of sums over velocities, whose forces -dD/dq_dot are added.
+            damping: damping rate of all momenta, a number or a formula of parameters.
             inputs: names of functions of time whose values are passed to each run
                 (:mod:`scvi_codegen.formulas.inputs`).
             constraints: formulas in coordinates and time that are 0, or equations, followed by the loops over which
                 they hold, ``"(q[i+1] - q[i])**2 = 1 for i in 0..N-2"``.
 
         Raises:
-            SystemDefinitionError: for text outside the grammar, and for a kinetic energy of another form.
+            SystemDefinitionError: for text outside the grammar.
 
-        >>> chain = IndexedSystem.from_text(
+        >>> chain = ArraySystem.from_text(
         ...     name="chain", coordinates=["q[N]"], parameters={"k": 2},
         ...     lagrangian="sum(i in N, q_dot[i]**2/2) - k*sum(i in N periodic, (q[i+1] - q[i])**2/2)")
         >>> print(chain)
         chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
-        arrays = tuple(map(parse_array, coordinates))
+        arrays = tuple(map(parse_coordinate, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
         places = tuple(map(_table, tables))
         values = with_inputs({key: number(key, value) for key, value in (parameters or {}).items()}, inputs)
@@ -170,7 +200,8 @@ class IndexedSystem:
         acting = [parse_force(*pair, arrays, everything, known, places) for pair in (forces or {}).items()]
         if dissipation is not None:
             acting.append(_friction(parse_indexed(dissipation, everything, known, places), velocities, arrays))
-        system = cls(
+        kind = ArrayHamiltonian if conjugate else ArrayLagrangian
+        system = kind(
             name=name,
             coordinates=arrays,
             momenta=conjugate,
@@ -184,6 +215,7 @@ class IndexedSystem:
             forces=tuple(_with_forces(force, driven) for force in chain(*acting)),
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, places) for each in constraints),
+            damping=damping_rate(damping, lambda given: parse_expression(str(given), known)),
         )
         system._warn_of_mistakes()
         return system
@@ -198,7 +230,7 @@ class IndexedSystem:
         lagrangian: Expr,
         parameters: Mapping[str, float] | None = None,
         tables: Sequence[str] = (),
-    ) -> IndexedSystem:
+    ) -> ArraySystem:
         """Create the system from a SymPy expression of ``Sum`` and ``Indexed``; see also :meth:`from_text`.
 
         A periodic index is ``Mod(i + 1, N)``, pairs are ``(j, i + 1, N - 1), (i, 0, N - 2)``, a table entry is
@@ -207,7 +239,7 @@ class IndexedSystem:
         >>> from sympy import IndexedBase, Sum, symbols
         >>> q, v, (i, N) = IndexedBase("q"), IndexedBase("q_dot"), symbols("i N", integer=True)
         >>> kinetic, springs = Sum(v[i] ** 2 / 2, (i, 0, N - 1)), Sum((q[i + 1] - q[i]) ** 2 / 2, (i, 0, N - 2))
-        >>> chain = IndexedSystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
+        >>> chain = ArraySystem.from_sympy(name="chain", coordinates=["q[N]"], lagrangian=kinetic - springs)
         >>> print(*sorted(map(str, chain.terms)), sep=chr(10))
         sum(i in 0..N-2, -(q[i+1] - q[i])**2/2)
         sum(i in N, q_dot[i]**2/2)
@@ -253,6 +285,8 @@ class IndexedSystem:
         """Reason why energy is not conserved; empty if it is."""
         if self.forces:
             return "forces act"
+        if self.damping != 0:
+            return "damping takes it"
         if any(self.time in term.formula.free_symbols for term in self.constraints):
             return "constraints depend on time"
         return f"the {self.function} depends on time" if self.depends_on_time else ""
@@ -354,9 +388,23 @@ class IndexedSystem:
                 raise SystemDefinitionError(
                     f"the table {table} must be declared with a size and a number of columns, as bonds[B, 2]"
                 )
-        for array in self.coordinates:
-            if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
-                raise SystemDefinitionError(f"of the axes of {array} only the last may be a number: name the others")
+
+
+class ArrayLagrangian(ArraySystem):
+    """Lagrangian of arrays whose sizes are known at run time."""
+
+    __slots__ = ()
+
+
+class ArrayHamiltonian(ArraySystem):
+    """Hamiltonian of arrays whose sizes are known at run time."""
+
+    __slots__ = ()
+
+
+def are_arrays(*declarations: Iterable[str]) -> bool:
+    """Return whether one of the coordinates, parameters or tables is an array."""
+    return any("[" in str(each) for group in declarations for each in group)
 
 
 def _with_formulas(term: IndexedTerm, rule: Mapping[Any, Expr]) -> IndexedTerm:
@@ -390,7 +438,7 @@ def _momenta(
         return ()
     if names is None:
         return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
-    given = tuple(map(parse_array, names))
+    given = tuple(map(parse_coordinate, names))
     if [array.axes for array in given] != [array.axes for array in coordinates]:
         shown = ", ".join(map(str, coordinates))
         raise SystemDefinitionError(
@@ -422,5 +470,5 @@ def _friction(
     return tuple(found)
 
 
-INDEXED = of("an IndexedSystem", IndexedSystem)
-"""Type check of indexed systems, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""
+ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)
+"""Type check of systems of arrays, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""

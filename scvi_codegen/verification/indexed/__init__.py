@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
-from scvi_codegen.indexed_compiler import compile_indexed
 from scvi_codegen.lowering.arrays import one_coordinate
-from scvi_codegen.mechanics.indexed.system import INDEXED, IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
 from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
@@ -44,10 +43,10 @@ ROUNDINGS = 16.0 * SMALL_STEPS
 """Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
-@checks_arguments(system=INDEXED, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
+@checks_arguments(system=ARRAYS, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
 @without_accuracy_warnings()
 def verify_indexed(
-    system: IndexedSystem,
+    system: ArraySystem,
     method: Method | str,
     q: ArrayLike | Mapping[str, ArrayLike],
     p: ArrayLike | Mapping[str, ArrayLike] | None = None,
@@ -84,7 +83,7 @@ def verify_indexed(
             "indexed systems with constraints have no certificate: verify a small unrolled system (unroll_sums) by "
             "SVI(1, 'gauss-lobatto:2')"
         )
-    stepper = stepper or compile_indexed(system, chosen, flags=tuple(flags))
+    stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
     run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
     arrays = read_arrays(stepper.interface, q, parameters, tables)
     start = WholeStart(system, chosen, stepper, arrays, run.p, run.h, run.t)

@@ -15,7 +15,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.formulas.indexed_values import Elements
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
-from scvi_codegen.mechanics.indexed.system import IndexedSystem
+from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.indexed_interface import RunArrays
 from scvi_codegen.runtime.indexed_run import IndexedRun
@@ -42,7 +42,7 @@ RESOLVED = EPSILON
 class WholeStart:
     """Integrator at full size, and the initial state of runs."""
 
-    system: IndexedSystem
+    system: ArraySystem
     method: Method
     stepper: IndexedStepper
     arrays: RunArrays

@@ -1,0 +1,166 @@
+"""Elements of arrays of known sizes: fields of the equivalent system of named coordinates q_0, q_1, ..."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sympy import Add, Expr, Symbol
+
+from scvi_codegen.errors import SystemDefinitionError, closest
+from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.formulas.symbols import DOT, number, symbol
+from scvi_codegen.indices import Access, Array, Loop, Place, Size
+from scvi_codegen.mechanics.indexed.system import ArraySystem
+
+__all__ = ["unrolled_fields"]
+
+Elements = Mapping[str, int]
+Tables = Mapping[str, NDArray[np.int64]]
+
+
+def unrolled_fields(
+    system: ArraySystem,
+    sizes: Mapping[str, int],
+    tables: Mapping[str, ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
+) -> dict[str, Any]:
+    """Return the fields of the system of named coordinates; arguments and errors as of :func:`unroll_sums`."""
+    given, places = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
+    rows = {table.axes[0].name: len(places[table.name]) for table in system.tables if table.name in places}
+    sizes = {**rows, **sizes}
+    for known, named, what in (
+        (system.sizes, sizes, "size"),
+        ([table.name for table in system.tables], places, "table"),
+    ):
+        if set(known) != set(named):
+            raise SystemDefinitionError(
+                f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
+            )
+    fields = {
+        array.name: _filled(array, given.pop(array.name, default), sizes)
+        for array, default in zip(system.fields, system.field_defaults, strict=True)
+    }
+    names = {array.name: _names(array, sizes) for array in (*system.state, *system.fields)}
+    values = {
+        str(name): float(value)
+        for array in system.fields
+        for name, value in zip(names[array.name].flat, fields[array.name].flat, strict=True)
+    }
+    numbers = {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
+    for name, value in given.items():
+        if name not in numbers:
+            raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
+        numbers[name] = number(name, value)
+    written = _Elements(sizes, places, names)
+    summands = [term.formula.xreplace(rule) for term in system.terms for _, rule in written.rules(term)]
+    acting = written.forces(system.forces)
+    coordinates, momenta = (
+        tuple(symbol(str(name)) for array in arrays for name in names[array.name].flat)
+        for arrays in (system.coordinates, system.momenta)
+    )
+    together: dict[str, Any] = {
+        "name": system.name,
+        "coordinates": coordinates,
+        "time": system.time,
+        "parameters": tuple(map(symbol, [*numbers, *values])),
+        "defaults": (*numbers.values(), *values.values()),
+        "forces": tuple(Add(*acting.get(q, ())) for q in coordinates) if acting else (),
+        "inputs": system.inputs,
+        "damping": system.damping,
+        "arrays": tuple(known_array(array, sizes) for array in (*system.coordinates, *system.fields)),
+    }
+    if momenta:
+        return together | {"momenta": momenta, "hamiltonian": Add(*summands)}
+    held = tuple(term.formula.xreplace(rule) for term in system.constraints for _, rule in written.rules(term))
+    return together | {"lagrangian": Add(*summands), "constraints": held}
+
+
+def known_array(array: Array, sizes: Mapping[str, int]) -> Array:
+    """Return the declaration with whole numbers as sizes."""
+    return replace(array, axes=tuple(Size("", length) for length in array.shape(sizes)))
+
+
+def _columns(table: ArrayLike) -> NDArray[np.int64]:
+    """Return an index table as a two-dimensional array; one axis becomes one column."""
+    found = np.asarray(table)
+    return found[:, None] if found.ndim == 1 else found
+
+
+def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
+    return np.array(known_array(array, sizes).elements, dtype=np.str_).reshape(array.shape(sizes))
+
+
+def _filled(array: Array, value: ArrayLike, sizes: Mapping[str, int]) -> NDArray[np.float64]:
+    if np.shape(value) not in ((), array.shape(sizes)):
+        raise SystemDefinitionError(f"'{array.name}' has the shape {np.shape(value)}, which does not match {array}")
+    return np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape(sizes))
+
+
+def _elements(loops: Sequence[Loop], sizes: Mapping[str, int]) -> Iterator[Elements]:
+    """Yield the values of all indices."""
+    if not loops:
+        yield {}
+        return
+    last = loops[-1]
+    for outer in _elements(loops[:-1], sizes):
+        first = outer[last.behind] + 1 if last.behind else last.first.at(sizes)
+        for k in range(first, last.end.at(sizes)):
+            yield {**outer, last.index: k}
+
+
+@dataclass(frozen=True, slots=True)
+class _Elements:
+    """Substitution of array accesses by symbols, at given values of the indices.
+
+    Attributes:
+        sizes, tables: value of every size; index tables.
+        names: names of the entries of each array.
+    """
+
+    sizes: Mapping[str, int]
+    tables: Tables
+    names: Mapping[str, NDArray[np.str_]]
+
+    def rules(self, of: IndexedTerm | IndexedForce) -> Iterator[tuple[Elements, dict[Symbol, Symbol]]]:
+        """Yield the values of the indices with the symbol that replaces each access."""
+        for at in _elements(of.loops, self.sizes):
+            yield at, {slot: self.entry(access, at, of.loops) for slot, access in of.slots}
+
+    def forces(self, forces: Sequence[IndexedForce]) -> dict[Symbol, list[Expr]]:
+        """Return the contributions to the force on each coordinate."""
+        found: dict[Symbol, list[Expr]] = {}
+        for force in forces:
+            for at, rule in self.rules(force):
+                for access, formula in force.targets:
+                    found.setdefault(self.entry(access, at, force.loops), []).append(formula.xreplace(rule))
+        return found
+
+    def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Symbol:
+        """Return the symbol of an array entry."""
+        periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
+        try:
+            places = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)
+        except IndexError as error:
+            raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
+        if any(not 0 <= place < length for place, length in zip(places, access.array.shape(self.sizes), strict=True)):
+            raise SystemDefinitionError(
+                f"{access} has the index {list(places)}, which is outside of {access.array}, at {dict(at)}"
+            )
+        name = access.array.name
+        if name in self.names:
+            return symbol(str(self.names[name][places]))
+        return symbol(str(self.names[name.removesuffix(DOT)][places]) + DOT)
+
+
+def _place(place: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:
+    if place.table:
+        return int(tables[place.table][at[place.index], place.column])
+    if not place.index:
+        return place.base.at(sizes)
+    k = at[place.index] + place.base.number
+    return k % periods[place.index] if place.index in periods else k

@@ -1,0 +1,130 @@
+"""Systems of single coordinates and arrays: sizes known when compiled against sizes known at run time."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import scvi_codegen as sc
+from scvi_codegen.errors import StateError, SystemDefinitionError
+
+LAGRANGIAN = (
+    "M*x_dot**2/2 + sum(i in {N}, m[i]*q_dot[i]**2/2) - k*x**2/2"
+    "- sum(i in {N} periodic, (q[i+1] - q[i])**4/4) - k*sum(i in {N}, (q[i] - x)**2/2)"
+)
+FORCES = {"x": "cos(t)/10", "q[i]": "sin(t)*m[i]"}
+MASSES = np.arange(1.0, 6.0)
+Q0 = {"x": 0.3, "q": np.linspace(0.0, 1.0, 5)}
+GIVEN = {"h": 0.1, "steps": 40, "parameters": {"m": MASSES}}
+
+
+def body_on_ring(size: str) -> sc.LagrangianSystem:
+    """A body joined by springs to the particles of a ring."""
+    return sc.LagrangianSystem.from_text(
+        name="body on ring",
+        coordinates=["x", f"q[{size}]"],
+        lagrangian=LAGRANGIAN.format(N=size),
+        parameters={"M": 2, "k": 1, f"m[{size}]": 1},
+        forces=FORCES,
+    )
+
+
+@pytest.fixture(scope="module")
+def at_run_time():
+    return sc.compile_stepper(body_on_ring("N"), "svi:4")
+
+
+@pytest.fixture(scope="module")
+def known():
+    return sc.compile_stepper(body_on_ring("N"), "svi:4", sizes={"N": 5})
+
+
+def test_sizes_known_and_at_run_time_agree(at_run_time, known):
+    first = at_run_time.integrate(Q0, **GIVEN)
+    second = known.integrate(Q0, velocity=np.zeros(6), **GIVEN)
+    named = known.arrays(second.q)
+    assert {name: values.shape for name, values in named.items()} == {"x": (41,), "q": (41, 5)}
+    for name, values in named.items():
+        assert np.abs(values - first.q[name]).max() < 1e-14
+    for name, values in known.arrays(second.p).items():
+        assert np.abs(values - first.p[name]).max() < 1e-13
+
+
+def test_threads_do_not_change_single_coordinates(at_run_time):
+    start = {"x": 0.3, "q": np.random.default_rng(1).normal(size=20_000)}
+    runs = [at_run_time.integrate(start, h=0.1, steps=3, parameters={"k": 1e-4}, threads=n) for n in (1, 2)]
+    assert runs[0].q["x"][-1] == runs[1].q["x"][-1]
+
+
+def test_literal_sizes_are_sizes_given_to_compile_stepper(known):
+    literal = body_on_ring("5")
+    assert [q.name for q in literal.coordinates] == ["x", "q_0", "q_1", "q_2", "q_3", "q_4"]
+    assert literal == sc.unroll_sums(body_on_ring("N"), {"N": 5})
+    run = sc.compile_stepper(literal, "svi:4").integrate(Q0, velocity=np.zeros(6), **GIVEN)
+    assert (run.q == known.integrate(Q0, velocity=np.zeros(6), **GIVEN).q).all()
+
+
+def test_motion_solves_newtons_equations(known):
+    def rates(t, y):
+        x, q, v = y[0], y[1:6], y[6:]
+        stretch = np.roll(q, -1) - q
+        ring = stretch**3 - np.roll(stretch, 1) ** 3 - (q - x) + np.sin(t) * MASSES
+        body = -x + (q - x).sum() + np.cos(t) / 10
+        return np.concatenate([v, [body / 2], ring / MASSES])
+
+    run = known.integrate(Q0, velocity=np.zeros(6), t_end=3.0, parameters={"m": MASSES})
+    start = np.concatenate([[Q0["x"]], Q0["q"], np.zeros(6)])
+    exact = solve_ivp(rates, (0, 3), start, rtol=1e-12, atol=1e-13, method="DOP853").y[:6, -1]
+    assert np.abs(run.q[-1] - exact).max() < 1e-10
+
+
+def test_states_by_name_in_ensembles_and_derivatives(known):
+    starts = {"x": np.array([0.3, 0.1]), "q": np.stack([Q0["q"], -Q0["q"]])}
+    masses = {"m": np.stack([MASSES, MASSES + 1])}
+    found = known.integrate_ensemble(starts, np.zeros((2, 6)), h=0.1, steps=40, parameters=masses)
+    single = known.integrate({"x": 0.1, "q": -Q0["q"]}, np.zeros(6), h=0.1, steps=40, parameters={"m": MASSES + 1})
+    assert np.abs(known.arrays(found.q[:, 1])["q"] - known.arrays(single.q)["q"]).max() < 1e-13
+    flow = known.jacobian(Q0, np.zeros(6), 0.1)
+    assert flow.shape == (12, 12)
+
+
+def test_the_only_array_needs_no_name():
+    atoms = sc.LagrangianSystem.from_text(
+        name="atoms", coordinates=["r[2, 3]"], lagrangian="sum(i in 2, k in 3, r_dot[i, k]**2/2 - r[i, k]**2/2)"
+    )
+    stepper = sc.compile_stepper(atoms, "svi:4")
+    start = np.arange(6.0).reshape(2, 3)
+    run = stepper.integrate(start, 0 * start, h=0.1, steps=3)
+    assert (run.q[0] == np.arange(6)).all()
+    assert (stepper.arrays(run.q)["r"][0] == start).all()
+
+
+@pytest.mark.parametrize(
+    ("q", "message"),
+    [
+        ({"x": 1.0}, "'q' is missing in q"),
+        ({"x": 1.0, "q": np.zeros(4)}, r"q: 'q' must have the shape \(5,\), not \(4,\)"),
+        ({"x": 1.0, "q": np.zeros(5), "u": 0}, "there is no 'u' in q"),
+        ({"x": [1.0, 2.0], "q": np.zeros(5)}, "different numbers of states"),
+    ],
+)
+def test_invalid_states_are_rejected(known, q, message):
+    with pytest.raises(StateError, match=message):
+        known.integrate(q, np.zeros(6), h=0.1, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("beside", "message"),
+    [
+        ({"lagrangian": "sum(i in N, q_dot[i]**2/2 + q[i]**2*q_dot[i]**2)"}, "velocities as m"),
+        ({"damping": 0.1}, "damping requires known sizes"),
+        ({"constraints": ["q_dot[i] = q[i] for i in 0..0"]}, "must be holonomic"),
+    ],
+)
+def test_known_sizes_lift_restrictions(beside, message):
+    given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **beside}
+    system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], **given)
+    with pytest.raises(SystemDefinitionError, match=rf"(?s){message}.*sizes=\{{'N': 8\}}"):
+        sc.compile_stepper(system, "svi:2")
+    if "constraints" not in beside:
+        run = sc.compile_stepper(system, "svi:2", sizes={"N": 2}).integrate([0.1, 0.2], velocity=[0, 0], h=0.1, steps=3)
+        assert np.isfinite(run.q).all()
