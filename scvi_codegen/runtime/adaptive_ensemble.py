@@ -7,7 +7,9 @@ for any number of threads. C runs without the GIL.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +17,12 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.native.options import SolverOptions, checked_options
+from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
 from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.global_error import GlobalError
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
@@ -87,6 +91,7 @@ class AdaptiveEnsemble:
             farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
             self.t_eval = times_of_run(t_eval, self.t0, farthest)
         self.saved: dict[int, SavedLane] = {}
+        self.confirmations: list[GlobalError | None] = []
 
     def _plans(self, t_end: ArrayLike, tolerance: float | None) -> list[StepPlan]:
         """Return the step plan of each trajectory; all must run forward or all backward."""
@@ -120,6 +125,36 @@ class AdaptiveEnsemble:
             "parameters": self.parameters[part],
             "options": self.options,
         }
+
+    def confirm(self, stepper: Any, wanted: float, *, threads: int | None = None) -> None:
+        """Choose the local tolerance of each trajectory for a global error, as ``stepper.integrate(error=)`` does.
+
+        The trajectories are bitwise those of the confirmed runs. One whose runs fail has errors at round-off level.
+        """
+        self.confirmations = [None] * len(self)
+
+        def confirm_one(j: int, check_stop: StopCheck) -> None:
+            own: dict[str, Any] = {
+                "t": self.t0,
+                "t_end": self.plans[j].t_end,
+                "save_every": self.save_every,
+                "options": self.options,
+            }
+            own |= {"error": wanted, "progress": check_stop, **self._parameters_and_inputs(j)}
+            with without_accuracy_warnings(), suppress(StateError, StepFailedError):
+                self.confirmations[j] = stepper.integrate(self.q[j], self.p[j], **own).confirmation
+
+        run_jobs(len(self), confirm_one, progress=None, threads=threads)
+        self.plans = [
+            plan if found is None else replace(plan, tolerance=found.tolerance)
+            for plan, found in zip(self.plans, self.confirmations, strict=True)
+        ]
+
+    def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
+        """Return the arguments ``parameters`` and ``inputs`` of a single run of trajectory j."""
+        of_inputs = set(columns_of_inputs(self.stepper.interface))
+        values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
+        return {"parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs}}
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
@@ -187,6 +222,7 @@ class AdaptiveEnsemble:
             steps=np.array([each.steps for each in found], dtype=np.int64),
             h=0.0,
             plans=tuple(self.plans),
+            confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
         )

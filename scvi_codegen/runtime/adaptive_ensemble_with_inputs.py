@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -80,6 +81,13 @@ class AdaptiveEnsembleWithInputs(AdaptiveEnsemble):
         """Return the parameters of trajectory j for the pieces that contain t."""
         found: Array = parameters_at(self.stepper.parameters, self.parameters, self.data, t, slice(j, j + 1))[0]
         return found
+
+    def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
+        own = {
+            name: replace(each, pieces=each.pieces[:, j]) if each.pieces.ndim == 3 else each
+            for name, each in self.data.items()
+        }
+        return super()._parameters_and_inputs(j) | {"inputs": own}
 
     def _first_parameters(self, j: int) -> Array:
         return self._values(j, first_inner_time(self.t0, self.plans[j].t_end))

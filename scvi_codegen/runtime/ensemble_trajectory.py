@@ -17,6 +17,7 @@ from scvi_codegen.files.export import LABELLED, check_format, write_whole
 from scvi_codegen.files.labelled_arrays import Labelled, checked_units, to_dataset
 from scvi_codegen.representation import one_line
 from scvi_codegen.runtime.descriptions import short_title
+from scvi_codegen.runtime.global_error import ConfirmedEnsemble, GlobalError
 from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.quantities import quantities
@@ -36,7 +37,7 @@ Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EnsembleTrajectory:
+class EnsembleTrajectory(ConfirmedEnsemble):
     """States of k trajectories, the initial state first.
 
     Attributes:
@@ -51,6 +52,8 @@ class EnsembleTrajectory:
         times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
         goals: step plan of each trajectory for adaptive steps, else empty.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
+        confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
+            empty.
     """
 
     t: Array
@@ -64,6 +67,7 @@ class EnsembleTrajectory:
     times: Array | None = None
     plans: tuple[StepPlan, ...] = ()
     spans: tuple[Span, ...] = field(default=(), repr=False)
+    confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
 
     def __len__(self) -> int:
         return len(self.status)

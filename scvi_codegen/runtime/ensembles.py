@@ -10,12 +10,14 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.accuracy import warn_of_energy_errors
+from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
 from scvi_codegen.runtime.chaos_indicators import ChaosIndicators
 from scvi_codegen.runtime.chaos_indicators_ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.constrained_states import ConstrainedStates
 from scvi_codegen.runtime.ensemble_selection import ensemble_work
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
 from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.global_error import checked_error, warn_of_unconfirmed
 from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
 
 __all__ = ["Ensembles"]
@@ -43,6 +45,7 @@ class Ensembles(ConstrainedStates):
         options: SolverOptions | None = None,
         progress: Callable[[int], None] | None = None,
         threads: int | None = None,
+        error: float | None = None,
     ) -> EnsembleTrajectory:
         """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
 
@@ -60,6 +63,8 @@ class Ensembles(ConstrainedStates):
             t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
             parameters: values by name, one number or k each; or an array (k, number of parameters).
             threads: number of threads, by default one per core.
+            error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
+                tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
 
         Returns:
             An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
@@ -68,6 +73,10 @@ class Ensembles(ConstrainedStates):
         Raises:
             StateError: if a shape, name or number is invalid.
         """
+        if error is not None:
+            others = {"h": h, "steps": steps, "tolerance": tolerance}
+            tau = self.interface.energy_parameter or self.interface.time_transformation
+            error = checked_error(error, others, has_tau=bool(tau))
         work = ensemble_work(
             self,
             q,
@@ -84,8 +93,11 @@ class Ensembles(ConstrainedStates):
             parameters=parameters,
             options=options,
         )
+        if error is not None and isinstance(work, AdaptiveEnsemble):
+            work.confirm(self, error, threads=threads)
         work.run(progress=progress, threads=threads)
         found = work.result()
+        warn_of_unconfirmed(found.confirmations)
         warn_of_energy_errors(found)
         return found
 

@@ -12,7 +12,7 @@ Math. 48 (1986) 1-20; E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Diff
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.native.arguments import checked_number
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.accuracy import warnings_wanted, without_accuracy_warnings
 
-__all__ = ["Confirmed", "GlobalError", "checked_error", "confirmed_run"]
+__all__ = ["Confirmed", "ConfirmedEnsemble", "GlobalError", "checked_error", "confirmed_run", "warn_of_unconfirmed"]
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
@@ -111,6 +111,41 @@ class Confirmed:
         return math.nan if self.confirmation is None else self.confirmation.confirmed_until
 
 
+class ConfirmedEnsemble:
+    """Properties of an ensemble, the same as of :class:`Confirmed` for each of k trajectories."""
+
+    __slots__ = ()
+    confirmations: tuple[GlobalError | None, ...]
+
+    @property
+    def global_error(self) -> Array:
+        """(k,) estimated relative errors; NaN without ``error=`` and for trajectories that fail."""
+        return np.array([math.nan if each is None else each.estimate for each in self.confirmations])
+
+    @property
+    def confirmed_digits(self) -> NDArray[np.int64]:
+        """(k,) numbers of decimal digits of all states that a second run confirms; 0 where there is none."""
+        return np.array([0 if each is None else each.digits for each in self.confirmations], dtype=np.int64)
+
+    @property
+    def confirmed_until(self) -> Array:
+        """(k,) times until which a second run confirms the error asked for; NaN where there is none."""
+        return np.array([math.nan if each is None else each.confirmed_until for each in self.confirmations])
+
+
+def warn_of_unconfirmed(confirmations: Sequence[GlobalError | None]) -> None:
+    """Issue one warning for the trajectories whose requested global error is not confirmed."""
+    lost = [(j, each) for j, each in enumerate(confirmations) if each is not None and not each.confirmed]
+    if lost:
+        j, first = lost[0]
+        warn(
+            f"the global error {first.requested:g} is not confirmed for {len(lost)} of {len(confirmations)} "
+            f"trajectories; for trajectory {j} it is until t = {first.confirmed_until:.6g} only. See "
+            "confirmed_until of the result; end the runs there, or give a larger error",
+            AccuracyWarning,
+        )
+
+
 def checked_error(error: Any, others: Mapping[str, Any], *, has_tau: bool = False) -> float:
     """Return the requested global error as a number; raise StateError if combined with another step-size option."""
     wanted = checked_number(error, "the global error")
@@ -186,7 +221,7 @@ def confirmed_run(
                 break
             excess = math.inf if result is None else result.estimate / wanted
             tolerance *= max(min(MARGIN, MARGIN / excess), LARGEST_CUT)
-    if not result.confirmed:
+    if not result.confirmed and warnings_wanted():
         until = f"confirmed until t = {result.confirmed_until:.6g} only"
         warn(
             f"the global error {wanted:g} is {until}: beyond it, runs with other steps and initial states perturbed in "

@@ -379,6 +379,106 @@ class TestWhatIsRefused:
             stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0, error=1e-6)
 
 
+def kepler_positions(e, t):
+    """The exact motion from the pericentre, with a semi-major axis of 1, by Kepler's equation."""
+    anomaly = t + e * np.sin(t)
+    for _ in range(50):
+        anomaly = anomaly - (anomaly - e * np.sin(anomaly) - t) / (1 - e * np.cos(anomaly))
+    return np.stack([np.cos(anomaly) - e, np.sqrt(1 - e * e) * np.sin(anomaly)], axis=-1)
+
+
+class TestEnsembles:
+    ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
+    ENDS = np.array([40.0, 30.0, 20.0, 10.0])
+
+    def _start(self):
+        e = self.ECCENTRICITIES
+        q, v = np.zeros((2, len(e), 2))
+        q[:, 0], v[:, 1] = 1 - e, np.sqrt((1 + e) / (1 - e))
+        return {"q": q, "velocity": v}
+
+    @pytest.mark.parametrize("error", [1e-5, 1e-9])
+    def test_estimates_bound_the_errors_of_all_trajectories(self, kepler_stepper, error):
+        """Each has a tolerance of its own; exact positions come from Kepler's equation."""
+        runs = kepler_stepper.integrate_ensemble(**self._start(), t_end=self.ENDS, error=error, threads=2)
+        for j, (t, q, _, status, _) in enumerate(runs.each()):
+            exact = kepler_positions(self.ECCENTRICITIES[j], t)
+            sizes = np.maximum.accumulate(np.linalg.norm(exact, axis=1))
+            assert status == "ok"
+            assert (np.linalg.norm(q - exact, axis=1) / sizes).max() < runs.global_error[j] <= error
+        assert (runs.confirmed_until == self.ENDS).all()
+        assert (runs.confirmed_digits >= -np.log10(error)).all()
+        assert error < 1e-5 or len({found.tolerance for found in runs.confirmations}) > 1
+
+    @pytest.mark.parametrize("threads", [1, 2])
+    def test_trajectories_are_those_of_single_runs_bitwise(self, kepler_stepper, threads):
+        start = self._start()
+        runs = kepler_stepper.integrate_ensemble(**start, t_end=self.ENDS, error=1e-7, threads=threads, save_every=3)
+        for j, (t, q, p, *_) in enumerate(runs.each()):
+            run = kepler_stepper.integrate(
+                start["q"][j], velocity=start["velocity"][j], t_end=self.ENDS[j], error=1e-7, save_every=3
+            )
+            assert np.array_equal(t, run.t)
+            assert np.array_equal(q, run.q)
+            assert np.array_equal(p, run.p)
+            assert runs.global_error[j] == run.global_error
+            assert runs.confirmations[j].tolerance == run.confirmation.tolerance
+
+    def test_states_at_given_times(self, kepler_stepper):
+        times = np.linspace(0.0, 40.0, 9)
+        runs = kepler_stepper.integrate_ensemble(**self._start(), t_end=self.ENDS, error=1e-8, t_eval=times)
+        for j, (t, q, *_) in enumerate(runs.each()):
+            assert t[-1] <= self.ENDS[j]
+            assert np.abs(q - kepler_positions(self.ECCENTRICITIES[j], t)).max() < 1e-7
+
+    def test_chaotic_and_failed_trajectories_are_named(self):
+        """One of them falls into the centre, and one is confirmed."""
+        stepper = sc.compile_stepper(
+            made("wells", ["x", "y"], "(x_dot**2 + y_dot**2)/2 - cosh(x)*cosh(y)*(x*y)**2"), "svi:8"
+        )
+        with pytest.warns(
+            sc.AccuracyWarning, match=r"confirmed for 1 of 2 trajectories; for trajectory 1 it is until"
+        ) as heard:
+            runs = stepper.integrate_ensemble(
+                [[1.0, 0.0], [1.0, 0.5]], [[0.1, 0.0], [0.3, 0.7]], t_end=150.0, error=1e-9
+            )
+        assert len(heard) == 1
+        assert runs.ok.all()
+        assert runs.global_error[0] <= 1e-9 < runs.global_error[1]
+        assert runs.confirmed_until[0] == 150.0 > runs.confirmed_until[1]
+        kepler = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
+        runs = kepler.integrate_ensemble([[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, 0.0]], t_end=3.0, error=1e-6)
+        assert runs.status[0] == "ok" != runs.status[1]
+        assert runs.global_error[0] <= 1e-6
+        assert np.isnan([runs.global_error[1], runs.confirmed_until[1]]).all()
+        assert runs.confirmed_digits[1] == 0
+
+    def test_inputs_of_each_trajectory(self):
+        system = sc.LagrangianSystem.from_text(
+            name="pushed", coordinates=["x"], lagrangian="x_dot**2/2 - x**2/2", inputs=["u"], parameters={"c": 0.2},
+            forces={"x": "u - c*x_dot"},
+        )  # fmt: skip
+        stepper, t = sc.compile_stepper(system, "svi:4"), np.array([0.0, 1.0, 2.5, 6.0])
+        values = np.array([[0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.5, 2.0]])
+        common = {"t_end": 6.0, "error": 1e-8}
+        start = [[1.0], [0.5]], [[0.0], [0.2]]
+        runs = stepper.integrate_ensemble(*start, inputs={"u": (t, values)}, parameters={"c": [0.1, 0.3]}, **common)
+        for j, (times, q, *_) in enumerate(runs.each()):
+            given = {"inputs": {"u": (t, values[j])}, "parameters": {"c": [0.1, 0.3][j]}}
+            run = stepper.integrate(start[0][j], start[1][j], **given, **common)
+            assert np.array_equal(times, run.t)
+            assert np.array_equal(q, run.q)
+            assert runs.global_error[j] == run.global_error <= 1e-8
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [({"h": 0.1, "steps": 3}, "h=0.1 both determine"), ({"t_end": 1.0, "tolerance": 1e-9}, "tolerance=1e-09 both")],
+    )
+    def test_contradictory_arguments_are_rejected(self, kepler_stepper, more, message):
+        with pytest.raises(sc.StateError, match=message):
+            kepler_stepper.integrate_ensemble(**self._start(), error=1e-9, **more)
+
+
 class TestOtherRuns:
     def test_without_error_argument_nothing_is_confirmed(self, kepler_stepper):
         run = kepler_stepper.integrate([1.6, 0.0], [0.0, 0.5], t_end=1.0)
