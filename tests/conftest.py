@@ -28,7 +28,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """What C text means, which most tests ask, does not depend on optimisation, of which compiling is mostly made."""
+    """Lower the optimisation of compilers in most tests: the results of the C code do not depend on it."""
     if config.option.markexpr == DEFAULT:
         os.environ.setdefault(FLAGS_VARIABLE, UNOPTIMISED)
 
@@ -65,13 +65,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is there now stays to the end: the garbage collector need not go through it again and again."""
+    """Freeze collected objects, so that the garbage collector does not visit them repeatedly."""
     gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Of the whole default tier a file is run by one process: what its tests share is made once."""
+    """Distribute the default tier by file, so that shared fixtures are made once."""
     if config.option.markexpr != DEFAULT or config.args_source is not config.ArgsSource.TESTPATHS:
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -82,7 +82,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def as_users_compile() -> Iterator[None]:
-    """With the flags that a stepper is given, for what depends on them: bits, round-off, long runs, documentation."""
+    """Compile with the default flags, for tests of bits, round-off, long runs and documentation."""
     with pytest.MonkeyPatch.context() as patch:
         if os.environ.get(FLAGS_VARIABLE) == UNOPTIMISED:  # and not those of `test_builds.py`
             patch.delenv(FLAGS_VARIABLE)
@@ -101,7 +101,7 @@ def compiled() -> Callable[..., Stepper]:
 
 @pytest.fixture(scope="session")
 def quickly_compiled() -> Callable[[LagrangianSystem, Method], Stepper]:
-    """For systems without a name."""
+    """Compile with little optimisation, for systems without a name."""
     return compile_quickly
 
 

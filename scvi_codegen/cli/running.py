@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from scvi_codegen.runtime.inputs import Array
 from scvi_codegen.runtime.largest_step import accuracy_message
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.run_loop import first_step_size
+from scvi_codegen.runtime.run_loop import record
 from scvi_codegen.runtime.runs_with_inputs import with_final_state
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
@@ -39,8 +39,6 @@ __all__ = [
     "worst_step",
 ]
 
-CHUNK_SECONDS = 0.2
-"""Target duration of a chunk in seconds; bounds the delay of Ctrl-C."""
 SHOWN_COORDINATES = 6
 """Largest number of coordinates that the final state lists."""
 
@@ -93,64 +91,40 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     if model.system.clock is not None and model.ends_at_time:
         return _in_transformed_time(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
+    began, stopped, failure, pieces = time.perf_counter(), False, None, list[Trajectory]()
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
-        work, pieces = _Chunks(model, run, caught, show_progress), []
-        for steps in model.segments(run):
-            pieces.append(work.segment(steps))
-            if work.failure is not None or work.stopped:
-                break
-    pieces = pieces or [run.record(0)]
+
+        def look(_: int) -> None:
+            show_progress(_reached(model, run))
+            check_run_memory(model, run.steps)
+
+        def stop() -> bool:
+            nonlocal stopped
+            stopped = bool(caught)
+            return stopped
+
+        def add(piece: Trajectory) -> None:
+            pieces.append(with_final_state(piece, run) if _in_segments(model) else piece)
+
+        try:
+            for steps in model.segments(run):
+                add(record(run, steps, save_every=model.save_every, progress=look, stop=stop))
+                if stopped:
+                    break
+        except StepFailedError as error:
+            failure = error
+            add(Trajectory.before(error))
+    seconds, pieces = time.perf_counter() - began, pieces or [record(run, 0)]
     trajectory = DrivenTrajectory(tuple(pieces)) if _in_segments(model) else pieces[0]
     return RunOutcome(
         trajectory=trajectory,
         run=run,
         preparation=preparation,
-        seconds=work.seconds,
-        failure=work.failure,
-        interrupted=work.stopped,
+        seconds=seconds,
+        failure=failure,
+        interrupted=stopped,
         missed=_missed(model, trajectory),
     )
-
-
-class _Chunks:
-    """Integration of a run in short chunks between which signals are handled; ends before a step that fails.
-
-    Attributes:
-        seconds: seconds spent in steps.
-        failure: error of the step that failed, or ``None``.
-        stopped: True if a signal arrived first.
-    """
-
-    def __init__(self, model: Model, run: Run, caught: Sequence[int], show_progress: Callable[[int], None]) -> None:
-        self.model, self.run, self.caught, self.show_progress = model, run, caught, show_progress
-        self.size, self.seconds, self.stopped = 1, 0.0, False
-        self.failure: StepFailedError | None = None
-
-    def segment(self, steps: int | None) -> Trajectory:
-        """Advance ``steps`` steps, or up to the target time of the run (``None``), and return the states."""
-        run, pieces = self.run, [self.run.record(0, save_every=self.model.save_every)]
-        last = None if steps is None else run.steps + steps
-        while self.failure is None and not (run.arrived if last is None else run.steps >= last):
-            self.stopped = bool(self.caught)
-            if self.stopped:
-                break
-            pieces.append(self._chunk(self.size if last is None else min(self.size, last - run.steps)))
-        joined = _joined(pieces)
-        return with_final_state(joined, run) if _in_segments(self.model) else joined
-
-    def _chunk(self, steps: int) -> Trajectory:
-        model, run = self.model, self.run
-        began = time.perf_counter()
-        try:
-            piece = run.record(steps, save_every=model.save_every)
-        except StepFailedError as error:
-            self.failure, piece = error, Trajectory.before(error)
-        elapsed = time.perf_counter() - began
-        self.seconds += elapsed
-        self.show_progress(_reached(model, run))
-        check_run_memory(model, run.steps)
-        self.size = max(1, int(self.size * min(2.0, CHUNK_SECONDS / max(elapsed, 1e-6))))
-        return piece
 
 
 def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
@@ -306,19 +280,4 @@ def _how_known(known: Known | None) -> str:
         f"{message}; chaotic: neighbouring trajectories diverge tenfold every {known.tenfold:.2g}"
         if known.chaotic
         else message
-    )
-
-
-def _joined(pieces: list[Trajectory]) -> Trajectory:
-    """Join trajectories; drop the first state of each but the first, which repeats the last of the one before."""
-    first, *rest = pieces
-    last, t = pieces[-1], np.concatenate([first.t, *(piece.t[1:] for piece in rest)])
-    return replace(
-        last,
-        h=first_step_size(last.plan, t) if last.plan else last.h,
-        t=t,
-        q=np.concatenate([first.q, *(piece.q[1:] for piece in rest)]),
-        p=np.concatenate([first.p, *(piece.p[1:] for piece in rest)]),
-        iterations=np.concatenate([first.iterations, *(piece.iterations[1:] for piece in rest)]),
-        step_sizes=np.concatenate([*(piece.step_sizes[:-1] for piece in pieces), last.step_sizes[-1:]]),
     )

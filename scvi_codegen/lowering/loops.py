@@ -19,6 +19,7 @@ from scvi_codegen.ir.program import LoopedTerms, Program
 from scvi_codegen.lowering.kernels import looped_kernel
 from scvi_codegen.lowering.lattices import reach_of
 from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
 __all__ = ["looped_terms", "with_sums"]
@@ -128,45 +129,38 @@ def with_sums(program: Program, of: SplitSystem) -> Program | None:
 
     ``None`` if forces enter otherwise than as values of kernels: in Newton's method, in shooting.
     """
-    forces = tuple(_forces(of, group, number) for number, group in enumerate(of.term_groups))
-    energies = tuple(_energy(of, group, number) for number, group in enumerate(of.term_groups))
-    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(forces), program.splitting
-    energy = program.quantities.energy
+    rest, energy, sign = of.rest, program.quantities.energy, -1 if of.rest.auxiliaries else 1
+    forces, terms = [], []
+    for number, group in enumerate(of.term_groups):
+        first = ((0,),) * len(group.places)
+        forces.append(_over_terms(rest, f"pull_{number}", group, group.partials, ()))
+        terms.append(_over_terms(rest, f"term_{number}", group, (sign * group.formula,), first))
+    fixed_point, splitting = program.fixed_point and program.fixed_point.with_forces(tuple(forces)), program.splitting
     if program.newton or energy is None or not (fixed_point or splitting):
         return None
     return replace(
         program,
-        quantities=replace(program.quantities, energy=energy.with_sums(energies)),
+        quantities=replace(program.quantities, energy=energy.with_sums(tuple(terms))),
         fixed_point=fixed_point,
-        splitting=replace(splitting, force=splitting.force.with_sums(forces)) if splitting else None,
+        splitting=replace(splitting, force=splitting.force.with_sums(tuple(forces))) if splitting else None,
     )
 
 
-def _forces(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
-    return _summed(of, f"pull_{number}", group, group.partials, ())
-
-
-def _energy(of: SplitSystem, group: TermGroup, number: int) -> LoopedKernel:
-    value = -group.formula if of.rest.auxiliaries else group.formula
-    return _summed(of, f"term_{number}", group, (value,), ((0,),) * len(group.places))
-
-
-def _summed(
-    of: SplitSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
+def _over_terms(
+    system: MechanicalSystem, name: str, group: TermGroup, values: Sequence[Expr], targets: tuple[tuple[int, ...], ...]
 ) -> LoopedKernel:
-    system = of.rest
-    places = {parameter: k for k, parameter in enumerate(system.parameters)}
-
-    def constant(value: Expr) -> Constant | Load:
-        return Load("parameters", places[value]) if value in places else Constant(exact_number(value))
-
-    term = lower_kernel(
+    """Return the loop over the terms of a group."""
+    kernel = lower_kernel(
         name,
         arguments=(*group.slots, *group.given),
         time=system.time,
         parameters=system.parameters,
-        values=tuple(values),
+        values=values,
         constants=len(group.given),
     )
-    given = tuple(tuple(map(constant, column)) for column in group.values)
-    return LoopedKernel.over_rows(term, group.places, given, targets)
+    index = {parameter: k for k, parameter in enumerate(system.parameters)}
+    given = tuple(
+        tuple(Load("parameters", index[x]) if x in index else Constant(exact_number(x)) for x in column)
+        for column in group.values
+    )
+    return LoopedKernel.over_rows(kernel, group.places, given, targets)

@@ -75,7 +75,12 @@ class Nest:
         return self.depth_of(access) == len(self.looped.loops)
 
     def text(
-        self, *, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]] = ()
+        self,
+        *,
+        prepare: Lines = lambda k: [],
+        innermost: Sequence[str],
+        finish: Lines = lambda k: [],
+        behind: Sequence[Sequence[str]] = (),
     ) -> list[str]:
         """Return the lines of the nested loops.
 

@@ -1,23 +1,23 @@
-"""Systems of arrays as C: nested loops around kernels, and the template's context."""
+"""Systems of arrays as C: functions of nested loops around kernels, lattices, and the template's context."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import accumulate
+from math import prod
 from typing import Any
 
+from scvi_codegen.indices import Array
 from scvi_codegen.ir.constraints import ConstrainedSteps
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.kernel_parts import is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.rendering.convergence import MAX_ITERATIONS
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.lattices import lattice_context, roots_per_coordinate
 from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
 from scvi_codegen.rendering.printer import inverse_roots, scalar_functions
 from scvi_codegen.rendering.simd import LIBRARY, POINTS, IterationSource, iteration_source
-from scvi_codegen.rendering.sizes import count_text, product_text, sizes_text
+from scvi_codegen.rendering.sizes import count_text, product_text, size_text, sizes_text
 from scvi_codegen.rendering.target import DOUBLE
 from scvi_codegen.rendering.thread_partition import MOST_THREADS, Sharing, sharing_of, sharing_text
 
@@ -35,8 +35,6 @@ FOURIER_VECTORS = 2
 """Further vectors: scratch of Fourier transforms (templates/support/fourier_preconditioner.h)."""
 HALVES_VECTORS = 7
 """Further vectors: the state at the start of a step and three increments (templates/support/indexed_halves.h)."""
-X = "const double *restrict X"
-CURSOR = "condition *now"
 
 
 def loop_context(program: Program) -> dict[str, Any]:
@@ -51,10 +49,6 @@ def loop_context(program: Program) -> dict[str, Any]:
         scalars += [each.kernel for each in (*constrained.conditions, *constrained.curvatures)]
     return {
         "program": program,
-        "prefix": program.prefix,
-        "target": DOUBLE,
-        "real": DOUBLE.scalar,
-        "max_iterations": MAX_ITERATIONS,
         "most_threads": 1 if constrained else MOST_THREADS,
         "cut": is_divided((*scalars, *(each.kernel for each in loops.applied))),
         "forces": [_force_text(program, each) for each in loops.applied],
@@ -72,7 +66,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         "iteration_vectors": ITERATION_VECTORS,
         "halves_vectors": HALVES_VECTORS,
         "hot": "static",
-        "waves": lattice_context(program) if loops.reach else None,
+        "waves": _lattice_context(program) if loops.reach else None,
         **_constraint_context(program, constrained),
     }
 
@@ -83,7 +77,7 @@ def _work(program: Program) -> int:
         return CONSTRAINED_VECTORS if program.loops.constrained else EXPLICIT_VECTORS
     own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
     linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
-    waves = FOURIER_VECTORS * program.fixed_point.lanes + roots_per_coordinate(program) if program.loops.reach else 0
+    waves = FOURIER_VECTORS * program.fixed_point.lanes + _roots_per_coordinate(program) if program.loops.reach else 0
     return (own + linear) * program.fixed_point.lanes + waves + HALVES_VECTORS
 
 
@@ -145,32 +139,35 @@ def _sharing_text(program: Program, looped: LoopedKernel) -> str:
     return f"/* Its rounds of tasks. */\n{head}\n{{\n{lines}\n}}"
 
 
+def _function(
+    program: Program,
+    looped: LoopedKernel,
+    name: str,
+    arguments: Sequence[str],
+    lines: Sequence[str],
+    *,
+    values: int = 1,
+    source: str = "X",
+) -> str:
+    """Return a function of numbers with the same statements for every element."""
+    nest = Nest(program, looped, "double", source)
+    text = ["(void)given;", *nest.text(innermost=lines)]
+    declared = f"double value[{values}]" if values else ""
+    return nest.function(f"static void {name}", ["const problem *given", *arguments], text, values=declared)
+
+
 def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
     """Return a function that computes the sum of the terms."""
-    nest = Nest(program, looped, "double", "q")
-    lines = nest.text(
-        prepare=lambda k: [],
-        innermost=[f"{kernel.name}(u, t, parameters, value);", "add_to_sum(total, value[0]);"],
-        finish=lambda k: [],
-    )
-    arguments = ["const problem *given", "const double *q", "double t", "compensated *total"]
-    return nest.function(f"static void sum_{kernel.name}", arguments, lines, values="double value[1]")
+    arguments = ["const double *q", "double t", "compensated *total"]
+    lines = [f"{kernel.name}(u, t, parameters, value);", "add_to_sum(total, value[0]);"]
+    return _function(program, looped, f"sum_{kernel.name}", arguments, lines, source="q")
 
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the masses."""
-    nest = Nest(program, looped, "", "")
-    place = nest.place_of(looped.targets[0])
-    lines = nest.text(
-        prepare=lambda k: [],
-        innermost=[
-            f"{looped.kernel.name}(NULL, 0.0, parameters, value);",
-            f"mass[{place}] += value[0];",
-        ],
-        finish=lambda k: [],
-    )
-    arguments = ["const problem *given", "double *mass"]
-    return nest.function(f"static void add_{looped.kernel.name}", arguments, lines, values="double value[1]")
+    name, place = looped.kernel.name, Nest(program, looped, "", "").place_of(looped.targets[0])
+    lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
+    return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
 
 
 def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict[str, Any]:
@@ -179,8 +176,9 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
         return {"held": None}
     counts = [count_text(each.loops) for each in held.conditions]
     entries = [f"{count} * {len(each.slots)}" for count, each in zip(counts, held.conditions, strict=True)]
+    pairs = zip(held.conditions, held.curvatures, strict=True)
     found = {
-        "functions": [text for pair in zip(*_texts(program, held), strict=True) for text in pair],
+        "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
         "conditions": [each.kernel.name for each in held.conditions],
         "curvatures": [each.kernel.name for each in held.curvatures],
         "sizes": list(sizes_text(program, " ".join(counts))),
@@ -190,44 +188,57 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
     return {"held": found, "part_ends": list(accumulate(held.parts))}
 
 
-def _texts(program: Program, held: ConstrainedSteps) -> tuple[list[str], list[str], list[str]]:
-    """Return one function per constraint for g, g_t and derivatives, one for second derivatives, one for indices."""
-    return (
-        [_condition(program, each) for each in held.conditions],
-        [_curvature(program, each) for each in held.curvatures],
-        [_places(program, each) for each in held.conditions],
-    )
-
-
-def _condition(program: Program, looped: LoopedKernel) -> str:
-    name, count = looped.kernel.name, len(looped.slots)
+def _constraint_texts(program: Program, condition: LoopedKernel, curvature: LoopedKernel) -> Iterator[str]:
+    """Yield functions of a constraint: g, g_t and derivatives; second derivatives; indices of its coordinates."""
+    name, count = condition.kernel.name, len(condition.slots)
+    X, now = "const double *restrict X", "condition *now"
     lines = [
         f"{name}(u, t, parameters, value);",
         "now->g[now->count] = value[0];",
         "now->rate[now->count++] = value[1];",
         *(f"now->derivative[now->entries++] = value[{k + 2}];" for k in range(count)),
     ]
-    arguments = ["const problem *given", X, "double t", CURSOR]
-    return _function(Nest(program, looped, "double", "X"), f"find_{name}", arguments, lines, count + 2)
-
-
-def _curvature(program: Program, looped: LoopedKernel) -> str:
-    name = looped.kernel.name
-    lines = [f"{name}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
-    arguments = ["const problem *given", X, f"const double *restrict {DIRECTION}", "double t", CURSOR]
-    return _function(Nest(program, looped, "double", "X"), f"find_{name}", arguments, lines, 1)
-
-
-def _places(program: Program, looped: LoopedKernel) -> str:
-    bare = replace(looped, slots=(), given=())
-    nest = Nest(program, bare, "", "")
+    yield _function(program, condition, f"find_{name}", [X, "double t", now], lines, values=count + 2)
+    second = curvature.kernel.name
+    lines = [f"{second}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
+    arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
+    yield _function(program, curvature, f"find_{second}", arguments, lines)
+    bare = replace(condition, slots=(), given=())
+    places = map(Nest(program, bare, "", "").place_of, condition.targets)
     lines = [
         "now->first[now->count++] = (int)now->entries;",
-        *(f"now->place[now->entries++] = (int)({nest.place_of(target)});" for target in looped.targets),
+        *(f"now->place[now->entries++] = (int)({place});" for place in places),
     ]
-    return _function(nest, f"place_{looped.kernel.name}", ["const problem *given", CURSOR], lines, 0)
+    yield _function(program, bare, f"place_{name}", [now], lines, values=0, source="")
 
 
-def _function(nest: Nest, name: str, arguments: Sequence[str], lines: Sequence[str], values: int) -> str:
-    text = ["(void)given;", *nest.text(prepare=lambda k: [], innermost=lines, finish=lambda k: [])]
-    return nest.function(f"static void {name}", arguments, text, values=f"double value[{values}]" if values else "")
+def _lattice_context(program: Program) -> dict[str, Any]:
+    """Return the template's context for lattices."""
+    before: list[str] = []
+    lines: list[str] = []
+    for array in program.layout.coordinates:
+        sizes = ", ".join(size_text(axis) for axis in array.axes if axis.name)
+        first = " + ".join(before) or "0"
+        lines.append(
+            f"{{.first = {first}, .components = {_components(array)}, .size = {{{sizes}}}, .axes = {_axes(array)}}}"
+        )
+        before.append(product_text(array))
+    return {
+        "lattices": lines,
+        "axes": max(map(_axes, program.layout.coordinates)),
+        "components": sum(map(_components, program.layout.coordinates)),
+        "sizes": list(sizes_text(program, " ".join(lines))),
+    }
+
+
+def _roots_per_coordinate(program: Program) -> int:
+    """Return the doubles per coordinate that suffice for the roots of unity of every axis."""
+    return 2 * max(map(_axes, program.layout.coordinates))
+
+
+def _axes(array: Array) -> int:
+    return sum(bool(axis.name) for axis in array.axes)
+
+
+def _components(array: Array) -> int:
+    return prod(axis.number for axis in array.axes if not axis.name)

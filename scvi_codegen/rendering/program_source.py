@@ -162,7 +162,9 @@ def render_embedded(program: Program, precision: Embedded, control: Control | No
 
 
 def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") -> Source:
-    environment = template_environment()
+    """Return the source of entry templates from their context, with defaults for all of them."""
+    common = {"prefix": prefix, "target": DOUBLE, "real": DOUBLE.scalar, "max_iterations": MAX_ITERATIONS}
+    environment, context = template_environment(), {**common, **context}
     code = environment.get_template(f"{entry}.c.jinja").render(context)
     own = cast("Mapping[str, str]", context.get("own_headers", {}))
     return Source(
@@ -193,10 +195,6 @@ def render_ensemble(program: Program) -> Source | None:
     prefix = f"{program.prefix}_ensemble"
     context = {
         "program": program,
-        "prefix": prefix,
-        "target": DOUBLE,
-        "real": DOUBLE.scalar,
-        "max_iterations": MAX_ITERATIONS,
         "points": len(fixed_point.guess.abscissae),
         "cut": is_divided(fixed_point.kernels),
         "needs_velocities": fixed_point.kept is StoredValues.VELOCITIES,
@@ -211,8 +209,6 @@ def render_events(search: EventSearch) -> Source:
     context = {
         "search": search,
         "prefix": search.prefix,
-        "target": DOUBLE,
-        "real": DOUBLE.scalar,
         "kernel": search.kernel,
         "cut": is_divided((search.kernel,)),
         "inverse_roots": inverse_roots((search.kernel,)),
@@ -284,7 +280,6 @@ def _context(
     lanes = beside.lane_kernels if beside else ()
     return {
         "program": program,
-        "prefix": program.prefix,
         "target": target,
         "real": target.scalar,
         "kernels": kernels,
@@ -292,7 +287,6 @@ def _context(
         "inverse_roots": inverse_roots(scalars),
         "workspace": workspace_size(program),
         "scratch": scratch_size(program),
-        "max_iterations": MAX_ITERATIONS,
         "most_iterations": "INT_MAX",
         "embedded": False,
         "derivatives": None,

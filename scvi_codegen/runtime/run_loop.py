@@ -36,11 +36,10 @@ def drive(
     steps: float,
     *,
     first: int = 1,
-    multiple: int = 1,
     most: float = math.inf,
     growth: float = 2.0,
     seconds: float = CALL_SECONDS,
-    ended: Callable[[], bool] | None = None,
+    ended: Callable[[], bool],
     progress: Callable[[int], None] | None = None,
 ) -> None:
     """Take steps in chunks of about ``seconds``, so that Python regains control regularly.
@@ -48,18 +47,18 @@ def drive(
     Args:
         advance: function that takes a number of steps and returns how many it took.
         steps: number of steps, possibly infinite.
-        first, multiple, most: steps of the first chunk; divisor of the chunk sizes; largest chunk size.
+        first, most: steps of the first chunk, and largest chunk size.
         growth: largest ratio of successive chunk sizes.
         seconds: target duration of a chunk.
         ended: function that returns whether the run has ended; called before each chunk.
         progress: called with the number of steps after each chunk.
     """
     done, size, began = 0, first, -math.inf
-    while done < steps and not (ended is not None and ended()):
+    while done < steps and not ended():
         now = time.perf_counter()
         if done:
             faster = min(growth, seconds / max(now - began, 1e-6))
-            size = multiple * max(1, int(min(size * faster, most) / multiple))
+            size = max(1, int(min(size * faster, most)))
         size, began = int(min(size, steps - done)), now
         done += advance(size)
         if progress is not None:
@@ -67,11 +66,17 @@ def drive(
 
 
 def record(
-    memory: Memory, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
+    memory: Memory,
+    steps: int | None,
+    *,
+    save_every: int = 1,
+    progress: Callable[[int], None] | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> Trajectory:
     """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
 
-    Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted.
+    Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted. The run ends
+    early if ``stop``, which is called before each chunk of steps, returns true.
 
     Raises:
         StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
@@ -83,9 +88,8 @@ def record(
         drive(
             recorder.advance,
             math.inf if count is None else count,
-            first=recorder.first_size,
-            multiple=save_every,
-            ended=None if memory.plan is None else memory.has_arrived,
+            first=1 if stop else recorder.first_size,
+            ended=memory.has_arrived if stop is None else lambda: memory.has_arrived() or stop(),
             progress=progress,
         )
     except StepFailedError as failure:

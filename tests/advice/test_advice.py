@@ -1,4 +1,4 @@
-"""The step advised gives the error asked for, against exact solutions; what cannot be promised is said."""
+"""Recommended step sizes reach the requested error, against exact solutions; unreachable tolerances are reported."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def kepler_start(eccentricity: float) -> tuple[list[float], list[float]]:
 
 
 def pendulum_end(t: float) -> np.ndarray:
-    """Of q'' = -sin(q) from rest at 1.5."""
+    """Return the final state of q'' = -sin(q) from rest at 1.5."""
     with mp.workdps(40):
         k = mp.sin(mp.mpf(1.5) / 2)
         return np.array([float(2 * mp.asin(k * mp.ellipfun("sn", mp.ellipk(k**2) + t, m=k**2)))])
@@ -165,7 +165,7 @@ class TestDegree:
     @pytest.mark.filterwarnings("ignore::scvi_codegen.errors.AccuracyWarning")  # two digits are wanted
     @pytest.mark.parametrize("tolerance", [1e-2, 1e-6, 1e-11])
     def test_degree_minimises_the_number_of_evaluations(self, tolerance: float):
-        """By count, hence the same each time: degree 8 fills a register, which degrees below pay for without use."""
+        """The count is deterministic: degree 8 fills a SIMD register, lower degrees waste lanes."""
         system, (q, p) = problem("kepler").system, kepler_start(0.2)
         advice = advise(system, SVI(4), q, p, 200.0, tolerance, degree=True)
         costs = {n: cost(advise(system, SVI(n), q, p, 200.0, tolerance), n) for n in (4, 6, 8, 10, 12)}
@@ -207,7 +207,7 @@ class TestHonesty:
         assert "symplectic" not in advise(system, RadauIIA(3), q, p, 20.0, 1e-6).message
 
     def test_a_step_for_newton_alone_is_not_advised(self):
-        """On a chain of springs steps beyond the limit of the fixed point meet the tolerance, at ten times the cost."""
+        """For a chain of springs, steps beyond the fixed-point limit meet the tolerance at ten times the cost."""
         chosen = problem("fput-chain")
         iterated = compile_stepper(chosen.system, SVI(8), solver="fixed-point")
         p = iterated.momentum(chosen.q, chosen.velocity)
@@ -255,7 +255,7 @@ class TestHonesty:
         assert 1e-7 < np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1]) < 2e-5
 
     def test_slow_chaos_is_detected_in_long_runs(self):
-        """Of Henon and Heiles at the energy 1/6: errors grow tenfold every 60 units of time or so."""
+        """Henon-Heiles at energy 1/6: errors grow tenfold every 60 units of time."""
         entry = problem("henon-heiles").system
         q, p = [0.0, -0.1475], [math.sqrt(1.0 / 3.0 - 0.1475**2 - 2.0 * 0.1475**3 / 3.0), 0.0]
         advice = advise(entry, SVI(8), q, p, 1e5, 1e-6)

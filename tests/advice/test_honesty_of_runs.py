@@ -1,4 +1,4 @@
-"""What is said of a run is checked on that run: long steps, broken promises, digits that are known, chaos."""
+"""Accuracy warnings of runs: too large steps, missed tolerances, correct digits, chaos."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class TestLongSteps:
             sc.compile_stepper(unstable, "svi:1").integrate([0.0], [1e-6], h=1.0, steps=steps)
 
     def test_close_encounter_from_far_warns(self):
-        """There positions are a fortieth of those before; momenta are the largest of all."""
+        """Positions shrink to a fortieth of the previous ones; momenta are at their maximum."""
         stepper = sc.compile_stepper(sc.problem("kepler").system, "svi:4")
         with pytest.warns(sc.AccuracyWarning, match="h = 0.02 is too large: .* from t = 3.14 is"):
             stepper.integrate([1.95, 0.0], [0.0, math.sqrt(2 / 1.95 - 1)], h=0.02, steps=300)
@@ -197,7 +197,7 @@ class TestLostEnergy:
         assert abs(energy[-1] - energy[0]) > 1.0
 
     def test_energy_loss_of_one_trajectory_of_an_ensemble_is_reported(self, kepler):
-        """Of the one whose orbit is nearly a line; the other keeps its energy."""
+        """The orbit that is nearly a line is reported; the other conserves its energy."""
         starts = [[1.0, 0.0]] * 2, [[0.0, 1.0], [0.0, 1e-3]]
         with pytest.warns(
             sc.AccuracyWarning, match=r"energy of trajectory 1 changed from -1 to \S+ although every step"
@@ -250,7 +250,7 @@ class TestTolerances:
         ("name", "method"), [("planar-pendulum", "svi:2"), ("cart-pole", "svi:3"), ("harmonic-oscillator", "svi:3")]
     )
     def test_overestimated_error_is_not_a_violation(self, name, method):
-        """Where a force passes through zero on a step, its highest coefficient is taken for more than it is."""
+        """If a force passes through zero on a step, its leading coefficient overestimates the error."""
         problem, tolerance = sc.problem(name), 1e-9
         stepper = sc.compile_stepper(problem.system, method)
         p = stepper.momentum(problem.q, problem.velocity) if problem.p is None else problem.p
@@ -264,7 +264,7 @@ class TestTolerances:
         assert "a second run with other steps differs by" in missed_tolerance(problem.system, found, error / 5)
 
     def test_underestimated_errors_are_detected(self):
-        """Where a second run is at hand: a step's error says nothing of how errors grow."""
+        """The second run detects the growth of errors, which the local error estimate does not contain."""
         system = sc.problem("kepler").system
         trajectory = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0], [0.0, 1.2], h=0.2, steps=2000)
         known = known_digits(system, trajectory, most=20_000)
@@ -373,7 +373,7 @@ def test_wrong_steps_are_rejected_or_reported(seed):
 
 
 def _report_of_wrong(stepper: sc.Stepper, judge: sc.Stepper, q: np.ndarray, p: np.ndarray, h: float) -> bool | None:
-    """Of a step off by more than a hundredth whether that was said."""
+    """Return whether a step with an error above a hundredth was reported; ``None`` if the step is accurate."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", sc.AccuracyWarning)
         try:

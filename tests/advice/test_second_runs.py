@@ -1,4 +1,4 @@
-"""What advice is wired to: parameters, times and velocities that are no defaults, worst and end errors, chaos."""
+"""Arguments of advice: parameters, times and velocities other than defaults, worst and final errors, chaos."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def test_lattices_by_hand_move_as_generated_ones(lattice):
     ids=lambda each: each.name,
 )
 def test_accelerations_by_numpy_are_those_of_the_formula(each):
-    """By a step of leapfrog."""
+    """Compare with one step of leapfrog."""
     h, given = 1e-3, {"parameters": each.parameters, "tables": each.tables}
     run = compile_stepper(each.system, "stoermer-verlet").integrate(each.q, velocity=each.v, h=h, steps=1, **given)
     ((_, q),) = run.q.values()

@@ -93,7 +93,7 @@ def test_conservative_systems_have_no_balance(changed):
 
 
 def test_many_coordinates_have_no_balance():
-    """Nothing is asked of the run."""
+    """The run is not used."""
     system = problem("outer-solar-system").system
     assert system.dimension > MAX_BALANCE_COORDINATES
     assert energy_balance(system, None, 10) is None  # type: ignore[arg-type]

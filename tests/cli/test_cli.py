@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it writes, what it says when something is wrong."""
+"""Command line: output, files and error messages."""
 
 from __future__ import annotations
 
@@ -563,7 +563,7 @@ class TestListings:
 
 @pytest.mark.parametrize("stream", ["1", "2"])
 def test_a_run_with_a_closed_stream_writes_its_file(stream, tmp_path):
-    """As of a shell's ``2>&-``: what would be said there is lost, and nothing else."""
+    """A closed stream, as in ``2>&-`` of a shell, loses only what is printed there."""
     command = f"{shlex.quote(sys.executable)} -m scvi_codegen run kepler --step 0.1 --steps 5 -o a.npz {stream}>&-"
     ended = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.returncode == 0

@@ -1,4 +1,4 @@
-"""What shells complete, asked of the shells."""
+"""Shell completion, tested in the shells."""
 
 from __future__ import annotations
 

@@ -34,14 +34,14 @@ def findings(status: int = 0) -> dict[str, dict[str, Any]]:
 
 @pytest.fixture
 def without_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it is of no account."""
+    """Skip the trial compilation, where it does not matter."""
     monkeypatch.setattr(
         diagnostics, "_trial", lambda folder: diagnostics.CheckResult(name="trial", status="lacks", found="")
     )
 
 
 def no_compiler(monkeypatch: pytest.MonkeyPatch, empty: Path) -> None:
-    """Nothing on the PATH, and no compiler from a wheel."""
+    """Return an environment without a compiler on the PATH or from a wheel."""
     find = importlib.util.find_spec
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(empty))

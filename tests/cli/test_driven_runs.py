@@ -143,15 +143,15 @@ def test_failing_step_saves_the_preceding_segments(model):
 
 
 def test_signal_stops_a_run_between_chunks(model, monkeypatch):
-    record, sent = Run.record, []
+    advance, sent = Run._advance, []
 
-    def interrupted(run, steps=None, **settings):
-        found = record(run, steps, **settings)
+    def interrupted(run, steps, save_every, arrays):
+        status = advance(run, min(steps, 2), save_every, arrays)
         if run.t > 1.2 and not sent:
             sent.append(os.kill(os.getpid(), signal.SIGTERM))
-        return found
+        return status
 
-    monkeypatch.setattr(Run, "record", interrupted)
+    monkeypatch.setattr(Run, "_advance", interrupted)
     outcome = integrate_model(model)
     assert outcome.interrupted
     assert outcome.failure is None

@@ -337,7 +337,7 @@ def done(request: Any, tmp_path_factory: Any) -> Done:
 
 
 def step_errors(done: Done) -> Array:
-    """Of stretches between states kept: those of positions and momenta as parts of their sizes."""
+    """Return errors between saved states, relative to the sizes of positions and momenta."""
     ends = advanced(done.kind, done.t[:-1], done.q[:-1], done.p[:-1], np.diff(done.t))
     off = [(np.linalg.norm(x - y[1:], axis=1), np.sqrt(np.mean(y**2))) for x, y in zip(ends, (done.q, done.p))]  # noqa: B905
     return np.max([error / size for error, size in off], axis=0)
@@ -376,7 +376,7 @@ def expected_fields(done: Done) -> dict[str, Callable[[Any], bool]]:
         return list(found["q"]) == list(kind.coordinates) and all(0.5 * y <= x <= 30 * y + 1e-9 for x, y in sizes)
 
     def worst_found(t: float) -> bool:
-        """The step stands in a stretch with one of the larger errors, and begins where steps do."""
+        """Return whether the reported step begins at a step and is in an interval with one of the larger errors."""
         if kind.h and not (kind.tau or kind.states) and abs((t - T) / kind.h - round((t - T) / kind.h)) > 1e-9:
             return False
         place = int(np.searchsorted(done.t, t, side="right")) - 1
@@ -445,7 +445,7 @@ def same(text: str, x: float, specification: str) -> bool:
 
 
 def drift(done: Done, scale: float) -> float:
-    """What a straight line through the relative errors rises by over the run."""
+    """Return the rise over the run of a straight line fitted to the relative errors."""
     energy = done.kind.energy(done.t, done.q, done.p)
     derivative = np.polyfit(done.t, (energy - energy[0]) / scale, 1)[0]
     return float(derivative * (done.t[-1] - done.t[0]))

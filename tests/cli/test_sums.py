@@ -57,7 +57,7 @@ def invoke(*words: str) -> Result:
 
 
 def test_adaptive_run_of_an_array_system(ring: str) -> None:
-    """To the end, as accurate as wanted; in place of the step of the file. What needs one step says so."""
+    """The tolerance replaces the step of the file; commands that need a fixed step size report it."""
     result = invoke("run", ring, "--tolerance", "1e-9", "--span", "7", "--json")
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
@@ -72,7 +72,7 @@ def test_adaptive_run_of_an_array_system(ring: str) -> None:
 
 
 def test_run_of_an_array_system(ring: str) -> None:
-    """What is conserved and where it ends, in words, numbers and files, against normal modes."""
+    """Conserved quantities and final states in text, numbers and files agree with normal modes."""
     result = invoke("run", ring, "-o", "ring.npz")
     assert result.exit_code == 0, result.output
     for words in (
@@ -179,7 +179,7 @@ def test_generate_for_an_array_system(ring: str) -> None:
 
 
 def test_newton_for_an_array_system(ring: str) -> None:
-    """By the option or by the model; a folder keeps it, whatever its model said before."""
+    """Newton is selected by the option or the model; the generated folder retains it."""
     by_option, iterations = (json.loads(invoke("run", ring, "--json", *words).stdout) for words in (NEWTON, ()))
     Path("stiff.toml").write_text(RING.replace('"svi:4"', '"svi:4"\nsolver = "newton"'))
     by_model, iterated = (
@@ -226,7 +226,7 @@ def test_folder_is_verified_with_its_own_files(ring: str, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("axes", ["q[N]", "q[N, 2]", "q[N, M]"])
 def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
-    """Of a line in time, of bodies, of a plane."""
+    """Line in time, bodies in space, and a plane."""
     pytest.importorskip("matplotlib")
     from scvi_codegen.pictures.arrays import plot_arrays
     from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory

@@ -117,7 +117,7 @@ SHORT = (SVI(1), SCVI(1, "gauss-legendre:2"), SpectralCollocation(2), Gauss(2), 
 
 
 def every_method_and_system():
-    """By default each method on one of one coordinate, and the short ones on one of two as well."""
+    """By default each method on a system of one coordinate, and short ones also on one of two."""
     for number, method in enumerate(METHODS):
         for system in SYSTEMS:
             kind = [each for each in SYSTEMS if each.dimension == system.dimension]

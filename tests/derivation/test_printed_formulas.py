@@ -71,7 +71,7 @@ class Case:
 
     @cached_property
     def results(self) -> dict[str, Callable[..., Any]]:
-        """What kernels give back: forces with what the page says acts beside L_q, E, S = lambda E, and derivatives."""
+        """Return kernel results: forces with additional terms of the page, E, S = lambda E, and derivatives."""
         q, v, a, lam, p = (self.letters[letter] for letter in ("q", "q'", "q''", "λ", "p"))
         t, formula = sympy.Symbol("t"), self.parsed(self.formula)
         L = sum(x * y for x, y in zip(p, v, strict=True)) - formula if p else formula
@@ -283,7 +283,7 @@ class PrintedStep:
         return known
 
     def arguments(self, group: Any, row: int, place: str, known: Mapping[str, Any]) -> dict[str, Any]:
-        """What the kernel of a family is given at a point; what has no formula is an unknown."""
+        """Return the arguments of a kernel at a point; symbols without a formula are unknowns."""
         found = {}
         for letter in filter(self.case.letters.get, self.case.letters):
             formulas = [self.gathers.get((group.name, f"{letter}_{at}")) for at in ("n", "k", "k+1", "1")]
@@ -358,7 +358,7 @@ def velocity_of(case: Case, q: Any, p: Any, t: Any) -> np.ndarray[Any, Any]:
 
 
 def _offers(group: Any, letter: str) -> bool:
-    """Whether the results called so at a point are those of this family, where another has them, too."""
+    """Return whether the results of that name at a point belong to this group."""
     scalar = {"S": "node", "L'": "derivative_1", "E": "node"}.get(letter.partition("_")[0])
     names = group.name if group.name != "kick" else "kick"
     if scalar is not None:
@@ -450,7 +450,7 @@ def at_random(case: Case, seed: int = 7) -> dict[str, Any]:
 
 
 def kernel_arguments(case: Case, at: Mapping[str, Any]) -> dict[str, Any]:
-    """The same for :meth:`Case.result`."""
+    """Return the kernel arguments of :meth:`Case.result`."""
     lam = [at["λ_1"]] if case.constraints else [at[f"λ_{x}"] for x in case.coordinates]
     found = {"q": [at[x] for x in case.coordinates], "p": [at[x] for x in case.momenta], "λ": lam}
     return found | {f"q{dot}": [at[f"{x}{dot}"] for x in case.coordinates] for dot in ("'", "''")}
@@ -550,7 +550,7 @@ def kronecker(method: Any, entry: Entry, index: int) -> bool:
 
 
 def paper_numbers(name: str, x: Any = None) -> dict[str, Any]:
-    """What names stand for in equations that are written out component by component."""
+    """Return the values of names in equations written by components."""
     case = CASES[name][0]
     step, solved = solution(name, "stages")
     q, p, h, t = start_of(case)
@@ -619,7 +619,7 @@ STATEMENT = re.compile(r"(?:const (?:double|lanes|real) )?(\w+(?:\[\d+\])?) = ([
 
 
 def numbers_of_c(text: str, case: Case, u: list[Any], t: Any) -> dict[str, Any]:
-    """What a kernel's C gives: it is straight-line arithmetic, and means the same in Python."""
+    """Return the values of straight-line C of a kernel, evaluated by Python."""
     functions = dict(FUNCTIONS) | {"pow": lambda x, y: x**y, "fabs": abs}
     functions |= {f"lanes_{name}": function for name, function in FUNCTIONS.items()} | {"lanes_of": lambda x: x}
     given = {"u": u, "t": t, "parameters": [mp.mpf(x) for x in PARAMETERS.values()], "value": {}, "derivative": {}}
@@ -644,7 +644,7 @@ def of_kernels(name: str, entry: Entry, index: int) -> bool:
 
 
 def of_functions(name: str, entry: Entry, index: int) -> bool:
-    """Newton's iteration, the gather, and the sweeps at the points of the step that the equations have."""
+    """Check Newton's iteration, the gather and the fixed-point iterations at the points of the step."""
     if entry.pair == "evaluate":
         return True  # solved as they stand, above
     if entry.pair == "newton":
@@ -659,7 +659,7 @@ def of_functions(name: str, entry: Entry, index: int) -> bool:
 
 @cache
 def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
-    """What the letters of a sweep are on the solved step, at all of its points; its tables are those of the package."""
+    """Return the values of symbols of a fixed-point iteration on the solved step; tables are those of the package."""
     case, method, _ = made(name)
     q, p, h, t = start_of(case)
     with warnings.catch_warnings():
@@ -705,7 +705,7 @@ def iteration_numbers(name: str) -> tuple[int, dict[str, Any]]:
 
 
 def tables_of(fixed_point: Any, count: int, case: Case) -> dict[str, Any]:
-    """The tables of a sweep by the names of the page; of masses their inverses, where they are constant."""
+    """Return the tables of a fixed-point iteration by their names on the page; constant masses are inverted."""
     found: dict[str, Any] = {"M^−1": np.array([1 / mp.mpf(PARAMETERS["m"]), 1 / mp.mpf(3)], dtype=object)}
     if getattr(fixed_point, "projection", ()):
         found["projection"] = fixed_point.projection
@@ -916,7 +916,7 @@ def of_python(text: str, scope: Mapping[str, Any]) -> Any:
 
 
 def plain_numbers(name: str) -> dict[str, Any]:
-    """By the names that SymPy's symbols have."""
+    """Return numbers by the names of SymPy symbols."""
     case, known = CASES[name][0], paper_numbers(name)
     step, x = solution(name, "stages")
     found: dict[str, Any] = {k: known[k] for k in (*PARAMETERS, "h", "t_k")}

@@ -1,4 +1,4 @@
-"""What ``derive`` prints of array systems, text and LaTeX, is read back: slopes of terms, masses, and whole steps."""
+"""Printed derivations of array systems, read back from text and LaTeX: gradients, masses and complete steps."""
 
 from __future__ import annotations
 

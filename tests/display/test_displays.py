@@ -1,4 +1,4 @@
-"""What notebooks show of systems, methods, equations, steppers and trajectories."""
+"""Notebook displays of systems, methods, equations, steppers and trajectories."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ def test_long_steps_are_divided(digits):
 
 
 def test_initial_guess_selects_one_of_several_solutions():
-    """From rest at 2 radians for 5 time units; another swing joins the same points."""
+    """Start from rest at 2 radians for 5 time units; another trajectory connects the same points."""
     flow = exact_map(PENDULUM, [2], [0], 5, digits=12)
     other = exact_discrete_lagrangian(PENDULUM, [2], flow.q1, 5, digits=12)
     same = exact_discrete_lagrangian(PENDULUM, [2], flow.q1, 5, digits=12, guess=[0.01])

@@ -77,7 +77,7 @@ class TestSize:
             assert entries_in(folder) == {number}
 
     def test_entries_are_counted_once_below_the_limit(self, folder, monkeypatch):
-        """And not for each that is written: there may be thousands."""
+        """Entries are not counted at every write, as there may be thousands."""
         counted = []
         fit = cache._fit
         monkeypatch.setattr(cache, "_fit", lambda *given: counted.append(1) or fit(*given))
@@ -143,7 +143,7 @@ class TestTrust:
         ("owner", "me", "trusted"), [(1000, 1000, True), (0, 1000, True), (65534, 1000, False), (1000, 0, False)]
     )
     def test_folder_of_another_user_is_not_used(self, folder, monkeypatch, owner, me, trusted):
-        """But one of root's is; and root uses none of others."""
+        """Folders of root are used by others, but root uses no others."""
         folder.mkdir(mode=0o755)
         stat = Path.stat
 
@@ -160,7 +160,7 @@ class TestTrust:
             assert cache.trusted_folder() is None
 
     def test_entries_of_another_user_are_not_loaded(self, folder, monkeypatch):
-        """Where there is a way to make some: as root."""
+        """Other users' entries can be created only as root."""
         if os.geteuid() != 0:
             pytest.skip("only root gives files to other users")
         answer(1)

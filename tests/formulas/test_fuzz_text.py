@@ -48,7 +48,7 @@ SYMBOLS = {name: Symbol(name, real=True) for name in ("x", "y", "z", "t", "q", "
 
 @pytest.fixture(scope="module", autouse=True)
 def warmed() -> None:
-    """What SymPy and SciPy import when they are first used is no code of an input."""
+    """Import what SymPy and SciPy load lazily, so that it is not attributed to an input."""
     for text in seeds("models"):
         try:
             parse_model(text)
@@ -65,7 +65,7 @@ def warmed() -> None:
 
 
 def try_formula(number: int) -> bool:
-    """Whether a text is a formula; it is then written as a text that gives it back."""
+    """Return whether a text is a formula; check its round trip."""
     random = Random(number)
     known = seeds("formulas.txt")
     text = formula(random) if number % 2 else mutated(random, random.choice(known), known)
@@ -99,7 +99,7 @@ def test_any_text_is_a_formula_or_an_error(text):
 
 
 def try_system(number: int) -> bool:
-    """Whether a random formula is part of a system that becomes C."""
+    """Return whether a random formula gives a system that is lowered to C."""
     random = Random(number)
     text = formula(random)
     common: dict[str, Any] = {"name": "s", "coordinates": ["q", "x"], "parameters": {"y": 1.0, "z": -2.0, "m": 0.5}}
@@ -152,7 +152,7 @@ def with_a_value_changed(random: Random, text: str) -> str:
 
 
 def try_model(number: int) -> bool:
-    """Whether a text is a model; it is then written as a text that gives it back, or refused by its name."""
+    """Return whether a text is a model; check its round trip or the named error."""
     random = Random(number)
     known = seeds("models")
     text = random.choice(known)
@@ -228,7 +228,7 @@ ABSCISSAE = (
 
 
 def try_name(number: int) -> bool:
-    """Whether a name is one of a rule, a space, nodes or a tableau, or plain data those of a method."""
+    """Return whether a name denotes a rule, space, nodes or tableau, or plain data a method."""
     random = Random(number)
     known = seeds("names.txt")
     name = mutated(random, random.choice(known), known) if number % 4 else random.choice(known)

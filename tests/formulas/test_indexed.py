@@ -12,7 +12,7 @@ NAMES = {name: symbol(name) for name in ("c", "t")}
 
 
 def terms(text: str) -> tuple[IndexedTerm, ...]:
-    """What is read."""
+    """Return the parsed terms."""
     return parse_indexed(text, ARRAYS, NAMES, TABLES)
 
 
@@ -81,7 +81,7 @@ def test_index_notation_is_parsed(text: str, read: list[str] | None) -> None:
     ],
 )
 def test_invalid_index_notation_is_rejected(text: str, message: str) -> None:
-    """With the column, and what to write."""
+    """Errors name the column and the remedy."""
     with pytest.raises(ExpressionError) as caught:
         terms(text)
     assert message in str(caught.value)

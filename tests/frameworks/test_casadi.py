@@ -103,7 +103,7 @@ def test_ipopt_finds_the_hohmann_transfer():
 
 
 def test_second_derivatives_are_those_of_runs():
-    """The Hessian of a function of kept states, and the Jacobian of the adjoint by the slopes it is given."""
+    """Compare the Hessian of a function of saved states and the Jacobian of the adjoint by its cotangents."""
     flow = casadi_flow(kepler(), steps=90, save_every=30, hessian=True)
     given, weights = symbols(flow), np.random.default_rng(3).normal(size=(4, 4))
     x, states = ca.vertcat(*given), ca.vertcat(*flow(*given))

@@ -1,4 +1,4 @@
-"""The scripts of ``examples/optimal_control`` find what their page says, as collocation of their own does."""
+"""Scripts in ``examples/optimal_control`` reproduce their page and agree with direct collocation."""
 
 import os
 import re

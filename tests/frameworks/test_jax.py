@@ -143,7 +143,7 @@ def test_transformations_apply_in_any_order():
 
 @pytest.mark.parametrize("save_every", [None, 50])
 def test_second_derivatives_are_those_of_leapfrog(save_every):
-    """Which JAX differentiates twice itself; forward and back over a gradient, compiled, of batches, times vectors."""
+    """JAX differentiates leapfrog twice: forward and reverse over a gradient, compiled, batched, times vectors."""
     flow = jax_flow(driven(StoermerVerlet()), steps=STEPS, save_every=save_every)
 
     def along(x):

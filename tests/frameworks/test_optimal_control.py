@@ -51,7 +51,7 @@ UP = {
 
 
 def test_minimum_effort_rest_to_rest_has_the_exact_costates():
-    """u = 6 - 12 t; the slopes of the cost to come are -12 by x and 12 t - 6 by p."""
+    """u = 6 - 12 t; the gradient of the cost-to-go is -12 by x and 12 t - 6 by p."""
     motion = optimal_control(POINT, SVI(2), steps=5, duration=1.0, cost="u**2/2", degree=1, **REST)
     assert motion.cost == pytest.approx(6.0, rel=1e-9)
     assert_allclose(motion.inputs["u"](motion.t[:-1] + 0.05), 6 - 12 * (motion.t[:-1] + 0.05), atol=1e-8)

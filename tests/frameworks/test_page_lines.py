@@ -1,4 +1,4 @@
-"""The lines of docs/frameworks.md print what is known; without a library flows say which extra has it."""
+"""Code of docs/frameworks.md prints known results; without a library, flows name the missing extra."""
 
 import re
 import sys

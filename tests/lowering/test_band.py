@@ -77,7 +77,7 @@ def solved(bandwidth: int, sites: int, blocks: int, matrix: np.ndarray, right: n
 
 
 def matrices(bandwidth: int, sites: int, blocks: int):
-    """Of entries wherever sites may meet: any, growing downwards, so that the lowest row is exchanged, and others."""
+    """Return test matrices with couplings of sites: random, growing downwards (which forces pivoting), and others."""
     rows, generator = sites * blocks, np.random.default_rng(3)
     i, j = np.indices((rows, rows))
     meets = abs(i // blocks - j // blocks) <= bandwidth

@@ -26,7 +26,7 @@ Q, P, STEPS = [1.2], [0.7], 5
 
 
 def scaling():
-    """H = x p_x: an implicit Euler step contracts by h a sweep, in x and in p_x."""
+    """H = x p_x: an implicit Euler step contracts by h per iteration, in x and in p_x."""
     return HamiltonianSystem.from_text(name="scaling", coordinates=["x"], hamiltonian="x*p_x")
 
 
@@ -157,7 +157,7 @@ TABLE = [
 def test_convergence_criterion_of_the_fixed_point_iteration(
     tmp_path_factory, after, change, last, before, tolerance, absolute, k, expected
 ):
-    """Where the change before the last is not given, the last sweep did not contract."""
+    """If the change before the last one is missing, the last iteration did not contract."""
     verdict = header(tmp_path_factory.getbasetemp(), after).verdict
     assert verdict(change, last, before, tolerance, absolute, k) == expected
 
@@ -165,7 +165,7 @@ def test_convergence_criterion_of_the_fixed_point_iteration(
 @pytest.mark.parametrize("after", [0, 1])
 @pytest.mark.parametrize("rate", [0.01, 0.1, 0.3, 0.6])
 def test_residual_at_convergence_is_a_quarter_of_the_tolerance(tmp_path_factory, after, rate):
-    """Changes that shrink by one rate: what all sweeps to come, but those that follow anyway, would add up to.
+    """Changes decrease geometrically: compare the sum of the omitted ones with the criterion.
 
     At most; up to half of it where they contract slowly, for 1 / (1 - r) is taken from squares.
     """

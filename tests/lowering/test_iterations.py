@@ -1,4 +1,4 @@
-"""How many iterations runs take, beside how many they took when each was looked at: what is slower is wrong somewhere.
+"""Iteration counts of runs compared with recorded counts: an increase indicates an error.
 
 Steps are the same whatever leads to them: kept factors that never serve, guesses from the wrong steps, sweeps that
 stop a little later than they may. The numbers are the same with and without optimisation; a few more or less are
@@ -55,7 +55,7 @@ def test_iteration_counts_are_those_recorded(name, solver):
 
 @pytest.mark.parametrize("name", ["kepler/svi-3", "cart/svi", "field/gauss"])
 def test_lanes_use_as_many_iterations_as_single_runs(name):
-    """From the same state in every lane: guesses from one step and from two are as good in a block."""
+    """Lanes start from equal states; predictors from one and two steps are equally good in a block."""
     given, own = case(name), stepper(name, "fixed-point")
     for part in (1, 8, 64):
         h = given.h / part
@@ -70,7 +70,7 @@ def test_lanes_use_as_many_iterations_as_single_runs(name):
 
 @pytest.mark.parametrize("name", CONTINUED)
 def test_predictor_from_two_steps_is_better_than_from_one(name):
-    """What one sweep leaves to be done after the first step, and after the third: another table serves then."""
+    """Compare the residual of one iteration after the first and after the third step, which use different tables."""
     given, left = case(name), []
     for steps in (1, 3):
         run = stepper(name, "fixed-point").start(given.q, given.p, h=CONTINUED[name] * given.h)
@@ -95,14 +95,14 @@ def test_newton_factors_are_reused_in_the_next_short_step():
 
 @pytest.mark.parametrize(("name", "expected"), [("double/svi", (46, 154)), ("tangle/scvi", (23, 87))])
 def test_adaptive_steps_use_the_predictor_of_the_preceding_step(name, expected):
-    """By Newton's iteration, where it was as long: steps, and iterations of all."""
+    """Compare Newton steps and iteration counts with steps of equal size."""
     given = case(name)
     run = stepper(name, "newton").integrate(given.q, given.p, t_end=10 * given.h, tolerance=1e-6)
     assert (len(run.t), int(run.iterations.sum())) == pytest.approx(expected, rel=ROUNDING, abs=2)
 
 
 def test_reused_factors_need_two_updates_at_convergence():
-    """Factors of another point must have shrunk an update once before one that is small says anything."""
+    """Factors of another point must reduce an update once before a small update indicates convergence."""
     own = problem("fput-chain").system
     rest = [0.0] * own.dimension
     run = compile_stepper(own, "svi:4", solver="newton", flags=QUICK_FLAGS).integrate(rest, rest, h=0.01, steps=5)

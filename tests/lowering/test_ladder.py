@@ -1,4 +1,4 @@
-"""Tables of steps that choose their length, and the digits of the coefficients they stand on."""
+"""Predictor tables of adaptive steps and the precision of their coefficients."""
 
 from __future__ import annotations
 

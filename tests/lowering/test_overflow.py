@@ -1,4 +1,4 @@
-"""Steps whose sweeps diverge beyond all squares fail, and errors of states of any size are controlled."""
+"""Iterations that overflow fail, and errors are controlled for states of any size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers are exact until they are printed; what a table says is zero stands as zero in C, no 6.8e-63."""
+"""Numbers are exact until printing; exact zeros of a table are zeros in C."""
 
 import re
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""One sweep does what is said of it, to round-off: beside its formulas with SymPy's derivatives, for one point.
+"""One fixed-point iteration agrees to round-off with its formulas, with SymPy's derivatives, for one point.
 
 What a sweep does wrong, the next ones mend as long as they contract: the solution does not show it.
 """
@@ -109,7 +109,7 @@ def test_constant_masses_update_velocities_and_forces_at_the_same_iterate(system
 
 
 def test_many_coordinates_do_not_request_the_jacobian():
-    """They are the square of their number; a chain of nine has masses that depend on where it is."""
+    """The Jacobian has the square of their number of entries; masses of the chain of nine depend on positions."""
     names = [f"a{k}" for k in range(9)]
     coupled = " + ".join(f"{a}_dot**2 + {a}_dot*{b}_dot*cos({a} - {b})" for a, b in itertools.pairwise([*names, "a0"]))
     chain = LagrangianSystem.from_text(name="ring of nine", coordinates=names, lagrangian=coupled)

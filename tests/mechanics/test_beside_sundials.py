@@ -12,13 +12,13 @@ MASSES = np.array([1.0, 1.0, 2.0, 2.0])
 
 
 def partials(q):
-    """(2, 4) of x1^2 + y1^2 - 1 and of (x2 - x1)^2 + (y2 - y1)^2 - 1/4; quadratic, so slopes(v) is their change."""
+    """Return the (2, 4) derivatives of x1^2 + y1^2 - 1 and (x2 - x1)^2 + (y2 - y1)^2 - 1/4, which are linear."""
     x, y = q[2] - q[0], q[3] - q[1]
     return 2 * np.array([[q[0], q[1], 0, 0], [-x, -y, x, y]])
 
 
 def test_double_pendulum_of_rods_agrees_with_ida():
-    """Of index 1, with the constraints differentiated twice, which IDA solves to about 1e-7."""
+    """IDA solves the index-1 form, with constraints differentiated twice, to about 1e-7."""
     ida = pytest.importorskip("sksundae.ida")
     rods = sc.LagrangianSystem.from_text(
         name="rods",

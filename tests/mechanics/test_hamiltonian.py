@@ -61,7 +61,7 @@ METHODS = (
 
 
 def hyperbolic() -> HamiltonianSystem:
-    """H = q p: q' = q, p' = -p, and velocities say nothing of momenta."""
+    """Return H = q p: q' = q, p' = -p; velocities do not determine momenta."""
     return HamiltonianSystem.from_text(name="hyperbolic", coordinates=["q"], momenta=["p"], hamiltonian="q*p")
 
 
@@ -332,7 +332,7 @@ def test_the_derivation_shows_the_momenta_at_the_points() -> None:
 
 
 def test_parameters_are_assumed_positive_if_their_values_are():
-    """Roots of squares of others keep their signs; 0 says nothing of the sign of other values."""
+    """Roots of squares of other parameters have signs; a value of 0 does not determine the sign of others."""
     system = LagrangianSystem.from_text(
         name="signs",
         coordinates=["q"],

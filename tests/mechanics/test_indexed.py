@@ -33,7 +33,7 @@ def system(coordinates: str, lagrangian: str, **extra: object) -> ArraySystem:
     ],
 )
 def test_velocities_occur_in_one_form(lagrangian: str, message: str) -> None:
-    """Which the error shows."""
+    """The error shows the accepted form."""
     with pytest.raises(SystemDefinitionError, match=message.replace("*", r"\*")):
         system("q[N]", lagrangian).check_run_time_sizes()
 
@@ -64,7 +64,7 @@ def test_momentum_maps_of_bodies_in_space() -> None:
 
 
 def test_rotation_requires_equal_masses() -> None:
-    """Of the two components."""
+    """Rotation mixes two components."""
     kinetic = "sum(i in N, r_dot[i, 0]**2 + w*r_dot[i, 1]**2)"
     round_trap = " - sum(i in N, r[i, 0]**2 + r[i, 1]**2)"
     assert not momentum_maps(system("r[N, 2]", kinetic + round_trap, parameters={"w": 2}))
@@ -117,7 +117,7 @@ def test_systems_that_cannot_be_unrolled_are_rejected(
 
 
 def test_derived_terms_are_displayed() -> None:
-    """A slope for every slot; the formula as a mathematician writes it."""
+    """Each read has a derivative; the formula has mathematical notation."""
     net = system(
         "q[N]",
         "sum(i in N, mass[i]*q_dot[i]**2/2) - sum(b in B, cos(q[ends_of[b, 0]] - q[ends_of[b, 1]])) - q[N-1]**2"
@@ -262,6 +262,6 @@ def test_forces_are_unrolled() -> None:
     ],
 )
 def test_invalid_forces_are_rejected(extra: dict[str, object], message: str) -> None:
-    """By the parser, or by what they are."""
+    """The parser or the checks of forces reject them."""
     with pytest.raises(SystemDefinitionError, match=message):
         system("q[N]", f"{KINETIC} - sum(i in N, q[i]**2)", **extra)

@@ -1,4 +1,4 @@
-"""What SymPy's mechanics describes moves as SymPy's own equations say, or is refused with what is missing."""
+"""Trajectories of SymPy's mechanics agree with SymPy's own equations; missing parts are named."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAMED = {"m": 2.0, "k": 3.0, "c": 0.5}
 
 
 def assert_moves_alike(mechanism: Mechanism, steps: int = 100) -> None:
-    """With steps of high order."""
+    """Compare trajectories with steps of high order."""
     system = mechanism.system()
     stepper = compile_stepper(system, SVI(4, "gauss-lobatto:5") if system.constraints else SVI(5))
     rates = mechanism.speeds_to_rates(np.array(mechanism.q), np.array(mechanism.u))
@@ -137,7 +137,7 @@ def test_rolling_constraint_forces_do_no_work() -> None:
 
 
 def test_potential_energies_count_as_in_the_equations() -> None:
-    """In those of Lagrange, not in those of Kane."""
+    """Potential energies enter the equations of Lagrange, not those of Kane."""
     frame, origin = ReferenceFrame("N"), Point("O")
     system = System(frame, origin)
     point = origin.locatenew("P", Q1 * frame.x)
@@ -166,7 +166,7 @@ def test_velocity_constraints_implied_by_configuration_constraints_are_dropped()
 
 
 def test_bicycle_has_the_constraints_of_its_wheels() -> None:
-    """One says where the front wheel touches, two that it rolls; the rear one's rolling is in the velocities."""
+    """Contact of the front wheel, its rolling (two), and the rear wheel whose rolling is in the velocities."""
     lengths = dict.fromkeys(("htangle", "WRrad", "WFrad", "framelength", "forkoffset", "forklength", "g"), 0.5)
     moments = [f"I{body}{axis}" for body in ("frame", "fork", "rear", "front") for axis in ("11", "22")]
     masses = [f"m{body}" for body in ("frame", "fork", "rear", "front")]

@@ -120,7 +120,7 @@ def test_symmetries_of_a_central_force_in_space():
 
 
 def test_oscillator_has_only_rotations():
-    """Its other symmetries go with cos(t): not among those searched."""
+    """Its other symmetries depend on cos(t) and are not searched."""
     assert list(formulas(particle("k*(x**2 + y**2 + z**2)/2", "xyz", k=2.0))) == [
         f"angular momentum {a}" for a in "xyz"
     ]
@@ -540,7 +540,7 @@ BROKEN = [
 
 @pytest.mark.parametrize(("name", "method", "broken"), BROKEN, ids=lambda value: getattr(value, "name", value))
 def test_unclaimed_conservation_may_be_violated(quickly_compiled, name, method, broken):
-    """Where the promise would be wrong; 100 times the round-off bound."""
+    """Compare with 100 times the round-off bound in cases where a claim would be wrong."""
     system, q, p = SYSTEMS[name]
     stepper = quickly_compiled(system, method)
     k = stepper.momentum_map_names.index(broken)

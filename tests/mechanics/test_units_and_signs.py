@@ -72,7 +72,7 @@ def test_multipliers_of_an_orbit_are_those_of_its_variations():
 
 @pytest.mark.parametrize(("metre", "second", "factor"), [(1000.0, 1.0, 1.0), (1e-3, 60.0, 1.0), (1.0, 1.0, 1e6)])
 def test_constraints_of_arrays_accept_any_units(metre, second, factor):
-    """The same two rods in other units of length and time, and with their constraints multiplied."""
+    """Compare two rods in other units of length and time, and with scaled constraints."""
 
     def states(metre, second, factor):
         system = sc.LagrangianSystem.from_text(

@@ -96,7 +96,7 @@ def test_degree_1_is_rattle():
 
 @pytest.mark.parametrize(("s", "moving"), [(1, False), (1, True), (2, True), (3, False), (4, True)])
 def test_multipliers_are_solved_separately_for_constant_masses(s, moving):
-    """To the states of Newton's iteration; also by steps that choose their length, and where one fails."""
+    """Compare with the states of Newton's iteration, also with adaptive steps and where an iteration fails."""
     chain = LagrangianSystem.from_text(
         name="two masses",
         coordinates=["x1", "y1", "x2", "y2"],
@@ -255,7 +255,7 @@ def test_initial_states_are_projected_or_rejected():
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 def test_constraint_violation_is_independent_of_units(unit):
-    """A slide in metres, an angle in radians: how far they are off is told, and refused, whatever the metre is."""
+    """For a slide in metres and an angle in radians, reports and rejections do not depend on the unit of length."""
 
     def crank(metre):
         slide = LagrangianSystem.from_text(
@@ -301,7 +301,7 @@ def test_dense_output_events_and_adaptive_steps_with_constraints():
 
 @pytest.mark.parametrize("s", [1, 2, 3, 4])
 def test_error_estimate_uses_the_velocity_at_the_end_of_the_step(s):
-    """Told by the curve alone it was 1500 times too much with degree 3 (the median), and not told with degree 1."""
+    """An estimate by the curve alone was 1500 times too large for degree 3 (median), and 0 for degree 1."""
     pendulum = LagrangianSystem.from_text(
         name="angle", coordinates=["a"], lagrangian="l**2*a_dot**2/2 + g*l*cos(a)", parameters={"g": G, "l": 1.5}
     )

@@ -138,7 +138,7 @@ def test_member_forces_of_a_bridge_equal_the_method_of_joints():
 
 
 def test_bridge_oscillates_as_a_pendulum():
-    """On rods of one length it does not turn; all its joints go along the same circle."""
+    """Rods of equal length do not rotate the bridge; all joints move on the same circle."""
     mechanism = JOINTS.bridge(0.3)
     run = ran(mechanism, 100)
     f = reduced("r**2*u0_dot**2/2 + g*r*cos(u0)", [0.3], [0.0], run.t, r=JOINTS.HANGER)[:, 0]
@@ -147,7 +147,7 @@ def test_bridge_oscillates_as_a_pendulum():
 
 
 def test_state_with_zero_coordinates_is_projected():
-    """There an update far below the rounding of the others still changes g, a little less each time."""
+    """Updates far below the rounding of other coordinates still change g."""
     hook = JOINTS.bent_pendulum()
     q, p = compile_stepper(hook.system, "svi:2").project(hook.q, [0.0] * 4)
     assert_allclose(q, hook.q, atol=1e-16)

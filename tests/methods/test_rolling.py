@@ -93,7 +93,7 @@ def test_rolling_disk_moves_in_circles_and_conserves_free_momenta():
 
 
 def test_energy_does_not_drift():
-    """Not because areas are kept, which they are not: steps are symmetric, and the motion is reversible."""
+    """Area is not preserved; the steps are symmetric and the system is reversible."""
     system = sleigh()
     assert not is_symplectic(lobatto(2), system)
     run = compile_stepper(system, lobatto(3)).integrate(START[0], velocity=START[1], h=0.2, steps=50_000, save_every=10)
@@ -103,7 +103,7 @@ def test_energy_does_not_drift():
 
 
 def test_holonomic_and_moving_nonholonomic_constraints_combine():
-    """On a slope x = 4 z: the same as with z left out; and dragged, x_dot = cos(t)."""
+    """A slope x = 4 z equals the system with z eliminated; and a moving constraint x_dot = cos(t)."""
     common = {"parameters": {"m": 1.0, "J": 0.3, "g": 9.81}, "name": "sleigh on a slope"}
     skate = "x_dot*sin(a) - y_dot*cos(a)"
     space = LagrangianSystem.from_text(

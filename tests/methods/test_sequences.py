@@ -95,7 +95,7 @@ def test_the_map_is_symplectic_and_symmetric():
 
 
 def test_logarithmic_hamiltonian_preserves_the_ellipse():
-    """Of Mikkola and Tanikawa, and Preto and Tremaine: second order in time alone, the orbit is exact."""
+    """Mikkola & Tanikawa, Preto & Tremaine: second order in time, while the orbit is exact."""
     system = HamiltonianSystem.from_text(
         name="logarithmic",
         coordinates=["x", "y", "s"],

@@ -426,7 +426,7 @@ class TestPlatforms:
 
 
 class TestByFMPy:
-    """The same through an importer of others."""
+    """The same checks with the importer FMPy."""
 
     def test_fmpy_validates_the_model_and_the_schema(self, fmu, tmp_path):
         validation = pytest.importorskip("fmpy.validation", reason="FMPy is not installed")

@@ -75,7 +75,7 @@ def test_model_file_is_read_completely(net: Path) -> None:
 
 
 def test_solver_is_read_from_the_file(net: Path) -> None:
-    """The run is that of Newton's iteration to the bit, not of sweeps; the solver stays where the method changes."""
+    """The run equals Newton's iteration bitwise; the solver is retained if the method changes."""
     net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
     model = sc.load_indexed_model(net)
     run = {"h": 0.1, "steps": 4, "tables": model.tables, "parameters": model.parameters}
@@ -101,7 +101,7 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
     ],
 )
 def test_unsupported_newton_is_rejected(net: Path, old: str, new: str) -> None:
-    """As without a file."""
+    """The error equals that of a system without a file."""
     net.write_text(net.read_text().replace(old, new, 1))
     model = sc.load_indexed_model(net, {"method": {"solver": "newton"}})
     with pytest.raises(sc.MethodError, match="leave out solver='newton'"):
@@ -121,7 +121,7 @@ def test_unsupported_newton_is_rejected(net: Path, old: str, new: str) -> None:
     ],
 )
 def test_arrays_are_read_from_the_file(value: Any, expected: Any, tmp_path: Path) -> None:
-    """In each way that they may be written."""
+    """Each notation of arrays is read."""
     np.save(tmp_path / "a.npy", [7, 8, 9])
     np.savez(tmp_path / "a.npz", x=[1, 2, 3], y=[4, 5, 6])
     (tmp_path / "a.csv").write_text("q,v\n1,0\n2,0\n3,0\n")
@@ -162,7 +162,7 @@ def test_index_has_one_meaning() -> None:
     ],
 )
 def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str) -> None:
-    """With the path, and the key at fault."""
+    """Errors contain the path and the key."""
     text = net.read_text()
     assert old in text
     net.write_text(text.replace(old, new, 1))
@@ -181,7 +181,7 @@ def test_each_kind_of_file_has_its_loader(net: Path, tmp_path: Path) -> None:
 
 
 def test_tolerance_selects_adaptive_steps(net: Path) -> None:
-    """With a tolerance, or without a step; a step laid over it takes its place."""
+    """A tolerance, or a missing step, selects adaptive steps; an overriding step replaces it."""
     given = {"tolerance": 1e-6, "span": -3.0}
     net.write_text(net.read_text().replace("step = 0.1\nsteps = 4", "tolerance = 1e-6\nspan = -3.0"))
     model = sc.load_indexed_model(net)

@@ -1,4 +1,4 @@
-"""Inputs of models: from tables written out or in files, written and read again, and what is said of faulty ones."""
+"""Inputs of models: tables in files or inline, round trips, and messages on faulty ones."""
 
 import re
 from dataclasses import replace
@@ -199,7 +199,7 @@ def test_names_that_are_not_inputs_are_rejected():
 
 
 def test_hamiltonian_has_inputs():
-    """In a file, which is written and read again."""
+    """The file survives a round trip."""
     text = MODEL.replace('lagrangian = "q_dot**2/2 + (1 + w)*cos(q)"', 'hamiltonian = "p_q**2/2 - (1 + w)*cos(q)"')
     text = text.replace("c*q_dot", "c*p_q").replace("q_dot = [0.1]", "p = [0.1]")
     text = text.replace('{ file = "tables/u.csv", kind = "cubic" }', "{ t = [0, 3.0], values = [0.0, 1.0] }")

@@ -101,7 +101,7 @@ def test_command_line_finds_a_step_and_reports_unsuitable_steps() -> None:
 @pytest.mark.parametrize("run", [{"tolerance": 1e-8}, {"tolerance": 1e-8, "span": -5.0}, {"step": 0.1}])
 @pytest.mark.parametrize("system", [{}, {"time_transformation": "frequency"}], ids=["t", "tau"])
 def test_single_step_functions_use_the_first_step_of_the_run(run: dict[str, float], system: dict[str, str]) -> None:
-    """As certificates do: of tau in transformed time."""
+    """Single steps, as certificates take them, are steps of tau in transformed time."""
     model = catalogue_model("kepler", {"run": run, "system": system})
     stepper = model.stepper()
     h = model.first_step(stepper)

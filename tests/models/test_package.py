@@ -192,7 +192,7 @@ vortex_pairs.toml
 
 @pytest.mark.parametrize("words", KINDS.strip().splitlines())
 def test_every_kind_of_folder_is_built_without_a_warning(words, tmp_path):
-    """By the Makefile in it, as it stands, with the C compiler of the system."""
+    """The generated Makefile builds each folder with the C compiler of the system."""
     model, *options = words.split()
     model = str(Path(__file__).parents[2] / "examples" / model) if model.endswith(".toml") else model
     folder = tmp_path / "own"

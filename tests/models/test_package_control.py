@@ -1,4 +1,4 @@
-"""Generated folders with steps that choose their length: from C, from Python, on a microcontroller."""
+"""Generated folders with adaptive steps: from C, from Python, on a microcontroller."""
 
 from __future__ import annotations
 

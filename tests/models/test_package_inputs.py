@@ -114,7 +114,7 @@ def test_step_longer_than_the_segment_is_shortened(model):
 
 
 def _tables(stepper, inputs):
-    """The same data as C takes them, and what must not be forgotten before C has used them."""
+    """Return the data as C structs, and the objects that must stay alive while C uses them."""
     table, saved = stepper.binding.new(f"input[{len(inputs)}]"), []
     for entry, name in zip(table, stepper.interface.inputs, strict=True):
         data = inputs[name]

@@ -38,7 +38,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 
 def forget(monkeypatch) -> None:
-    """As a new process would."""
+    """Clear caches, as in a new process."""
     monkeypatch.setattr(building, "_loaded", {})
     compilers.compiler_version.cache_clear()
 
@@ -105,7 +105,7 @@ def test_different_source_or_flag_is_a_different_entry(changed, cache):
 
 
 def compiler_reporting(tmp_path: Path, version: str, name: str = "own-cc") -> str:
-    """A compiler that is nothing but what it says of itself."""
+    """Return a compiler that only reports a version."""
     script = tmp_path / name
     script.write_text(f"#!/bin/sh\necho '{version}'\n")
     script.chmod(0o755)
@@ -460,7 +460,7 @@ def test_build_prints_nothing(capfd):
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_gcc_only_passes_are_not_given_to_other_compilers(compiler, monkeypatch):
-    """Of text that is cut into functions, as large systems are: clang refuses what it does not know."""
+    """Large systems are split into functions; clang rejects unknown options."""
     needs(compiler)
     monkeypatch.setenv("CC", compiler)
     cut = source('#include "support/parts.h"\ndouble tiny_answer(void)\n{\n  return 42.0;\n}\n')

@@ -55,7 +55,7 @@ def child_of(script: Path) -> int:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a process ends within moments; one that nobody has reaped has ended."""
+    """Return whether a process ends within moments; unreaped processes have ended."""
     until = time.monotonic() + 300
     while time.monotonic() < until:
         try:
@@ -137,7 +137,7 @@ def part(name: str) -> Source:
 
 
 def announced_by(monkeypatch, seconds: float, patience: float) -> list[str]:
-    """What is said while something takes so many seconds."""
+    """Return what is announced during work of a given duration."""
     monkeypatch.setattr(announcements, "PATIENCE_SECONDS", patience)
     message: list[str] = []
     with announcements.announce_to(message.append), announcements.announced("deriving"):

@@ -88,7 +88,7 @@ exec {compiler} -MD -MF {folder}/$$.d "$@"
 
 
 def test_no_header_of_python_is_read(tmp_path, monkeypatch):
-    """Of all files that the compiler opens none is Python's, and it is not told where these are."""
+    """The compiler opens no header of Python and receives no path to them."""
     script = tmp_path / "watched-cc"
     script.write_text(WATCHED.format(folder=tmp_path, compiler=needs("cc")))
     script.chmod(0o755)

@@ -62,7 +62,7 @@ class Mechanism:
     span: float = 1.0
 
     def system(self) -> LagrangianSystem:
-        """As this project reads it."""
+        """Return the system as read by this project."""
         return self.read(self.model, name="mechanism", parameters=self.constants)
 
     @property
@@ -93,7 +93,7 @@ class Mechanism:
         return self._numbers(Matrix(self.method.rhs()[: 2 * len(self.q)]))
 
     def _rates_solved_for(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """The same with the linear equations solved in numbers, where SymPy would take minutes."""
+        """Solve the linear equations numerically, where SymPy would take minutes."""
         size = 2 * len(self.q)
         rows = self._numbers(Matrix([*self.method.forcing_full, *self.method.mass_matrix_full]))
 

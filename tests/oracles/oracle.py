@@ -53,7 +53,7 @@ def cardinals(points: np.ndarray) -> list[np.ndarray]:
 
 
 def table(points: np.ndarray, at: np.ndarray, operation: Callable[[np.ndarray], np.ndarray] = np.array) -> np.ndarray:
-    """Values (slopes, integrals from 0) of the cardinal polynomials on ``points``, one row for each of ``at``."""
+    """Return values (derivatives, integrals from 0) of the cardinal polynomials on ``points``, a row per ``at``."""
     return _table(tuple(points), tuple(at), operation)
 
 
@@ -267,7 +267,7 @@ def scvi(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, nodes: Any, c: 
 
 
 def scvi_abscissae(system: Mechanics, t: Any, q0: Any, p0: Any, h: Any, *, stages: Any, c: Any, w: Any) -> State:
-    """The same with collocation at any abscissae: V = v0 + h A a, Q = q0 + h A V, q1 = q0 + h b V."""
+    """Compute the collocation step at any abscissae: V = v0 + h A a, Q = q0 + h A V, q1 = q0 + h b V."""
     A, b = table(stages, stages, integral), weights(stages)
     values, integrals = table(stages, c), table(stages, c, integral)
     v_start = system.velocity(t, q0, p0)

@@ -57,7 +57,7 @@ class Evaluation:
                 self.values[symbol.name] = sympy.N(result, DIGITS)
 
     def residuals(self) -> Iterator[sympy.Expr]:
-        """Of all equations, in their order."""
+        """Return the residuals of all equations, in their order."""
         for _, formula in row_formulas(self.system, self.stages):
             bounds = re.search(r"i = (\d+),.* (\d+)$", formula.number)
             for index in range(int(bounds[1]), int(bounds[2]) + 1) if bounds else (None,):
@@ -76,7 +76,7 @@ class Evaluation:
 
 
 def _table_values(stages: StageSystem) -> Iterator[tuple[str, sympy.Expr]]:
-    """What the entries of columns with names are, by what they are called at each point."""
+    """Return the values of named table columns at each point."""
     tables = [part.table for group in stages.stage_groups for part in (*group.gathers, *group.scatters)]
     for table in (*tables, stages.end_position):
         for number in range(len(table.names[0])):

@@ -137,7 +137,7 @@ def test_both_solvers_agree_with_the_oracle(sample, compiled, name, method, solv
 
 @pytest.mark.parametrize("method", MANY, ids=lambda method: method.name)
 def test_every_family_of_methods_agrees_with_the_oracle(sample, compiled, method):
-    """On a Lagrangian with everything in it: coupled, mass depending on angle and time, velocity-dependent terms."""
+    """The Lagrangian is coupled, has masses depending on angle and time, and velocity-dependent terms."""
     check(sample, compiled, "pumped-cart-pole", method, flags=UNOPTIMISED)
 
 

@@ -1,4 +1,4 @@
-"""In company: processes that share a cache, threads that share a stepper, steppers that travel between processes."""
+"""Concurrency: processes that share a cache, threads that share a stepper, pickled steppers."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def loading(folder: Path, *numbers: int, **environment: str) -> subprocess.Popen
 
 
 def at_once(processes: list[subprocess.Popen[str]]) -> list[tuple[str, str]]:
-    """What they print and complain of, all let loose together."""
+    """Return the output and errors of concurrently started processes."""
     for process in processes:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n", process.communicate(timeout=60)[1]
@@ -99,7 +99,7 @@ def test_concurrent_processes_compile_into_an_empty_cache(folder):
 
 @pytest.mark.parametrize("rounds", [1, pytest.param(12, marks=pytest.mark.full)])
 def test_entries_removed_during_loading_are_rebuilt(folder, rounds):
-    """With room for one entry, each process throws out what the others have just built."""
+    """The cache has room for one entry, so each process removes the others' entries."""
     numbers = [[(first + i) % 3 for i in range(rounds * 3)] for first in range(4)]
     results = at_once([loading(folder, *order, **{cache.SIZE_VARIABLE: "1"}) for order in numbers])
     assert results == [("".join(f"{number}.0\n" for number in order), "") for order in numbers]
@@ -203,7 +203,7 @@ MOMENTA = tuple(1.2 + 0.05 * i for i in range(16))
 
 @pytest.fixture(scope="session")
 def finals(kepler) -> list[bytes]:
-    """Of each momentum, one after the other."""
+    """Return the final state for each momentum in turn."""
     return [final(kepler, p) for p in MOMENTA]
 
 
@@ -247,7 +247,7 @@ def test_threads_compile_each_text_once(folder, monkeypatch):
 
 
 def test_threads_derive_at_once(folder):
-    """The same text, whatever else is derived beside it."""
+    """The generated source does not depend on concurrent derivations."""
     systems = [sc.problem(name).system for name in ("kepler", "planar-pendulum", "henon-heiles")]
     alone = [sc.generate_source(system, SVI(2)) for system in systems]
     with ThreadPoolExecutor(6) as pool:

@@ -1,4 +1,4 @@
-"""Whatever is wrong with what a caller gives, the package's own errors say so: no traceback of another type leaves it.
+"""Invalid input of any kind raises the package's own errors.
 
 Each case damages one thing (a file, an argument, a variable of the environment) and may be refused or accepted; an
 exception must be a :class:`~scvi_codegen.errors.ScviCodegenError`.
@@ -145,7 +145,7 @@ CALLS: dict[str, Callable[[Any], Any]] = {
 
 
 def _is_huge(x: Any) -> bool:
-    """Whether it is a number that is right, and would take for ever."""
+    """Return whether a number is valid but would cause excessive work."""
     return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) > 1e6
 
 
@@ -231,7 +231,7 @@ CSV = [
 
 @pytest.mark.parametrize("number", range(len(CSV)))
 def test_damaged_csv_tables_are_rejected(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As inputs, as tables of places, and as ensembles of the command line."""
+    """Tables are inputs, index tables and ensembles of the command line."""
     monkeypatch.chdir(tmp_path)
     Path("u.csv").write_text(CSV[number])
     Path("model.toml").write_text(MODEL.replace("{ t = [0.0, 10.0], values = [0.0, 1.0] }", '{ file = "u.csv" }'))

@@ -87,7 +87,7 @@ def test_linear_steps_contract_area_exactly(method):
 
 @pytest.mark.parametrize("h", [0.1, 0.8])
 def test_curved_steps_contract_area_exactly(h):
-    """By the compiled derivative, whatever the step; and two steps back lead to the start."""
+    """Check the compiled derivative for every step size; two backward steps return to the start."""
     stepper = compile_stepper(damped(), SVI(2))
     J = stepper.integrate([0.3, -0.4], [0.5, 0.7], h=h, steps=1).sensitivity().state[-1]
     omega = np.kron([[0, 1], [-1, 0]], np.eye(2))
@@ -216,7 +216,7 @@ def test_certificate_reports_damping():
     "given", [0.25, "0.25", np.float64(0.25), Fraction(1, 4), sympy.Rational(1, 4)], ids=lambda x: type(x).__name__
 )
 def test_damping_rate_may_be_a_number(given):
-    """In text, SymPy and model files alike; what is neither number nor text is refused by name."""
+    """Text, SymPy and model files are equivalent; other types are rejected by name."""
     x = sympy.Function("x")(sympy.Symbol("t", real=True))
     systems = []
     if not isinstance(given, str):

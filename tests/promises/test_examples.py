@@ -1,4 +1,4 @@
-"""The examples run as they stand and show what they say."""
+"""Examples run unchanged and produce their documented results."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ ENERGY_ERRORS = {
 
 @pytest.fixture(autouse=True, params=["-O0", pytest.param("", marks=pytest.mark.full)], ids=["quickly", "as users"])
 def compiled_with(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an example says does not depend on optimisation; the full tier has it as users compile."""
+    """Compile with little optimisation, which does not change the output of an example."""
     monkeypatch.setenv(FLAGS_VARIABLE, request.param)
 
 
@@ -68,7 +68,7 @@ many_steps = pytest.mark.parametrize("compiled_with", [""], ids=["as users"], in
 
 @pytest.fixture
 def output_of(tmp_path, monkeypatch, capfd) -> Callable[..., str]:
-    """What a Python example prints, with these arguments, run from elsewhere in this process."""
+    """Return the output of a Python example with these arguments, run in this process in another folder."""
 
     def output(name: str, *arguments: str) -> str:
         script = str(EXAMPLES / f"{name}.py")
@@ -115,7 +115,7 @@ def test_ring_conserves_energy_and_momentum(tmp_path):
 
 
 def test_shaken_tower_agrees_with_dop853(tmp_path):
-    """By DOP853 from breakpoint to breakpoint of SciPy's spline through the same table."""
+    """Compare with DOP853 between breakpoints of SciPy's spline through the same table."""
     result = CliRunner().invoke(main, ["run", str(EXAMPLES / "shaken_tower.toml"), "-o", str(tmp_path / "run.csv")])
     assert result.exit_code == 0, result.output
     assert "too long" not in result.output
@@ -196,7 +196,7 @@ def test_halo_orbits_and_their_bifurcations_are_the_published_ones(output_of, tm
 
 
 def test_the_map_of_henon_and_heiles_is_half_chaotic(output_of, tmp_path):
-    """Of coarser grids than by default; on fine ones 44 per cent are regular."""
+    """The grids are coarser than the default; on fine ones 44 per cent are regular."""
     output = output_of("henon_heiles_map", "24")
     assert 30 < float(re.search(r"regular .*: (\d+)%", output)[1]) < 60
     assert float(re.search(r"(\d+) a second", output)[1]) > 0
@@ -296,7 +296,7 @@ def test_a_cart_balances_its_pole(output_of):
 
 
 def test_orbit_of_ceres_determines_the_mass_of_jupiter(output_of, tmp_path):
-    """To two thousandths of the published one, as far as the approximate orbits of the planets let it."""
+    """The mass agrees to two thousandths, the accuracy of the approximate orbits of the planets."""
     output = output_of("ceres_orbit")
     found, published = map(float, re.search(r"1/(\S+) of the Sun; 1/(\S+) by other", output).groups())
     assert published == 1047.3

@@ -1,4 +1,4 @@
-"""Mistakes of the first hour, in Python and on the command line: each error says which, what was given, what to do."""
+"""Common first mistakes in Python and on the command line: errors name the argument, its value and the remedy."""
 
 from __future__ import annotations
 

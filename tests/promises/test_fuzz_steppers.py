@@ -1,4 +1,4 @@
-"""Hostile numbers: a compiled stepper answers right to round-off, or says no; never something else."""
+"""Extreme numbers: a compiled stepper is accurate to round-off or reports a failure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REFUSED = (StateError, StepFailedError)
 
 
 def prepared(stepper: Stepper) -> Stepper:
-    """With all that is compiled when it is first needed: no code may run while input is hostile."""
+    """Compile in advance all code that is compiled on demand."""
     stepper.prepare()
     return stepper
 
@@ -261,12 +261,12 @@ def exact_step(q: float, p: float, h: float, steps: int) -> complex:
 
 
 def rounding(q: float, p: float, h: float) -> float:
-    """What the solver calls round-off level, of |q| + h|v| and |p| + h|L_q| as the header says, and underflow."""
+    """Return the round-off level of the solver, of |q| + h|v| and |p| + h|L_q| as in the header, and underflow."""
     return 5e-13 * ((float(abs(q)) + float(abs(p))) * (1.0 + abs(h))) + 1e-319 * (1.0 + abs(h)) ** 2
 
 
 def check_oscillator(stepper: Stepper, random: Random) -> bool:
-    """Whether a run from a random state was completed; its end must then be right."""
+    """Return whether a run from a random state was completed; check its end."""
     q, p = (
         random.choice((-1, 1)) * random.choice(SIZES) * random.choice((1.0, random.uniform(0.5, 1.0))) for _ in "qp"
     )
@@ -326,7 +326,7 @@ NONLINEAR = [
 
 
 def check_nonlinear(name: str, method: Any, random: Random) -> bool:
-    """Whether two solvers both took a step; they must then agree, where the step is one of reason."""
+    """Return whether both solvers took a step; check that the steps agree if h is reasonable."""
     steppers = [prepared(stepper_for(name, method, solver=solver)) for solver in ("auto", "newton")]
     q, p = (
         [random.choice((-1, 1)) * random.choice(SIZES) * random.uniform(0.5, 1.0) for _ in range(steppers[0].dimension)]

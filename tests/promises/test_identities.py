@@ -126,7 +126,7 @@ def test_other_lagrangians_additional_lobatto_point_is_not_the_next_pair(sample,
 
 
 def test_nonquadratic_kinetic_energy_distinguishes_methods_from_degree_two(sample, compiled):
-    """For L = T(v) - V(q) the one velocity of degree 1 makes no difference; two do."""
+    """For L = T(v) - V(q) the single velocity of degree 1 makes no difference; two velocities do."""
     name = "relativistic-particle"
     one, two = (
         distance(
@@ -263,7 +263,7 @@ def test_constant_mass_scvi_on_gauss_points_is_svi(sample, compiled, name, s):
 
 
 def test_variable_mass_scvi_on_gauss_points_is_not_svi(sample, compiled):
-    """It collocates the equations of second order, Gauss's method those of first order."""
+    """SCVI collocates the second-order equations, Gauss methods the first-order equations."""
     maps = [
         compiled_map(sample, compiled, "double-pendulum", method) for method in (SCVI(2, abscissae="gauss"), SVI(2))
     ]

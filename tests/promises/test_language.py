@@ -62,7 +62,7 @@ def test_no_retired_term_is_a_name_in_tests():
 
 
 def test_messages_are_sentences():
-    """They are found at all, and none is a bare status word."""
+    """Messages are found, and none is a single status word."""
     found = list(messages())
     assert len(found) > 800
     assert [place(text) for text in found if re.search(r"\b(vanished|strayed|stalled)\b", text.text)] == []

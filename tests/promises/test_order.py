@@ -1,4 +1,4 @@
-"""The order that a method claims is the slope of its global error in the step size."""
+"""The claimed order of a method is the slope of its global error over the step size in logarithms."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def global_error(compiled, sample, name, method, span, count):
 
 
 def measured_order(compiled, sample, name, method):
-    """The slope through the shortest steps (three, if there are as many) whose error is above the plateau."""
+    """Return the slope through the smallest steps (at most three) whose error is above round-off."""
     span = LOW_ORDER_SPAN if (method.order or 1) <= LOW_ORDER else SPANS[name]
     errors = []
     for count in COUNTS:
@@ -157,7 +157,7 @@ def test_the_printed_shooting_equations_have_order_one_less_than_their_degree(co
 
 @pytest.mark.parametrize("method", [SVI(2), RadauIIA(3), SCVI(2)], ids=lambda method: method.name)
 def test_the_reference_is_the_exact_solution_where_there_is_one(compiled, sample, method):
-    """q'' = -q: the same slope from the closed form, so that a fault of the reference cannot hide."""
+    """q'' = -q: the order from the closed form is equal, so errors of the reference would be detected."""
     q, p = sample("harmonic-oscillator").state
     exact = q[0] * np.cos(6.0) + p[0] * np.sin(6.0)
     stepper = compiled("harmonic-oscillator", method)

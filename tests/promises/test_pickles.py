@@ -1,4 +1,4 @@
-"""What was chosen survives pickling: every option of a stepper and of a run; no default takes its place."""
+"""Options of steppers and runs survive pickling; none is replaced by a default."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is public changes on purpose alone: names, what they take, options of the command line."""
+"""Public names, signatures and options of the command line change only on purpose."""
 
 from difflib import unified_diff
 

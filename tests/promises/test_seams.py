@@ -38,7 +38,7 @@ PAGE = ROOT / "docs" / "extending.md"
 
 
 def additions() -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """What the page shows, each with the file named above it: new files, and changes of files."""
+    """Return the code of the page by the file named above it: new files, and changes of files."""
     new, changes = (
         re.findall(rf"^`([\w/.]+)`\n\n```{kind}\n(.*?)^```$", PAGE.read_text(), re.M | re.S)
         for kind in ("python", "diff")
@@ -70,7 +70,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(folder: Path, script: str) -> str:
-    """What a script prints that uses the copy."""
+    """Return the output of a script that uses the modified copy."""
     own = f"import sys\nsys.meta_path[:] = [f for f in sys.meta_path if 'editable' not in repr(f).lower()]\n{script}"
     own = own.replace("import sys\n", f"import sys\nsys.path.insert(0, {str(folder)!r})\n", 1)
     found = subprocess.run([sys.executable, "-c", own], capture_output=True, text=True, check=False, cwd=folder)
@@ -250,7 +250,7 @@ def test_without_constraints_the_method_is_the_svi() -> None:
 
 @dataclass(frozen=True, slots=True)
 class ConstrainedIncrements(Constrained):
-    """The same with velocities as unknowns, as it is compiled."""
+    """Equations with velocities as unknowns, as in compiled code."""
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         s, k = self.degree, len(self.constraints)

@@ -63,7 +63,7 @@ def newhall_accelerations(gm, x, v, c):
 
 
 def test_bodies_move_as_einstein_infeld_and_hoffmann_found(example):
-    """What is left in the equations of L, of the accelerations in closed form, is of the next order, 1/c^4."""
+    """The residual of the closed-form accelerations in the equations of L is of the next order, 1/c^4."""
     system = relativistic(example, MASSES, 1.0)
     q, v = (sympy.Matrix(list(each)) for each in (system.coordinates, system.velocities))
     momenta = sympy.Matrix([system.lagrangian]).jacobian(v)
@@ -139,7 +139,7 @@ def test_mercury_advances_by_43_arcseconds_a_century(example):
 
 
 def value(text, values):
-    """Of a formula without velocities and time."""
+    """Return the value of a formula without velocities and time."""
     return float(eval(text, {"sqrt": np.sqrt, "sin": np.sin, "cos": np.cos} | values))
 
 
@@ -161,7 +161,7 @@ def test_zonal_harmonics_are_those_of_two_masses_on_the_axis(example):
 
 
 def test_the_third_harmonic_is_that_of_unequal_masses(example):
-    """Of masses that have neither a dipole nor a quadrupole: -1, 3, -3, 1 at equal distances, and one at the centre."""
+    """Masses without dipole and quadrupole: -1, 3, -3, 1 at equal distances, and one at the centre."""
     axis, place, d, radius = np.array([0.36, -0.48, 0.8]), np.array([1.1, 2.0, -0.4]), 0.01, 0.7
     weights, at = np.array([-1.0, 3.0, -3.0, 1.0]), d * np.array([-1.5, -0.5, 0.5, 1.5])
     j3 = float(-(weights @ at**3) / radius**3)

@@ -1,4 +1,4 @@
-"""What the steps preserve: dq ^ dp, momentum maps, reversibility, energy without drift; and what they do not."""
+"""Preserved quantities: dq ^ dp, momentum maps, reversibility, energy without drift; and counterexamples."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def symplecticity_defect(stepper, q, p, h, t=0.0):
 
 
 def reversal_defect(stepper, q, p, h, t=0.0):
-    """How far the step with -h misses the start of the step with h."""
+    """Return the distance between the start and the result of a step followed by a step with -h."""
     back = stepper.step(*stepper.step(q, p, h, t), -h, t + h)
     return np.abs(np.array(back) - [q, p]).max()
 
@@ -236,7 +236,7 @@ def test_outer_solar_system_conserves_momenta_over_long_times(compiled, method):
 
 
 def test_methods_without_a_discrete_lagrangian_do_not_conserve_angular_momentum(compiled):
-    """What the tests above would show if conservation were an accident."""
+    """Counterexample to the tests above: these methods do not conserve the quantity."""
     entry = problem("kepler")
     for method in (SpectralCollocation(4), SCVI(4, variational=False), RadauIIA(3)):
         run = compiled("kepler", method).integrate(entry.q, entry.velocity, h=0.05, steps=1000)

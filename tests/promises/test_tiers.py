@@ -1,4 +1,4 @@
-"""What the default tier leaves to the full one covers what it should."""
+"""Selection of combinations for the default and the full tier."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is released: wheel and sdist, the same bytes from any folder at any time, used outside of the checkout."""
+"""Released archives: wheel and sdist are reproducible and work outside the checkout."""
 
 from __future__ import annotations
 

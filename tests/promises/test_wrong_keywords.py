@@ -1,4 +1,4 @@
-"""Keywords that a function does not have: an error that says what was meant, or where it belongs."""
+"""Unknown keywords raise an error with the intended keyword or its location."""
 
 from functools import partial
 
@@ -84,7 +84,7 @@ def test_functions_suggest_the_intended_keyword(function, wrong, meant):
 
 
 def test_no_synonym_hides_a_keyword():
-    """What a function has is never said to be another, and every place that is named is one."""
+    """A known keyword is never reported as a synonym, and every suggested location exists."""
     assert keyword_hint("q", ["y0"]) == "; did you mean 'y0'?"
     assert keyword_hint("n", ["mass"]).startswith(": pass the number to run.advance(n)")
     assert not [here for here, elsewhere in SYNONYMS.items() if {*here.split()} & {*elsewhere.split()}]

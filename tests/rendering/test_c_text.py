@@ -1,4 +1,4 @@
-"""What is promised of the C text: strict C99, C++ headers, no allocation, no globals, equal bytes, no user text."""
+"""Properties of the C code: strict C99, C++ headers, no allocation, no globals, reproducible, no user text."""
 
 import os
 import re
@@ -160,7 +160,7 @@ def test_clang_reports_no_warnings(method, share, tmp_path):
 @pytest.mark.parametrize("solver", ["auto", "newton"])
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum", "driven Hamiltonian"])
 def test_sources_for_this_machine_compile_without_warnings(name, solver, compiler, tmp_path):
-    """A fallback borrowed and lent, and steps of a density of their own."""
+    """Sources with a fallback library and with a step density."""
     system = systems()[name]
     q = system.coordinates[0].name
     time_transformation = f"1/(1 + {q}**2)"
@@ -226,7 +226,7 @@ def test_either_solver_alone_compiles_without_warnings(compiler, solver, tmp_pat
 @pytest.mark.parametrize("method", TUNED, ids=lambda method: method.name)
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_tuned_builds_compile_without_warnings(compiler, method, name, tmp_path):
-    """With the vector instructions of this processor, and with glibc's vector functions where those are."""
+    """Flags are the vector instructions of this processor, and glibc's vector functions where available."""
     files = write([generate_source(systems()[name], method)[0]], tmp_path)
     for define, _ in _mathematics(TUNED_FLAGS):
         run([needs(compiler), *C99, *TUNED_FLAGS, *define, "-c", *files], tmp_path)

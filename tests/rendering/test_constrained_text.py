@@ -93,7 +93,7 @@ def test_packages_are_self_contained(tmp_path):
 
 
 def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
-    """A folder is generated, ``make`` builds what is in it and runs it: the example's states, and all that it said."""
+    """Generate a folder, build it with ``make``, run it and return the example's states and output."""
     model = Model(system=system, method="svi:3", q=tuple(q), velocity=(0.0,) * 4, h=0.05, steps=40)
     generate_package(model, folder, embedded=precision)
     found = subprocess.run(["make", "-s", "-C", str(folder)], capture_output=True, text=True)
@@ -103,7 +103,7 @@ def made_and_run(folder, q, *, precision=None, system=LINKAGE, exit_status=0):
 
 @pytest.mark.parametrize("precision", [None, "double", "single"])
 def test_generated_folders_project_constraints_and_equal_python(precision, tmp_path):
-    """A state a little off is moved, which is said, and integrated; also by steps that choose their length."""
+    """Slightly inconsistent states are projected with a message and integrated, also with adaptive steps."""
     near = [0.001, 1.0, 1.94, 1.5]
     states, found = made_and_run(tmp_path / "linkage", near, precision=precision)
     stepper = compile_stepper(LINKAGE, "svi:3", solver="newton")
@@ -122,7 +122,7 @@ def test_generated_folders_project_constraints_and_equal_python(precision, tmp_p
 
 
 def test_states_that_cannot_be_projected_are_rejected_in_c(tmp_path):
-    """A state that is far off; and one stretched out, whose rods are one line: what they say depends on each other."""
+    """States far off the constraints and stretched linkages with dependent constraints are rejected."""
     states, found = made_and_run(tmp_path / "far", [0.3, 1.0, 1.94, 1.5], exit_status=1)
     assert "violates the constraints" in found.stderr
     stretched = LINKAGE.with_parameters(d=4.5)

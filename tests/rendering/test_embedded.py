@@ -213,7 +213,7 @@ def test_residual_zeros_in_tables_become_zero_and_model_numbers_are_rejected():
 
 @pytest.mark.parametrize("number", ["1e-45", "1e40"])
 def test_models_with_numbers_beyond_single_precision_are_rejected(number):
-    """As constants of the Lagrangian and as values of parameters."""
+    """Numbers are constants of the Lagrangian or values of parameters."""
     text = "q_dot**2/2 - {}*q**2/2"
     for system in (
         LagrangianSystem.from_text(name="s", coordinates=["q"], lagrangian=text.format(number)),

@@ -1,4 +1,4 @@
-"""The C text of flows: without a warning, in style, behind every kind of sweep, Newton's iteration and leapfrog."""
+"""C code of flows compiles without warnings, in the project style, for every kind of solver."""
 
 import subprocess
 

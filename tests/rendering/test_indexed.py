@@ -74,12 +74,12 @@ def test_generated_code_is_strict_c(name: str, method: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["bodies", "all forms", "lattices"])
 def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
-    """The same."""
+    """Newton's iteration compiles as strict C."""
     check_strict(rendered(name, "svi:4", newton=True), tmp_path)
 
 
 def check_strict(source: Source, tmp_path: Path) -> None:
-    """As one compiles a library."""
+    """Compile as a library with strict flags."""
     for path, text in source.files.items():
         (tmp_path / path).parent.mkdir(exist_ok=True)
         (tmp_path / path).write_text(text)
@@ -91,7 +91,7 @@ def check_strict(source: Source, tmp_path: Path) -> None:
 
 
 def test_terms_of_the_first_index_are_computed_once_per_pair() -> None:
-    """Before and behind the loop over the second."""
+    """Reads are before, and sums after, the loop over the second index."""
     code = rendered("bodies", "svi:4").code
     outer = code.index(
         "for (long long index_i = here->of.first; index_i < here->of.end; index_i++)",

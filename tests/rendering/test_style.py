@@ -1,4 +1,4 @@
-"""Support headers are laid out as ``.clang-format`` says; generated sources are short, amalgamated or not the same."""
+"""Support headers satisfy ``.clang-format``; generated sources are short, and amalgamation does not change results."""
 
 from __future__ import annotations
 

@@ -23,14 +23,14 @@ SANITIZED = ("gcc", "-std=c99", "-g", "-fsanitize=address,undefined", "-fno-sani
 
 @cache
 def is_sanitized() -> bool:
-    """Whether there is a compiler that has the sanitizers."""
+    """Return whether a compiler with sanitizers is available."""
     words = [*SANITIZED, "-x", "c", "-", "-o", os.devnull]
     empty = "int main(void) { return 0; }"
     return subprocess.run(words, input=empty, text=True, capture_output=True, check=False).returncode == 0
 
 
 def output_of(program: str, folder: Path, *flags: str) -> str:
-    """What a program prints, compiled in a folder under the sanitizers."""
+    """Return the output of a program compiled in a folder with sanitizers."""
     needs(SANITIZED[0])
     if not is_sanitized():
         pytest.skip("no gcc with sanitizers here")
@@ -74,7 +74,7 @@ int main(void)
 
 
 def test_predictor_is_limited_to_the_available_tables(tmp_path):
-    """From the last step for every change of length that has a table; from two for every pair; from none beyond."""
+    """One step predicts across every tabulated change of size, two across every pair; others are not predicted."""
     assert REACH == 2
     lines = [list(map(int, line.split())) for line in output_of(LEVELS, tmp_path, f"-I{SUPPORT}").splitlines()]
     assert len(lines) == 2 * 13 * 13

@@ -77,7 +77,7 @@ def test_different_arguments_are_derived_again(made, other):
 
 
 def keys(change: dict, **options) -> tuple[str, ...]:
-    """What the name of a text is made from."""
+    """Return the parts of a cache key."""
     given = {
         "name": "pair",
         "coordinates": ["q", "r"],

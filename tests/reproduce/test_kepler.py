@@ -111,7 +111,7 @@ def test_errors_on_the_circle_follow_the_lines_of_figure_16(scheme, constant, ba
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["figure-16", "figure-17"])
 def test_lines_of_the_circle_are_not_those_of_ellipses(name):
-    """Slower by far with e = 0.2 and 0.5, so what the paper says of its lines holds in part."""
+    """Convergence is much slower for e = 0.2 and 0.5, so the paper's statement on its lines holds partly."""
     result = BY_NAME[name].run({})
     assert {check.verdict for check in result.checks} == {Verdict.PARTLY}
     fitted = {row[:3]: row[4] for row in result.tables[0].rows}

@@ -370,5 +370,5 @@ def test_interrupt_ends_all_processes_and_saves_results(tmp_path):
 
 
 def interrupt_group(child: subprocess.Popen[str]) -> None:
-    """What a terminal does on Ctrl-C: the signal goes to all processes."""
+    """Send the signal of Ctrl-C to the process group, as a terminal does."""
     os.killpg(child.pid, signal.SIGINT)

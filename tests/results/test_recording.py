@@ -68,7 +68,7 @@ class TestRecording:
 
     @pytest.mark.parametrize("save_every", [1, 7])
     def test_steps_after_the_last_saved_state_are_recomputed(self, kepler, save_every, monkeypatch):
-        """Ctrl-C within a portion: the run stands beyond the last state that was kept, and so does its memory."""
+        """Ctrl-C between saved states: the run and its memory are beyond the last saved state."""
         recorded(kepler, 600, save_every=save_every, folder="whole.run")
         left = iter([*[False] * 5, True])
 

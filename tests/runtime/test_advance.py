@@ -1,4 +1,4 @@
-"""Runs that go on without keeping states: by steps, to a goal, with inputs held between samples."""
+"""Runs without saved states: a number of steps, a target time, inputs with zero-order hold."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def standing(run):
 
 @pytest.mark.parametrize("chunk", [1, 7, 1000])
 def test_runs_with_and_without_saved_states_are_equal(pushed, monkeypatch, chunk):
-    """In however many calls of C they are done."""
+    """The result does not depend on the number of calls into C."""
     saved = pushed.integrate([0.3], [0.1], h=0.05, steps=100, parameters={"u_0": 0.2})
     monkeypatch.setattr(memory, "STEPS_PER_CALL", chunk)
     run = pushed.start([0.3], [0.1], h=0.05, parameters={"u_0": 0.2})
@@ -85,7 +85,7 @@ def test_nan_input_leaves_all_inputs_unchanged(pushed):
 
 
 def test_target_times_and_parameters_may_be_changed_during_a_run(pushed):
-    """By what is heard of in the next call, whatever was given to the last."""
+    """The next call uses the arguments that it receives, not those of the previous call."""
     run = pushed.start([0.3], [0.1], t_end=1.0, tolerance=1e-9, parameters={"u_0": 0.2})
     run.advance(10**6)
     run.update(parameters={"k": 2.0, "u_0": -0.1}, plan=StepPlan(t_end=2.0, tolerance=1e-9))

@@ -45,7 +45,7 @@ def stepper(form: str = "L", solver: str = "auto", method: str = "svi") -> sc.St
 
 
 def kepler_time(q: Any) -> Any:
-    """Of positions along the orbit from its pericentre, less than half an orbit apart (Kepler's equation)."""
+    """Return the time between positions less than half an orbit apart, from Kepler's equation."""
     axis = np.sqrt(1.0 - ECCENTRICITY**2)
     anomaly = np.unwrap(np.arctan2(q[:, 1] / axis, q[:, 0] + ECCENTRICITY))
     return anomaly - ECCENTRICITY * np.sin(anomaly)
@@ -75,7 +75,7 @@ def test_every_solver_gives_the_same_time(form: str, method: str) -> None:
 
 @pytest.mark.parametrize(("form", "method"), [("L", "three points"), ("K", "radau"), ("K, momenta", "lobatto")])
 def test_order_of_the_time_is_that_of_the_method(form: str, method: str) -> None:
-    """Of one step beside the exact motion of (q, p) and t = integral of the rate, in 45 digits."""
+    """Compare one step with the exact solution of (q, p) and t = integral of the rate, in 45 digits."""
     made, order = stepper(form, "auto", method), METHODS[method].order
     errors = []
     for h in (0.4, 0.2):
@@ -86,7 +86,7 @@ def test_order_of_the_time_is_that_of_the_method(form: str, method: str) -> None
 
 
 def _exact_time(form: str, h: float) -> float:
-    """How long tau = h lasts: K = g (H + p_t) moves t with it."""
+    """Return the physical duration of tau = h: K = g (H + p_t) advances t."""
     system = FORMS[form]
     if isinstance(system, sc.LagrangianSystem):
         system = sc.hamiltonian_of(system)
@@ -190,7 +190,7 @@ def test_events_are_located_in_physical_time(form: str) -> None:
 
 
 def test_event_functions_receive_physical_velocities() -> None:
-    """On the orbit the radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
+    """The radial speed is largest, e/sqrt(1 - e^2), at the ends of the latus rectum."""
     functions = "(x*x_dot + y*y_dot)/sqrt(x**2 + y**2) - 2"
     found = [stepper(form).integrate(*START, h=0.1, t_end=3.0, events=functions).events[0].t for form in FORMS]
     assert len(found[0]) == 2

@@ -49,7 +49,7 @@ def orbit(e, anomaly=0.3):
 
 
 def exact_position(q, p, t):
-    """By Kepler's equation from exactly these doubles, in 40 digits, with Lagrange's coefficients."""
+    """Return the position from Kepler's equation in 40 digits, with Lagrange coefficients."""
     with mp.workdps(40):
         (x, y), (u, v) = map(mp.mpf, q), map(mp.mpf, p)
         r = mp.hypot(x, y)
@@ -106,7 +106,7 @@ def test_end_of_a_step_has_the_requested_accuracy(tolerance, degree):
 
 @pytest.mark.parametrize(("degree", "e", "tolerance"), [(8, 0.9, 1e-12), (8, 0.999, 1e-12), (12, 0.9, None)])
 def test_step_sizes_are_smaller_where_errors_grow(degree, e, tolerance):
-    """On the way to the pericentre from step to step a thousandfold; a third of the trials was in vain."""
+    """Step sizes change a thousandfold before the pericentre; a third of the trials was rejected."""
     stepper = sc.compile_stepper(sc.problem("kepler").system, sc.SVI(degree))
     run = stepper.integrate(*orbit(e, math.pi), t_end=SPAN, **({"tolerance": tolerance} if tolerance else {}))
     assert run.rejected_steps < 0.08 * run.steps
@@ -386,7 +386,7 @@ def test_initial_step_size_is_found_for_zero_velocity(method):
 
 @pytest.mark.parametrize("tolerance", [1e-8, 1e-12])
 def test_degree_two_error_estimate_uses_the_change_of_force(tolerance):
-    """From rest the force does not change at first: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
+    """At rest the force is initially constant: q = 2 asin(k cd(t, k)) (Whittaker, Analytical Dynamics, 44)."""
     pendulum = sc.LagrangianSystem.from_text(name="pendulum", coordinates=["q"], lagrangian="q_dot**2/2 + cos(q)")
     run = sc.compile_stepper(pendulum, "svi:2").integrate([1.0], [0.0], t_end=2.0, tolerance=tolerance)
     k = math.sin(0.5)

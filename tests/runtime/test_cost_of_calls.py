@@ -1,4 +1,4 @@
-"""What a call of ``integrate`` costs beside its steps, in function calls instead of seconds, and the reuse of runs."""
+"""Overhead of calls of ``integrate`` in function calls instead of seconds, and the reuse of runs."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def test_states_before_a_failure_are_available():
 
 
 def test_solve_ivp_agrees_with_scipy():
-    """The same arguments, attributes and shapes; the pendulum from rest at 2, four turning points."""
+    """Arguments, attributes and shapes are equal; pendulum from rest at 2, four turning points."""
     asked = np.linspace(0, 10, 33)
     system = problem("planar-pendulum").system
     ours = solve_ivp(

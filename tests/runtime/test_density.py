@@ -125,7 +125,7 @@ def test_reversed_run_returns_on_its_own_steps(system):
 
 
 def off_the_time_transformation(run):
-    """How far lengths of whole steps are from h = tau g in their middle, of Kepler's orbit, tau = 0.1."""
+    """Return the deviation of step sizes from h = tau g at the midpoint, for Kepler's orbit, tau = 0.1."""
     t, lengths = run.t[:-2], run.step_sizes[:-2]
     return np.abs(np.abs(lengths) / (0.1 * (run.at(t + lengths / 2)[0] ** 2).sum(axis=1)) - 1.0).max(initial=0.0)
 
@@ -153,7 +153,7 @@ def test_steps_that_end_at_a_time_advance_the_density_partially():
 
 
 def test_time_transformations_of_runs_with_inputs():
-    """Both of them by positive steps of tau, which have no number."""
+    """Steps of tau are positive, and their number is not prescribed."""
     system = LagrangianSystem.from_text(name="u", coordinates=["x"], lagrangian="x_dot**2/2 + u*x", inputs=["u"])
     stepper = compile_stepper(system, SVI(2), time_transformation="1 + x**2", flags=QUICK_FLAGS)
     given = {"inputs": {"u": ([0.0, 1.0, 2.0], [1.0, 2.0, 2.0], "constant")}, "h": 0.1}

@@ -108,7 +108,7 @@ def columns_of(found):
 
 
 def values_of(form):
-    """What a run starts from, with nothing beside the energy of its state."""
+    """Return the initial data of a run, with no parameter but the energy."""
     return [*Q, *P, *stepper(form).defaults[:-1], 0.0, T0, H]
 
 
@@ -172,7 +172,7 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_gradients_are_the_transpose_of_derivatives(way):
-    """Of functions of states, and of states and times."""
+    """Functions of states, and of states and times."""
     run = stepper("L").integrate(Q, P, **({"h": H, "t": T0} | WAYS[way]))
     forward = run.sensitivity()
     weights = np.random.default_rng(1).normal(size=(len(run), 5, 3))
@@ -213,7 +213,7 @@ def test_derivatives_at_an_end_time_agree_with_fixed_steps_of_time():
 
 
 def test_derivatives_of_a_rod_in_transformed_time():
-    """With a constraint: the transpose, and differences of steps."""
+    """With a constraint, compare with the transpose and with differences of steps."""
     rod = LagrangianSystem.from_text(
         name="rod",
         coordinates=["x", "y"],

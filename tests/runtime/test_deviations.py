@@ -1,4 +1,4 @@
-"""Indicators of chaos: against closed forms, variational equations by DOP853, published values, promises."""
+"""Chaos indicators compared with closed forms, variational equations by DOP853 and published values."""
 
 import pickle
 import warnings
@@ -221,7 +221,7 @@ def test_ensembles_are_the_same_as_runs(galaxy):
 
 
 def by_derivatives(stepper):
-    """The same, without a text for lanes: a copy knows none that nobody asked for. Each motion is followed alone."""
+    """Compute the indicators without code for lanes: each trajectory is followed separately."""
     alone = pickle.loads(pickle.dumps(stepper))
     assert alone._variational_source(1) is None
     return alone
@@ -257,7 +257,7 @@ OPEN = HamiltonianSystem.from_text(
     ],
 )
 def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
-    """To round-off of each logarithm, of eleven motions in two blocks."""
+    """Logarithms agree to round-off, for eleven trajectories in two blocks."""
     start = 0.4 * np.random.default_rng(1).normal(size=(2, 11, 2))
     stepper = compile_stepper(system, method)
     alone = by_derivatives(stepper)
@@ -268,7 +268,7 @@ def test_lanes_have_the_derivatives_of_the_steps(system, method, options):
 
 
 def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
-    """x'' = 100 x: apart by e^20 in ten steps, e^600 in all; the closed form, and what the derivatives tell."""
+    """x'' = 100 x: growth e^20 in ten steps, e^600 in total; compare with the closed form and the derivatives."""
     saddle = LagrangianSystem.from_text(name="saddle", coordinates=["x"], lagrangian="(x_dot**2 + 100*x**2)/2")
     stepper, start = compile_stepper(saddle, SVI(6)), ([[1e-3], [0.0]], [[0.0], [2e-3]])
     alone = by_derivatives(stepper)
@@ -279,7 +279,7 @@ def test_fast_growing_tangent_vectors_in_lanes_use_shorter_segments():
 
 
 def test_diverging_trajectory_is_continued_as_scalar():
-    """x'' = 4 x^3 goes to infinity, sooner or later: statuses, and what is known until then, are those told alone."""
+    """x'' = 4 x^3 diverges: statuses and results until then equal those of single runs."""
     away = LagrangianSystem.from_text(name="away", coordinates=["x"], lagrangian="x_dot**2/2 + x**4")
     stepper, done = compile_stepper(away, SVI(3)), []
     alone = by_derivatives(stepper)
@@ -306,7 +306,7 @@ def test_failed_steps_are_rejected_as_in_runs():
 
 
 def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
-    """Those of a row of a map, and each of them alone, whatever the number of threads."""
+    """A row of a map equals its single trajectories for any number of threads."""
     y = np.linspace(-0.2, 0.3, TRAJECTORIES_TOGETHER + 5)
     start = np.column_stack([0 * y, y]), np.column_stack([0.3 + 0 * y, 0 * y])
     both = [galaxy.chaos_indicators_ensemble(*start, h=0.2, steps=40, count=1, threads=threads) for threads in (1, 3)]
@@ -317,7 +317,7 @@ def test_more_trajectories_than_one_batch_are_distinguished(galaxy):
 
 
 def test_last_step_of_an_event_run_is_not_changed(galaxy):
-    """Its length is held: the derivative is that of the state at that time, not of the crossing."""
+    """The step size is fixed: the derivative is that of the state at that time, not of the crossing."""
     run = galaxy.integrate(*CHAOTIC, h=0.2, steps=1000, events=Event("y", terminal=True, direction=1))
     assert run.ended_by is not None
     assert run.t[-1] % 0.2 > 1e-6

@@ -40,7 +40,7 @@ def pendulum():
 
 
 def reference(u, w, t_end):
-    """By DOP853, piece by piece."""
+    """Integrate with DOP853, piece by piece."""
     state, ends = [0.3, 0.1], [*KNOTS[(KNOTS > 0.0) & (t_end > KNOTS)], t_end]
     for start, end in zip([0.0, *ends], ends, strict=False):
         inner = (start + end) / 2
@@ -139,7 +139,7 @@ def test_inputs_from_sympy_and_scipy():
 
 @pytest.mark.parametrize("t_end", [2.3, 2.05])
 def test_states_at_breakpoints_are_saved_for_any_save_every(pendulum, t_end):
-    """Nothing but what is kept depends on it: states between, work and iterations are those of all states."""
+    """Dense output, work and iterations do not depend on the stride."""
     stepper = compile_stepper(pendulum, SVI(3))
     given = {"inputs": {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}, "h": 0.1, "t_end": t_end}
     reported = []
@@ -361,7 +361,7 @@ def test_inputs_survive_changes_of_coordinates_and_formulation(pendulum):
 
 
 def test_inputs_of_a_hamiltonian(pendulum):
-    """In text and from SymPy, in H and in forces: as of the Lagrangian of the same motion."""
+    """Text and SymPy input, in H and in forces, equal the Lagrangian formulation."""
     data = {"u": (KNOTS, VALUES), "w": ([0.0, 3.0], [0.0, 0.3])}
     expected = compile_stepper(pendulum, SVI(6)).integrate([0.3], [0.1], inputs=data, h=0.05, t_end=2.3)
     reported = HamiltonianSystem.from_text(

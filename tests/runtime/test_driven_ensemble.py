@@ -23,7 +23,7 @@ def pendulum():
 
 @pytest.fixture(scope="module")
 def coupled():
-    """Masses that depend on positions: its sweeps begin with velocities."""
+    """Return a system with position-dependent masses, whose iterations start with velocities."""
     return LagrangianSystem.from_text(
         name="coupled",
         coordinates=["x", "y"],

@@ -528,7 +528,7 @@ def test_pickled_stepper_has_its_lanes(kepler: Stepper):
 
 @pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
 def test_absolute_tolerance_equals_that_of_single_trajectories(name):
-    """Lanes measure changes of q, not relative ones, where the options say so: as many sweeps, the same states."""
+    """With the absolute tolerance, lanes need as many iterations and reach the same states."""
     chosen = problem(name)
     stepper = compile_stepper(chosen.system, SVI(4))
     p = stepper.momentum(chosen.q, chosen.velocity)

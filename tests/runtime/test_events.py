@@ -67,7 +67,7 @@ def at_perihelion(e: float) -> dict[str, list[float]]:
 
 
 def crossings_in_one_step(function: str, h: float = 1.0) -> np.ndarray:
-    """Of a function of t alone, along one step from 0."""
+    """Return the crossings of a function of t along one step from 0."""
     stepper = compile_stepper(FREE, StoermerVerlet(), flags=FLAGS)
     return stepper.integrate([0.0], [1.0], h=h, steps=1, events=function).events[0].t
 
@@ -153,7 +153,7 @@ def test_all_roots_of_polynomials_of_degree_four_are_found(polynomials, numbers,
 
 
 def test_few_roots_of_polynomials_of_degree_eight_are_missed(polynomials):
-    """Eight roots within one step are more than polynomials of degree 4 can promise to see: a measured share."""
+    """Polynomials of degree 4 cannot resolve all of eight roots in one step: a measured share is found."""
     generator = np.random.default_rng(8)
     found = 0
     for _ in range(500):
@@ -451,7 +451,7 @@ def test_bouncing_ball_runs_until_its_bounces_accumulate(thrown, floor, error, h
     q, v, t, times = np.array([floor + 1.0]), np.zeros(1), 0.0, []
 
     def bounce():
-        """Until no bounce is told from the next."""
+        """Integrate until bounces can no longer be resolved."""
         nonlocal t, q, v
         for _ in range(100):
             t, q, v, met = until_event(ball, [Event(f"{height} - {floor}", -1, terminal=True)], q, v, t, h)
@@ -496,7 +496,7 @@ def test_simultaneous_crossings_are_ordered_within_the_step():
 
 
 def test_equal_events_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And those of many calls do not fill the memory."""
+    """Events of many calls do not exhaust the memory."""
     system = LagrangianSystem.from_text(name="falling", coordinates=["q"], lagrangian="q_dot**2/2 - q")
     stepper = compile_stepper(system, "svi:2")
     first = stepper.with_events("q - 1")

@@ -1,4 +1,4 @@
-"""What forces give: work beside the energy, impulses beside the momentum maps, by curves and by quadrature."""
+"""Work and impulses of forces compared with energy and momentum maps, by curves and by quadrature."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_shooting_has_a_work_balance_of_the_order_of_its_curve(thrown):
 
 
 def test_work_balance_of_hamiltonians_iterations_and_parameters(thrown):
-    """The same account from H; sweeps borrow the iteration; parameters and time are those of the run."""
+    """The balance of H is equal; fixed-point steps use the fallback; parameters and time are those of the run."""
     hamiltonian = HamiltonianSystem.from_text(
         name="thrown",
         hamiltonian="(p_x**2 + p_y**2)/2 - k/sqrt(x**2 + y**2)",

@@ -1,4 +1,4 @@
-"""Newton's iteration borrowed from a second library where sweeps fail: equal to one's own, compiled when needed."""
+"""Newton's iteration from a fallback library equals a built-in one and is compiled on demand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ each_method = pytest.mark.parametrize(
 
 @cache
 def both(method):
-    """One that borrows, anew from its text, and one with an iteration of its own."""
+    """Return a stepper with a fallback library and one with a built-in iteration."""
     chosen = problem("double-pendulum")
     source, interface = generate_source(chosen.system, method)
     return compile_stepper(chosen.system, method, flags=PORTABLE_FLAGS), Stepper(
@@ -123,7 +123,7 @@ def test_recorded_run_continues_with_its_fallback(start, tmp_path):
 
 
 def test_low_words_do_not_depend_on_the_split_of_a_run():
-    """Those of a step by sweeps are not those of the next one by Newton's iteration, in one call as in many."""
+    """Low words of fixed-point and Newton steps are separate, for one call as for many."""
     stepper = compile_stepper(problem("kepler").system, SVI(4), flags=PORTABLE_FLAGS)
     whole, cut = (stepper.start([0.3, 0.0], [0.0, (1.7 / 0.3) ** 0.5], h=0.8) for _ in range(2))
     whole.advance(40)

@@ -1,4 +1,4 @@
-"""Parameters and initial states from measurements: against DOP853 and curve_fit, and errors that mean what they say."""
+"""Parameter estimation compared with DOP853 and curve_fit, and validity of standard errors."""
 
 import warnings
 from functools import cache, partial
@@ -75,7 +75,7 @@ def test_noise_free_data_give_the_true_values():
 
 
 def test_estimates_and_errors_agree_with_curve_fit():
-    """Which integrates with DOP853, and takes differences for slopes."""
+    """curve_fit integrates with DOP853 and uses finite differences."""
     measured = recorded(1)[0]
     found = fit(oscillator(), TIMES, measured, unknown=SOME, **GUESS)
     values, covariance = curve_fit(
@@ -201,7 +201,7 @@ def test_invalid_arguments_are_named(options, message):
 
 
 def test_biased_parameters_warn_of_too_long_steps():
-    """Of second order, by long steps: what is found is off by twelve of the errors claimed, and said to be."""
+    """With large second-order steps, estimates are off by twelve standard errors, which is reported."""
     soft = LagrangianSystem.from_text(
         name="hard",
         coordinates=["x"],
@@ -239,7 +239,7 @@ def test_measurements_are_finite_or_missing():
 
 
 def test_measurement_at_the_start_determines_the_state():
-    """No step is taken: the state is what was measured, and parameters are not told."""
+    """No step is taken: the state is the measured one, and parameters are undetermined."""
     known = {"q": [0.7], "p": [0.2], "h": 0.1}
     with pytest.raises(FitError, match="do not determine delta: they do not depend on it"):
         fit(oscillator(), [0.0], [0.5], unknown=["delta"], fit_initial_state=False, **known)
@@ -248,7 +248,7 @@ def test_measurement_at_the_start_determines_the_state():
 
 
 def test_parameter_at_a_bound_has_no_standard_error():
-    """As if it were no unknown: nothing else is known of their errors to first order."""
+    """The parameter counts as known; other errors are those to first order."""
     bound = {"alpha": (-0.95, 0.0)}
     found = fit(oscillator(), TIMES, recorded(4)[0], unknown=SOME, bounds=bound, **GUESS)
     assert found.at_bounds == ("alpha",)
@@ -319,7 +319,7 @@ def test_chaotic_record_is_fitted_in_segments():
 
 
 def test_segments_and_single_shooting_agree():
-    """Of a record that is neither long nor chaotic: the same least squares, the same errors."""
+    """For a short regular record, least squares and errors are equal."""
     known = GUESS | {"unknown": SOME}
     whole = fit(oscillator(), TIMES, recorded(1)[0], **known)
     parts = fit(oscillator(), TIMES, recorded(1)[0], segments=5, **known)
@@ -405,7 +405,7 @@ def kepler():
     ("length", "time", "segments"), [(1.0, 1.0, 1), (1e6, 1e-6, 1), (1e-6, 1e6, 3), (1e6, 1e6, 1), (1e-6, 1e-6, 3)]
 )
 def test_diagnosis_does_not_depend_on_units(length, time, segments):
-    """Not even where slopes by mu, q and p are 10^30 apart; nor are data without noise a fault of the steps."""
+    """Derivatives by mu, q and p may differ by 10^30; noise-free data do not trigger a warning."""
     units = [length**3 / time**2, 1 / time**2, *[length] * 3, *[length / time] * 3]
     true = np.array([1.0, 1.0, 1.0, 0.0, 0.2, 0.0, 0.8, 0.1])
     mu, k, *state = (true * units).tolist()

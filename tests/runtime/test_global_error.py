@@ -622,7 +622,7 @@ class TestCommandLine:
 
     @pytest.mark.parametrize("where", ["file", "option", "folder"])
     def test_printed_run_equals_the_confirmed_one_bitwise(self, tmp_path, where):
-        """Whether a file or an option asks for it, in memory and in a folder."""
+        """A file or an option requests the confirmation, in memory and in a folder."""
         path = self._kepler(tmp_path)
         output = tmp_path / ("orbit.run" if where == "folder" else "orbit.npz")
         chosen = ["kepler", "--span", "20", "--error", "1e-9"] if where == "option" else [str(path)]

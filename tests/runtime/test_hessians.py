@@ -76,7 +76,7 @@ def test_hessian_of_a_function_of_all_states(stepper, save_every):
     "options", [{"h": None, "steps": None, "t_end": 4.0}, {"h": -0.07}], ids=["own lengths", "back"]
 )
 def test_hessian_is_the_derivative_of_the_gradient(stepper, options):
-    """As a symmetric form: v . H w = w . H v, and as the change of all states along two directions."""
+    """The Hessian is symmetric, v . H w = w . H v, and is the change of all states along two directions."""
     run = run_from(stepper, START, **options)
     weights, hessians = square(len(run), 1)
     v, w = np.random.default_rng(2).normal(size=(2, stepper._input_size))
@@ -111,7 +111,7 @@ def test_hessian_of_a_long_run_equals_that_of_its_segments(stepper):
 
 
 def test_hessian_of_the_energy_at_the_end_equals_that_at_the_start():
-    """By a high order its Hessian at the end, pulled back, is that at the start: a closed form."""
+    """At high order the Hessian at the end, pulled back, equals that at the start, a closed form."""
     stepper = compile_stepper(problem("planar-pendulum").system, SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=200)
     m, length, g = stepper.defaults

@@ -25,7 +25,7 @@ class Case:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """From the shape of the only array, and the rows of the only table."""
+        """Return the sizes from the shape of the only array and the rows of the only table."""
         found = dict(zip(self.system.coordinates[0].names, self.q.shape, strict=False))
         return found | {table.names[0]: len(self.tables[table.name]) for table in self.system.tables}
 
@@ -209,7 +209,7 @@ def test_energy_has_the_terms_without_coordinates(method: str) -> None:
 
 
 def test_consecutive_runs_equal_one_run() -> None:
-    """So many steps at once or one after the other give the same bits; a stepper survives a pickle."""
+    """Steps in one or several calls are bitwise equal; a stepper survives pickling."""
     each = CASES["bodies"]
     stepper = pickle.loads(pickle.dumps(sc.compile_stepper(each.system, "svi:4")))
     runs = [stepper.start(each.q, velocity=each.velocity, h=0.05, parameters=each.parameters) for _ in range(2)]
@@ -224,7 +224,7 @@ def test_consecutive_runs_equal_one_run() -> None:
 
 @pytest.mark.parametrize("method", ["svi:4", "composition:8"])
 def test_restored_run_continues_bitwise(method: str) -> None:
-    """To the bit, with its tables and parameters; other bytes are refused."""
+    """Tables and parameters are restored bitwise; other bytes are rejected."""
     each = CASES["net"]
     stepper = sc.compile_stepper(each.system, method)
     run = stepper.start(each.q, velocity=each.velocity, h=0.1, tables=each.tables, parameters=each.parameters)
@@ -243,7 +243,7 @@ def test_restored_run_continues_bitwise(method: str) -> None:
 
 
 def test_observed_runs_save_the_requested_quantities() -> None:
-    """And the first and the last state."""
+    """The first and the last state are saved."""
     each = CASES["ring"]
     stepper = sc.compile_stepper(each.system, "svi:2")
     run = stepper.integrate(each.q, h=0.01, steps=25, save_every=10, observe=lambda run: run.q["q"][:2])
@@ -263,14 +263,14 @@ def test_observed_runs_save_the_requested_quantities() -> None:
     ],
 )
 def test_unsupported_observations_are_rejected(observe: Any, message: str) -> None:
-    """By name, not by NumPy, and not as NaN."""
+    """Errors name the observation; they are neither NumPy errors nor NaN."""
     each = CASES["ring"]
     with pytest.raises(sc.StateError, match=message):
         sc.compile_stepper(each.system, "svi:2").integrate(each.q, h=0.1, steps=2, observe=observe)
 
 
 def test_velocities_depend_on_masses() -> None:
-    """Of the states that are kept, and of a run; what they show of themselves is a line."""
+    """Velocities of saved states and of a run; representations fit one line."""
     each = CASES["bodies"]
     stepper = sc.compile_stepper(each.system, "svi:2")
     given = {"velocity": each.velocity, "h": 0.05, "parameters": each.parameters}
@@ -288,7 +288,7 @@ def test_velocities_depend_on_masses() -> None:
 
 
 def test_table_with_one_column_may_be_a_list() -> None:
-    """What is held in place, say."""
+    """For example, fixed positions."""
     constrained = sc.LagrangianSystem.from_text(
         name="held",
         coordinates=["q[N]"],
@@ -303,7 +303,7 @@ def test_table_with_one_column_may_be_a_list() -> None:
 
 
 def test_energies_are_drawn() -> None:
-    """As of other trajectories, whose axes they may share."""
+    """The energies may share axes with other trajectories."""
     pytest.importorskip("matplotlib")
     each = CASES["ring"]
     run = sc.compile_stepper(each.system, "svi:2").integrate(each.q, h=0.1, steps=20)
@@ -343,7 +343,7 @@ def test_energies_are_drawn() -> None:
     ],
 )
 def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message: str) -> None:
-    """Before anything is done."""
+    """Arrays are checked before the run."""
     net = sc.LagrangianSystem.from_text(
         name="net",
         coordinates=["r[N, 3]"],
@@ -356,7 +356,7 @@ def test_incompatible_arrays_are_rejected(q: Any, given: dict[str, Any], message
 
 
 def test_failures_of_array_runs() -> None:
-    """A step that is too long says so and keeps the states before; a coordinate without a mass is found."""
+    """A too large step fails and the preceding states are saved; a coordinate without mass is reported."""
     each = CASES["ring"]
     with pytest.raises(sc.StepFailedError, match="Use a smaller h") as caught:
         sc.compile_stepper(each.system, "svi:4").integrate(each.q, h=1.5, steps=3)
@@ -390,7 +390,7 @@ def test_index_out_of_range_of_a_table_is_rejected() -> None:
 @pytest.mark.parametrize(("method", "most"), [("svi:1", 1.3), ("svi:2", 1.6), ("svi:4", 2.2), ("svi:8", 3.4)])
 @pytest.mark.parametrize("form", ["lagrangian", "hamiltonian"])
 def test_fixed_point_converges_up_to_the_documented_step_size(form: str, method: str, most: float) -> None:
-    """Of an oscillator, also where positions or momenta pass through 0; its energy is kept."""
+    """For an oscillator, also where positions or momenta pass through 0; the energy is conserved."""
     formulas = {
         "lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)",
         "hamiltonian": "sum(i in N, (p_q[i]**2 + q[i]**2)/2)",

@@ -37,7 +37,7 @@ def chain() -> sc.IndexedStepper:
 
 @pytest.fixture(scope="module")
 def pendulums() -> sc.IndexedStepper:
-    """With constraints, whose memory has places, too."""
+    """Return pendulums with constraints, whose memory depends on positions."""
     system = sc.LagrangianSystem.from_text(
         name="pendulums",
         coordinates=["x[N]", "y[N]"],

@@ -1,4 +1,4 @@
-"""Newton's iteration for sums over indices: where sweeps fail it ends where that of the system written out does."""
+"""Newton's iteration for array systems agrees with that of the unrolled system where fixed-point iterations fail."""
 
 import numpy as np
 import pytest

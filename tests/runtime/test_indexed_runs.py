@@ -225,7 +225,7 @@ class TestInputs:
 
     @pytest.mark.parametrize("method", ["svi:2", "svi:6"])
     def test_equal_samples_do_not_reset_the_predictor(self, driven, method):
-        """Samples of the same number cost no sweep more than none; of another, fewer than from nothing."""
+        """Equal samples need no additional iteration; different ones need fewer than without a predictor."""
         stepper = sc.compile_stepper(driven, method)
         runs = [stepper.start(Q, velocity=V, h=0.05) for _ in range(4)]
         for run in runs:

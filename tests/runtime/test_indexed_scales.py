@@ -64,7 +64,7 @@ def test_iteration_counts_are_those_recorded(method, solver, h):
 @pytest.mark.parametrize(("method", "solver"), WAYS)
 @pytest.mark.parametrize("force", [0.0, 2.0**-90])
 def test_forces_from_rest_at_the_origin_are_scale_invariant(method, solver, force):
-    """Where there is nothing yet, beside which a change would be small."""
+    """The initial state is 0, so no relative change is defined."""
     hamiltonian = {"momenta": ["p[N]"], "hamiltonian": "sum(i in N, p[i]**2/2 + q[i]**2/2) - e*cos(t)*q[0]"}
     lagrangian = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2) + e*cos(t)*q[0]"}
     form = hamiltonian if method == "hamiltonian" else lagrangian

@@ -110,7 +110,7 @@ CASES = {
 
 
 def system_of(case: Case) -> sc.LagrangianSystem:
-    """With unit masses."""
+    """Return a system with unit masses."""
     axes = "i in N, j in N" if "N, N" in case.coordinates else "i in N, j in M" if "M" in case.coordinates else "i in N"
     velocity = "q_dot[i, j]" if "j" in axes else "q_dot[i]"
     return sc.LagrangianSystem.from_text(
@@ -169,7 +169,7 @@ def test_results_do_not_depend_on_the_number_of_threads(name: str, method: str) 
 
 
 def test_iterative_methods_agree_with_leapfrog() -> None:
-    """By short steps of both."""
+    """Both methods take small steps."""
     for name in ("ring", "pairs", "net"):
         case = CASES[name]
         ends = [
@@ -306,7 +306,7 @@ int main(void)
 
 @pytest.fixture(scope="module")
 def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], list[list[int]]]:
-    """Rounds and windows of families of several sizes, as C says them."""
+    """Return rounds and windows of term groups of several sizes, as computed in C."""
     folder = tmp_path_factory.mktemp("windows")
     source, _ = generate_array_source(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
     for path, text in {**source.files, "main.c": WINDOWS}.items():
@@ -321,7 +321,7 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], l
 
 
 def test_neighbouring_blocks_are_never_processed_concurrently(windows: dict[tuple[str, int], list[list[int]]]) -> None:
-    """Of a round; and every index is in one block."""
+    """Blocks of a round are disjoint, and every index is in one block."""
     several = 0
     for (what, size), each in windows.items():
         if what == "tiles":
@@ -422,7 +422,7 @@ def test_as_many_threads_are_started_as_requested(tmp_path: Path) -> None:
     + [("ring", "svi:4", "newton")],
 )
 def test_threads_have_no_data_races(name: str, method: str, solver: str, tmp_path: Path) -> None:
-    """By the thread sanitizer, where the compiler has it."""
+    """The thread sanitizer is used if the compiler has it."""
     needs("setarch")
     program(name, method, solver, tmp_path, threads=3, steps=4)
     flags = ["-std=c99", "-O1", "-g", "-fsanitize=thread", "-DSCVI_THREADS", "-pthread", "-Wno-psabi"]

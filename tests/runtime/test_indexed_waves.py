@@ -1,4 +1,4 @@
-"""What waves precondition: steps on lattices far beyond the limit of sweeps, with few products."""
+"""Circulant preconditioner: steps on lattices far beyond the limit of fixed-point iterations need few products."""
 
 from functools import cache
 
@@ -47,7 +47,7 @@ def smooth(shape):
 
 
 def products_of(stepper, q, h, *, steps=1, **given):
-    """How many products steps take, which must converge."""
+    """Return the number of products of steps, which must converge."""
     run = stepper.start(q, h=h, **given)
     report = run._binding.new("report *")
     assert run._steps(steps, report) == 0
@@ -57,7 +57,7 @@ def products_of(stepper, q, h, *, steps=1, **given):
 @pytest.mark.parametrize("size", [8, 12, 13, 34, 60, 77, 169, 500, 1001])
 @pytest.mark.parametrize("method", ["svi:2", "svi:4", "gauss:3"])
 def test_fourier_modes_of_a_linear_ring_decouple(size, method):
-    """With the right transform of every size, and the right symbol, a product leaves nothing but rounding."""
+    """With the transform of each size and the exact symbol, one product leaves only rounding."""
     q = RANDOM.normal(size=size)
     assert products_of(stepper_of("ring", method), q, 1.0, parameters={"k": 1e3}) <= 3
 
@@ -91,7 +91,7 @@ def test_boundaries_and_amplitudes_need_few_products(name, shape, most):
 @pytest.mark.parametrize("name", LATTICES)
 @pytest.mark.parametrize("k", [1e2, 1e5])
 def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
-    """By Newton's iteration with whole matrices; the least lattices are too small to be asked for waves."""
+    """Compare with Newton's iteration with full matrices; very small lattices have no preconditioner."""
     for shape in [(2, 7), (7, 12)] if "plane" in name else [4, 34]:
         sizes = dict(zip(("NX", "NY"), shape, strict=True)) if "plane" in name else {"N": shape}
         small = sc.unroll_sums(lattice(name), sizes)
@@ -108,7 +108,7 @@ def test_preconditioned_steps_equal_those_of_the_unrolled_system(name, k):
 
 @pytest.mark.parametrize("name", ["chain", "beam"])
 def test_corrections_are_accurate_in_badly_scaled_systems(name):
-    """The size has a factor beyond those that are transformed, and the diagonal says nothing of long waves."""
+    """The size has a factor that is not transformed, and the diagonal is a poor preconditioner for long waves."""
     run = stepper_of(name).start(smooth(503), h=0.5, parameters={"k": 1e5})
     with pytest.raises(StepFailedError, match="GMRES"):
         run.advance(1)

@@ -1,4 +1,4 @@
-"""The longest step of tau for a wanted accuracy, and what is said of a run that does not keep it."""
+"""Largest step of tau for a requested accuracy, and reports of runs that miss it."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ class Begun:
         return momentum, places
 
     def off(self, start: tuple[Fraction, Fraction, Fraction]) -> tuple[float, float]:
-        """By how much the momentum, and the centre of mass, are not where they belong."""
+        """Return the deviations of the momentum and of the centre of mass."""
         momentum, places = self.invariants()
         t, first, begun = start
         return float(momentum - first), float(places - begun - first * (self.time() - t))
@@ -202,7 +202,7 @@ def test_last_step_ends_at_the_sum_of_both_words_of_time(lengths: str, sign: flo
 
 @pytest.mark.parametrize("lengths", ["tolerance", "inputs"])
 def test_times_are_sums_of_all_steps(lengths: str) -> None:
-    """Of steps that choose their length, the last of which ends at t_end; and of pieces between breakpoints."""
+    """Adaptive steps, the last of which ends at t_end, and segments between breakpoints."""
     own = Begun("svi")
     if lengths == "tolerance":
         own.run = own.stepper.start(own.q, own.p, t_end=1.7, tolerance=1e-6, t=1 / 3)
@@ -227,7 +227,7 @@ def tables(code: str) -> dict[str, list[float]]:
 
 @pytest.mark.parametrize("text", ["svi", "gauss", "ensemble", "array"])
 def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
-    """Of Gauss-Legendre points: c, A^2, b A and b of the tableau in 50 digits."""
+    """For Gauss-Legendre points, compare c, A^2, b A and b of the tableau in 50 digits."""
     stepper = compiled(text if text != "ensemble" else "svi")
     code = stepper.ensemble.code if text == "ensemble" else stepper.source.code
     found, own = tables(code), collocation_tableau(points("gauss", 3))

@@ -62,7 +62,7 @@ class Holder:
 
 
 def entries(run: Any) -> dict[str, Callable[[], Any]]:
-    """What a second thread may try, by name."""
+    """Return the calls that a second thread may attempt, by name."""
     found = {
         "advance": lambda: run.advance(1),
         "update": lambda: run.update(h=0.2),

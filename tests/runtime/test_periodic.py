@@ -44,7 +44,7 @@ def galaxy():
 
 
 def test_a_halo_orbit_is_the_published_one(restricted):
-    """From a guess that is off in the third digit, to the tenth; its monodromy against differences by DOP853."""
+    """From a guess with an error in the third digit to ten digits; its monodromy is compared with DOP853."""
     x, v, period = HALO
     guess = [1.001 * x[0], 0.0, x[2]], [0.0, 0.998 * v[1], 0.0]
     orbit = periodic_orbit(restricted, guess[0], velocity=guess[1], period=1.001 * period, steps=200, fixed=["y", "z"])

@@ -40,7 +40,7 @@ STEPS = 24
 
 @dataclass(frozen=True)
 class Formula:
-    """What follows from L: functions of (q, v, t, parameters) one state at a time."""
+    """Functions of (q, v, t, parameters) derived from L, for one state at a time."""
 
     momentum: Callable
     energy: Callable
@@ -114,7 +114,7 @@ def trajectory(number: int):
 
 
 def expected(number: int, t):
-    """Of one time: q, p, v, energy and momentum maps."""
+    """Return q, p, v, energy and momentum maps at one time."""
     given = SETTINGS[number]
     own, values = formula(given.system), values_of(given)
     q, v = np.split(solution(number)(t), 2)

@@ -140,7 +140,7 @@ def test_spurious_solution_is_rejected_or_its_error_reported(name, flags):
 
 
 def test_run_with_controller_starts_with_a_correct_step():
-    """With 1e-2 allowed to a step, its curve tells less than that of steps of many periods."""
+    """With a tolerance of 1e-2, the error estimate of a step of many periods is too small."""
     stepper = sc.compile_stepper(sc.problem("planar-pendulum").system, "scvi:3")
     exact = sc.compile_stepper(sc.problem("planar-pendulum").system, sc.SVI(12))
     for q, p in [(0.3, -1.0), (0.6, 0.9), (1.4, 0.2)]:

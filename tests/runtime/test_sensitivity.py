@@ -110,7 +110,7 @@ def curvature(stepper, q, p, h, t, weights):
 
 
 def second_difference(case, start, direction, weights):
-    """Of weights . (q1, p1) along a direction, of the paper's equations solved in 60 digits."""
+    """Return the second difference of weights . (q1, p1) along a direction, of equations solved in 60 digits."""
     m, width = len(weights) // 2, mp.mpf(10) ** -15
     step = DerivedStep(case.system, paper_equations(case.system, case.method()))
     ends = []
@@ -123,7 +123,7 @@ def second_difference(case, start, direction, weights):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_second_derivatives_of_a_step_by_all_arguments(name):
-    """Along directions in which all entries count alike; and symmetric, by which all of them are told."""
+    """Directions weight all entries equally; symmetry determines all of them."""
     case, stepper, q, p, h = given(name)
     rng, start = np.random.default_rng(7), np.array([*q, *p, *stepper.defaults, T, h])
     weights = rng.normal(size=2 * len(q))
@@ -153,7 +153,7 @@ def test_vector_products_agree_with_the_jacobian(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_adjoint_is_the_transpose(name):
-    """Of vectors of all that is given, and what they become: (J v, w) = (v, J^T w), for all v and w of a basis."""
+    """(J v, w) = (v, J^T w) for all v and w of a basis."""
     _, stepper, q, p, h = given(name)
     size = stepper._input_size
     starts = Starts.chain(q, p, np.array([T, T + h, T + 2 * h]), np.array([h, h, 0.5 * h]))
@@ -197,7 +197,7 @@ def test_sensitivities_of_runs_by_all_arguments():
     ids=["all", "checkpoints", "backward", "own lengths"],
 )
 def test_gradients_are_the_transpose_of_sensitivities(options):
-    """For functions of all states at once: one pass back, where not all states are kept, too."""
+    """For functions of all states at once, one backward pass, also with a stride."""
     _, run = driven(**options)
     forward = run.sensitivity()
     seeds = np.random.default_rng(1).normal(size=(len(run), 2, 3))
@@ -228,7 +228,7 @@ def test_gradient_with_checkpoints_equals_that_with_all_states():
 
 
 def test_the_energy_at_the_end_of_a_run_does_not_depend_on_time():
-    """And by mass it does as it does at the start: a closed form for what the adjoint gives."""
+    """The derivative by mass at the end equals that at the start: a closed form for the adjoint."""
     entry = problem("planar-pendulum")
     stepper = compile_stepper(entry.system, SVI(8), flags=QUICK_FLAGS)
     run = stepper.integrate([2.0], [0.3], h=0.05, steps=400)

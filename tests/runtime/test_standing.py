@@ -1,4 +1,4 @@
-"""Runs and their results say in a line what they are: system, method, where they stand, by which steps."""
+"""One-line representations of runs and results: system, method, current state and steps."""
 
 import numpy as np
 import pytest

@@ -276,7 +276,7 @@ def test_step_beyond_the_domain_fails_with_a_message(compiled):
 
 
 def test_a_step_without_solution_fails_with_advice(compiled):
-    """Of q'' = q^2, the midpoint rule asks for a root of h^2 x^2 / 2 - 2 x + 2 q + h v: there is none for this h."""
+    """q'' = q^2 by the midpoint rule requires a root of h^2 x^2 / 2 - 2 x + 2 q + h v: none exists for this h."""
     with pytest.raises(StepFailedError, match=r"step 0 at t = 1\.5 with h = 2 failed: .*smaller step") as caught:
         compiled("runaway", SVI(1)).step([1.0], [1.0], 2.0, 1.5)
     assert caught.value.status in ("not converged", "singular")
@@ -567,7 +567,7 @@ def test_a_stepper_shows_system_and_method(kepler):
 @pytest.mark.parametrize("name", ["double-pendulum", "relativistic-particle", "planar-pendulum", "harmonic-oscillator"])
 @pytest.mark.parametrize("method", [SVI(8), SVI(4, "gauss-legendre:6"), SCVI(4)], ids=lambda method: method.name)
 def test_fixed_point_iteration_starts_from_rest(name, method):
-    """The first sweep from rest has no velocity to measure changes by."""
+    """The first iteration from rest has no velocity as a scale for changes."""
     chosen = problem(name)
     rest = np.zeros(chosen.system.dimension)
     ends = [

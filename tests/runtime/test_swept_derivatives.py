@@ -1,4 +1,4 @@
-"""Derivatives that sweeps carry, beside those of Newton's factors: the same equations, solved in two ways."""
+"""Derivatives by fixed-point iteration compared with those by factorisation: equal equations, two solvers."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_iterated_derivatives_equal_those_by_factorisation(name):
 
 
 def test_unconverged_steps_are_differentiated_by_factorisation():
-    """A spring that is too stiff for sweeps now and then."""
+    """The spring is occasionally too stiff for the fixed-point iteration."""
     spring = LagrangianSystem.from_text(
         name="spring that stiffens",
         coordinates=["x"],

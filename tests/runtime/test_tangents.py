@@ -1,4 +1,4 @@
-"""Tangent maps of runs, and what they say of motions; those of steps are in test_sensitivity."""
+"""Tangent maps of runs; those of steps are in test_sensitivity."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def test_runs_propagate_tangent_vectors():
 
 
 def test_kepler_orbit_has_the_exact_shear_after_a_period():
-    """After a period all multipliers are 1, and only the phase drifts with the energy: M - 1 has rank one."""
+    """After a period all multipliers are 1, and only the phase depends on the energy: M - 1 has rank one."""
     entry = problem("kepler")
     stepper = compile_stepper(entry.system, SVI(8))
     run = stepper.integrate([0.5, 0.0], [0.0, np.sqrt(3.0)], h=2 * np.pi / 64, steps=64)

@@ -28,7 +28,7 @@ def free() -> Stepper:
 
 
 def in_last_places(time: float, t: float, h: float, n: int) -> float:
-    """How far a time is from t + n h, in units of its last place."""
+    """Return the distance of a time from t + n h, in units of the last place."""
     return float(abs(Fraction(time) - (Fraction(t) + n * Fraction(h))) / Fraction(math.ulp(time)))
 
 

@@ -43,7 +43,7 @@ def final_error(system, method, start, *, h, steps, reference):
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_functions_of_the_space_are_interpolated_exactly(space, degree, curve, derivative) -> None:
-    """From its velocities at the space's points each curve follows at any other, to 50 digits."""
+    """A curve is determined at all points by its velocities at the points of the space, to 50 digits."""
     with mp.workdps(60):
         points = space.points(degree, gauss_legendre(degree + 2))
         assert len(points) == space.dimension(degree)
@@ -189,7 +189,7 @@ def test_symplecticity_momentum_and_reversibility(method: SVI, solver: str) -> N
 
 @pytest.mark.parametrize("method", [SVI(3, "hermite:3"), SVI(4, "hermite-2:3")], ids=lambda method: method.name)
 def test_discrete_lagrangian_includes_derivatives(method: SVI) -> None:
-    """It generates the step: p0 = -D1 L_d and p1 = D2 L_d by differences; and it is the action to the order."""
+    """L_d generates the step, p0 = -D1 L_d and p1 = D2 L_d by differences, and approximates the action."""
     system, h = problem("planar-pendulum").system, 0.4
     own = stepper(system, method)
     q1, p1 = own.step([0.7], [0.4], h)
@@ -264,7 +264,7 @@ def test_splines_are_more_accurate_where_a_force_has_a_kink() -> None:
 
 
 def test_hermite_is_more_accurate_with_two_points_per_step() -> None:
-    """Where L is wanted at the ends of a step alone, derivatives along the curve give order 8 in place of 2."""
+    """With L at the ends of a step only, derivatives along the curve give order 8 instead of 2."""
     system, start = problem("planar-pendulum").system, ([1.0], [0.0])
     fine = stepper(system, SVI(12)).integrate(*start, h=0.25, steps=80)
     errors = [

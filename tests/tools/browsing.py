@@ -1,4 +1,4 @@
-"""What tests of pages do in a headless Chromium: open a file as a phone or a desk, ask what the eye would see."""
+"""Tests of pages in a headless Chromium: open a file in the size of a phone or a desk, and inspect its layout."""
 
 from __future__ import annotations
 

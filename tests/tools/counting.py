@@ -11,7 +11,7 @@ __all__ = ["TooMuchWorkError", "at_most"]
 
 
 class TooMuchWorkError(BaseException):
-    """Not an ``Exception``, so that nothing under test mistakes it for one of its own."""
+    """Base exception, so that code under test does not catch it."""
 
 
 @contextmanager

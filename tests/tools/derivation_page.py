@@ -90,7 +90,7 @@ def _cells(row: str) -> Iterator[str]:
 
 
 def number(text: str) -> str:
-    """A cell as text: a power of ten as it is typed, ``-`` for what has no number."""
+    """Return a cell as text: powers of ten as typed, ``-`` for undefined numbers."""
     powers = re.sub(r"10<sup>(.*?)</sup>", r"1e\1", re.sub(r"\s*×\s*10<sup>(.*?)</sup>", r"e\1", plain_spaces(text)))
     return plain(powers).replace("\N{EN DASH}", "")
 

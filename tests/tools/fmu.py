@@ -1,4 +1,4 @@
-"""An importer of FMUs for tests: the library driven through ctypes, as FMI 3.0 says."""
+"""Minimal importer of FMUs for tests: the library called through ctypes, as specified by FMI 3.0."""
 
 from __future__ import annotations
 

@@ -164,7 +164,7 @@ def mutated(random: Random, text: str, others: tuple[str, ...]) -> str:
 
 
 def quietly(call: Callable[..., Result], *arguments: Any, expected: type[Exception]) -> Result | None:
-    """What the call returns under the guard, ``None`` where it raises the expected error; others go through."""
+    """Return the result of the call under the guard; ``None`` if it raises the expected error."""
     with guarded():
         try:
             return call(*arguments)

@@ -40,7 +40,7 @@ static void show(const char *name, const double *x, long long n)
 
 
 def repeated(body: str) -> str:
-    """C that runs ``body`` as often as the command line says, and then prints the shortest time."""
+    """Return C code that repeats ``body`` and prints the shortest time."""
     return f"""double shortest = INFINITY;
   const int repeats = count > 1 ? atoi(arguments[1]) : 1;
   for (int k = 0; k < repeats; k++) {{

@@ -96,7 +96,7 @@ class Case:
         return self.problem.values(self.given.own)
 
     def parameters(self, values: dict[str, float] | None = None) -> dict[str, Any]:
-        """As the package takes them: arrays by name."""
+        """Return the parameters as the package accepts them: arrays by name."""
         known = dict(values or self.values)
         for name, array in self.problem.fields.items():
             known[name] = np.array([known.pop(f"{name}{i}") for i in range(len(array))])
@@ -107,7 +107,7 @@ class Case:
         return {"p" if "hamiltonian" in self.problem.text else "velocity": np.array(x)}
 
     def motion(self, values: dict[str, float] | None = None, start: float | None = None, state: Any = None) -> Motion:
-        """From a state at a time, twice as far as the run goes."""
+        """Integrate from a state at a time, twice as far as the run."""
         begin = self.given.t if start is None else start
         q, x = state or (self.problem.q, self.problem.x)
         reach = begin + 2.0 * self.span
@@ -262,7 +262,7 @@ def between(case: Case) -> None:
 
 
 def _as_array(case: Case, text: str) -> str:
-    """Of a function of q0, q1, ..: of q[0], q[1]."""
+    """Return a function of q0, q1, .. as a function of q[0], q[1]."""
     import re
 
     return re.sub(r"\bq(\d)\b", r"q[\1]", text) if case.kind == "array" else text
@@ -294,7 +294,7 @@ def events(case: Case) -> None:
 
 
 def failure(case: Case) -> None:
-    """The number and the time of a step that fails far behind the first portion, and the states before."""
+    """Return number and time of a step that fails far beyond the first chunk, and the preceding states."""
     steps, h = 700, case.h / 100
     values = {**case.values, STOP: case.given.t + 512.5 * h}
     parameters = case.parameters(values)
@@ -446,7 +446,7 @@ def _velocity_of(case: Case, truth: Any, t: float, state: Any, values: dict[str,
 
 
 def controlled(case: Case) -> None:
-    """Steps that choose their length: where they end, between them, and what is said of the worst."""
+    """Adaptive steps: ends, dense output, and the estimate of the worst step."""
     end = case.given.t + case.span
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run_loop, "CALL_SECONDS", 1e-9)
@@ -466,7 +466,7 @@ def controlled(case: Case) -> None:
 
 
 def _differences(case: Case, names: list[str], width: float) -> dict[str, np.ndarray]:
-    """(n, 2m) slopes of all states of a run by numbers that it starts from."""
+    """Return the (n, 2m) differences of all states of a run by its initial data."""
 
     def ends(name: str, change: float) -> np.ndarray:
         q, p, t, h = base.q[0].copy(), base.p[0].copy(), case.given.t, base.h
@@ -613,12 +613,12 @@ PROPERTIES: dict[str, tuple[Property, Callable[[Case], bool]]] = {
 
 
 def _conserves_balance(case: Case) -> bool:
-    """Whether the text has Newton's iteration, by which steps are taken again, along a curve."""
+    """Return whether the code has Newton's iteration along a curve, which recomputes steps for the balance."""
     if case.problem.methods[case.method][1] == "fixed-point":
         return False
     return str(case.problem.methods[case.method][0]).startswith(("svi", "scvi", "gauss"))
 
 
 def _estimates_errors(case: Case) -> bool:
-    """Whether steps choose their length: by a curve, and not of RATTLE."""
+    """Return whether adaptive steps are available: with an error estimate by a curve, not for RATTLE."""
     return not isinstance(case.problem.methods[case.method][0], dict) and case.error < LOW

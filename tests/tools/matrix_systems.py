@@ -140,7 +140,7 @@ class Truth:
         return np.asarray(x), solved[: self.m], solved[self.m :]
 
     def motion(self, start: float, end: float, q: Any, x: Any, parameters: Mapping[str, float]) -> Motion:
-        """From (q, x) at start to end."""
+        """Integrate (q, x) from start to end."""
         return Motion(self, start, end, tuple(q), tuple(x), tuple(parameters.values()))
 
 

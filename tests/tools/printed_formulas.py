@@ -183,7 +183,7 @@ class _Parser:
         return found
 
     def several(self) -> list[Tree]:
-        """What stands between brackets, commas between."""
+        """Return the comma-separated entries between brackets."""
         found = [self.sum()]
         while self.next == ",":
             self.take()

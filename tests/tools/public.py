@@ -1,4 +1,4 @@
-"""What is public, a line each: names and signatures, options, keys of model files, names in C, variables of FMUs.
+"""Public names, one per line: names and signatures, options, keys of model files, C names, variables of FMUs.
 
 python tests/tools/public.py      writes it to tests/corpus/public.txt, which test_public.py compares.
 """
@@ -74,7 +74,7 @@ def _is_ours(kind: type, member: str, fields: dict[str, Any]) -> bool:
 
 
 class _Something:
-    """In place of a default that is no number or text."""
+    """Placeholder of a default that is neither a number nor text."""
 
     def __repr__(self) -> str:
         return "..."

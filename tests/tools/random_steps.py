@@ -53,7 +53,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of the trials of a method: per trial the estimate (NaN: none, or refused) and the error."""
+    """Results of the trials of a method: estimate (NaN: none or rejected) and error of each trial."""
 
     refused: Array
     estimates: Array
@@ -171,7 +171,7 @@ def displaced(q: Array, end: Array, other: Array) -> float:
 
 @cache
 def trials(name: str, count: int, seed: int = 1) -> list[Trial]:
-    """So many random trials of a family, less those whose reference is doubtful."""
+    """Return random trials of a system, without those whose reference is doubtful."""
     family, random, found = FAMILIES[name], np.random.default_rng([seed, sum(map(ord, name))]), []
     system = family.written_out or family.system
     exact, other = (sc.compile_stepper(system, sc.SVI(degree)) for degree in (12, 9))
@@ -203,7 +203,7 @@ def taken(stepper: Any, trial: Trial) -> tuple[Array, float]:
 
 
 def outcome(stepper: Any, of: list[Trial]) -> Outcome:
-    """What became of them."""
+    """Return the results of the trials."""
     refused, estimates, errors = np.zeros(len(of), bool), np.full(len(of), np.nan), np.zeros(len(of))
     for k, trial in enumerate(of):
         with warnings.catch_warnings():

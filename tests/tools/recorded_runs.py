@@ -26,7 +26,7 @@ def recorded(stepper: Stepper, steps: int = 1000, *, folder: str = "a.run", **se
 
 
 def digests(folder: str | Path) -> dict[str, str]:
-    """Of every file with states, to the byte."""
+    """Return the hashes of all files with states."""
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(Path(folder).glob("states-*"))}
 
 

@@ -94,7 +94,7 @@ def sleigh() -> LagrangianSystem:
 
 
 def pushed_pendulum() -> LagrangianSystem:
-    """With inputs: pushed by u, its hook shaken by w."""
+    """Return a pendulum with a force u and a moving pivot w."""
     return LagrangianSystem.from_text(
         name="pushed pendulum",
         coordinates=["q"],
@@ -106,7 +106,7 @@ def pushed_pendulum() -> LagrangianSystem:
 
 
 def damped_pendulum() -> LagrangianSystem:
-    """On a cart that a spring holds; all momenta damped at a rate of two parameters, and L with time."""
+    """Return a pendulum on a cart with a spring; damping rate from two parameters, and explicit time in L."""
     return LagrangianSystem.from_text(
         name="damped pendulum",
         coordinates=["x", "a"],

@@ -1,4 +1,4 @@
-"""Whether C is set as clang-format sets it."""
+"""C style as specified by clang-format."""
 
 from __future__ import annotations
 

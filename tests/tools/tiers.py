@@ -1,4 +1,4 @@
-"""What of a product of arguments the default tier runs; the full tier runs all of it.
+"""Selection of argument combinations for the default tier; the full tier runs all.
 
 ``@pytest.mark.covering`` on a test with several parametrised arguments keeps few of their combinations, so that each
 value of each argument is in one; ``@pytest.mark.covering(2)`` so that each is in two (where there are as many).
@@ -42,7 +42,7 @@ def cover(combinations: Sequence[Combination], times: int = 1) -> set[Combinatio
 
 
 def mark_the_rest_full(items: Iterable[pytest.Item]) -> None:
-    """Of tests marked ``covering``, those that are not needed for it become tests of the full tier."""
+    """Mark tests with ``covering`` that the default tier does not need as tests of the full tier."""
     tests: defaultdict[tuple[str, str], list[pytest.Function]] = defaultdict(list)
     for item in sorted(items, key=lambda item: item.nodeid):  # in one order, however they are shuffled
         if isinstance(item, pytest.Function) and item.get_closest_marker("covering"):

@@ -68,14 +68,14 @@ def test_every_planted_fault_is_detected(mutation: Mutation, record_property) ->
 
 
 def test_planted_faults_find_their_source_lines() -> None:
-    """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
+    """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
     texts = [path.read_text("utf-8") for path in ROOT.glob("templates/support/*.h")]
     places = {what: inside(within, pattern) for what, _, within, pattern, _ in C_TEXT}
     assert [what for what, place in places.items() if not any(re.search(place, text) for text in texts)] == []
 
 
 def test_planted_fault_leaves_no_trace_in_the_process() -> None:
-    """Its iteration of Newton, say, borrowed by sweeps that are the same with the fault and without it."""
+    """The fallback iteration of Newton, for example, is shared by sources with and without the fault."""
     (mutation,) = (one for one in MUTATIONS if one.name == "momentum by A for A^T")
     assert caught(mutation)
     assert certified(mutation.case).passed
@@ -215,7 +215,7 @@ def test_velocities_are_found_where_newton_leaves_the_domain(name: str) -> None:
 
 
 def test_the_derived_step_is_that_of_the_closed_form() -> None:
-    """Its unknowns satisfy the equations that ``derive`` writes out."""
+    """Its unknowns satisfy the equations that ``derive`` prints."""
     system, method = problem("planar-pendulum").system, SVI(2)
     solved, derived = derived_step(system, method)([0.7], [0.4], 0.2), derive(system, method)
     values = {entry.symbol: entry.value for entry in derived.entries} | dict(

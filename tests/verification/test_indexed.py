@@ -72,7 +72,7 @@ SYSTEMS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 def certificate(name: str, method: str) -> sc.Certificate:
-    """Of one of the systems."""
+    """Return the certificate of one of the systems."""
     given, start = SYSTEMS[name]
     system = either_system(name=name, **given)
     return sc.verify_indexed(system, method, **start, flags=QUICK_FLAGS)
@@ -84,7 +84,7 @@ def certificate(name: str, method: str) -> sc.Certificate:
     [("ring", "svi:3"), ("net", "svi:2"), ("net", "composition:8"), ("waves", "gauss:2"), ("damped", "svi:2")],
 )
 def test_correct_integrators_pass(name: str, method: str) -> None:
-    """Each promise is measured, but for velocities of a Hamiltonian."""
+    """Every property is measured except velocities of a Hamiltonian."""
     found = certificate(name, method)
     assert found.passed, found.to_text()
     assert {check.name for check in found.checks} >= {
@@ -125,7 +125,7 @@ QUICK = ("a ring that closes one place off",)
 
 @pytest.mark.parametrize(("name", "method"), sorted({fault[:2] for fault in FAULTS.values()}))
 def test_planted_faults_find_their_source_lines(name: str, method: str) -> None:
-    """Otherwise text that was rewritten takes its faults with it, and only the full tier says so."""
+    """Rewritten source would otherwise disable its planted faults, noticed only by the full tier."""
     system = either_system(name=name, **SYSTEMS[name][0])
     code = compiler.generate_array_source(system, method)[0].amalgamated().code
     here = {what: fault[2] for what, fault in FAULTS.items() if fault[:2] == (name, method)}

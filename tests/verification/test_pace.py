@@ -1,4 +1,4 @@
-"""Certificates of runs in transformed time, and of steps that choose their length. Faults: ``faults/paces.py``."""
+"""Certificates of runs in transformed time and with adaptive steps. Planted faults: ``faults/paces.py``."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import time
@@ -23,7 +24,7 @@ from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states,
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
 from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.run_loop import record
+from scvi_codegen.runtime.run_loop import drive, record
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
@@ -189,32 +190,37 @@ class _Recorder:
 
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
         """Advance to the end; write a checkpoint also on any exception."""
+        manifest, run, checked, stopped = self.manifest, self.run, time.monotonic(), False
+
+        def take(size: int) -> int:
+            nonlocal checked
+            before = run.steps
+            self._advance(min(size, self._most_steps()))
+            if self._rows() == manifest.rows or time.monotonic() - checked >= self.seconds or self._at_checkpoint():
+                self.checkpoint()
+                checked = time.monotonic()
+            return run.steps - before
+
+        def look(_: int) -> None:
+            nonlocal stopped
+            if progress is not None:
+                progress(run.steps)
+            stopped = stop is not None and stop()
+
         try:
-            for done in self._advance_in_chunks():
-                if progress is not None:
-                    progress(done)
-                if stop is not None and stop():
-                    break
+            drive(
+                take,
+                math.inf,
+                seconds=min(LONGEST_CHUNK_SECONDS, max(SHORTEST_CHUNK_SECONDS, self.seconds)),
+                ended=lambda: stopped or manifest.reached(run),
+                progress=look,
+            )
         except RecordingError:
             raise
         except BaseException:
             self.checkpoint()
             raise
         self.checkpoint()
-
-    def _advance_in_chunks(self) -> Iterator[int]:
-        """Advance in chunks, write checkpoints when due, and yield the number of completed steps."""
-        manifest, run, portion, checked = self.manifest, self.run, 1, time.monotonic()
-        wanted = min(LONGEST_CHUNK_SECONDS, max(SHORTEST_CHUNK_SECONDS, self.seconds))
-        while not manifest.reached(run):
-            began = time.monotonic()
-            self._advance(min(portion, self._most_steps()))
-            now = time.monotonic()
-            portion = max(1, int(portion * min(2.0, wanted / max(now - began, 1e-6))))
-            if self._rows() == manifest.rows or now - checked >= self.seconds or self._at_checkpoint():
-                self.checkpoint()
-                checked = time.monotonic()
-            yield run.steps
 
     def _advance(self, steps: int) -> None:
         try:
