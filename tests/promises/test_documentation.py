@@ -1,6 +1,6 @@
 """Tests of the documentation: code, links, API reference, site and search.
 
-``test_seams.py`` runs the code of ``docs/extending.md``, ``frameworks/test_page_lines.py`` that of
+``test_extension_points.py`` runs the code of ``docs/extending.md``, ``frameworks/test_page_lines.py`` that of
 ``docs/frameworks.md``.
 """
 

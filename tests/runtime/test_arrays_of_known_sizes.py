@@ -66,8 +66,8 @@ def test_literal_sizes_are_sizes_given_to_compile_stepper(known):
 def test_motion_solves_newtons_equations(known):
     def rates(t, y):
         x, q, v = y[0], y[1:6], y[6:]
-        stretch = np.roll(q, -1) - q
-        ring = stretch**3 - np.roll(stretch, 1) ** 3 - (q - x) + np.sin(t) * MASSES
+        elongation = np.roll(q, -1) - q
+        ring = elongation**3 - np.roll(elongation, 1) ** 3 - (q - x) + np.sin(t) * MASSES
         body = -x + (q - x).sum() + np.cos(t) / 10
         return np.concatenate([v, [body / 2], ring / MASSES])
 
@@ -113,18 +113,18 @@ def test_invalid_states_are_rejected(known, q, message):
 
 
 @pytest.mark.parametrize(
-    ("beside", "message"),
+    ("extra", "message"),
     [
         ({"lagrangian": "sum(i in N, q_dot[i]**2/2 + q[i]**2*q_dot[i]**2)"}, "velocities as m"),
         ({"damping": 0.1}, "damping requires known sizes"),
         ({"constraints": ["q_dot[i] = q[i] for i in 0..0"]}, "must be holonomic"),
     ],
 )
-def test_known_sizes_lift_restrictions(beside, message):
-    given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **beside}
+def test_known_sizes_lift_restrictions(extra, message):
+    given = {"lagrangian": "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)", **extra}
     system = sc.LagrangianSystem.from_text(name="chain", coordinates=["q[N]"], **given)
     with pytest.raises(SystemDefinitionError, match=rf"(?s){message}.*sizes=\{{'N': 8\}}"):
         sc.compile_stepper(system, "svi:2")
-    if "constraints" not in beside:
+    if "constraints" not in extra:
         run = sc.compile_stepper(system, "svi:2", sizes={"N": 2}).integrate([0.1, 0.2], velocity=[0, 0], h=0.1, steps=3)
         assert np.isfinite(run.q).all()
