@@ -67,7 +67,7 @@ def run_pilot(
         q: (m,) initial positions.
         span: duration, not 0; negative to integrate backward.
         symplectic: True if steps preserve the symplectic form.
-        goal: error bound at the end of the span.
+        target_error: error bound at the end of the span.
         most: largest number of steps of a run.
 
     Raises:

@@ -30,7 +30,7 @@ class ConstrainedCase:
 
     Attributes:
         angles: case for peers; errors are measured in its final q.
-        places: case with constraints.
+        positions: case with constraints.
         methods: methods for the constraints.
     """
 

@@ -47,7 +47,7 @@ Field = Callable[[Extended, Extended], Extended]
 
 STAGES = 16
 MAX_ITERATIONS = 100
-STALLED, ROUNDED = 1e-16, 1e-14
+STAGNATED, ROUNDED = 1e-16, 1e-14
 """Relative changes below which the iteration has converged: once they hardly shrink, or, near collisions, grow."""
 
 DIGITS = 50
@@ -216,7 +216,7 @@ def _stages(
         new = field(x + h * (_product((a[0],), derivatives) + low))
         change = float(scale * np.max(np.abs(new - derivatives)))
         derivatives = new
-        if change == 0.0 or (change < STALLED and change >= 0.3 * last) or (change < ROUNDED and change >= last):
+        if change == 0.0 or (change < STAGNATED and change >= 0.3 * last) or (change < ROUNDED and change >= last):
             return derivatives
         last = change
     raise StateError(f"the reference did not converge with steps of {float(h):g} (last change {change:.1e})")

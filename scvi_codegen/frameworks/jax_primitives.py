@@ -80,10 +80,10 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
     return batched
 
 
-def _repeated(given: Any, count: int, axis_index: int) -> Any:
+def _repeated(array: Any, count: int, axis_index: int) -> Any:
     """Return the array repeated along a new axis of length ``count``."""
     return jnp.broadcast_to(
-        jnp.expand_dims(given, axis_index), (*given.shape[:axis_index], count, *given.shape[axis_index:])
+        jnp.expand_dims(array, axis_index), (*array.shape[:axis_index], count, *array.shape[axis_index:])
     )
 
 
@@ -93,25 +93,25 @@ VJP: Primitive = _primitive("vjp", lambda x, w, *_: (*w[:-2], x[-1]), _linear_ba
 VJP_DERIVATIVE: Primitive = _primitive("vjp_derivative", lambda x, w, v, *_: v, _linear_batched(lambda: VJP_DERIVATIVE))
 
 
-def _states_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    found = STATES.bind(*given, **static)
+def _states_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    found = STATES.bind(*primals, **static)
     if type(tangents[0]) is ad.Zero:
         return found, ad.Zero.from_primal_value(found)
-    pushed = JVP.bind(given[0], jnp.expand_dims(tangents[0], -2), **static)
+    pushed = JVP.bind(primals[0], jnp.expand_dims(tangents[0], -2), **static)
     return found, jnp.squeeze(pushed, -3)
 
 
-def _jvp_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+def _jvp_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
     if type(tangents[0]) is not ad.Zero:
         raise MethodError(
             "a flow has no forward-over-forward second derivatives (jacfwd of jacfwd, jacrev of jacfwd) and no third "
             "derivatives: use jax.hessian, or jacfwd or jacrev of jacrev"
         )
-    return JVP.bind(*given, **static), JVP.bind(given[0], tangents[1], **static)
+    return JVP.bind(*primals, **static), JVP.bind(primals[0], tangents[1], **static)
 
 
-def _vjp_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    (x, cotangents), (of_x, of_cotangents), parts = given, tangents, []
+def _vjp_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+    (x, cotangents), (of_x, of_cotangents), parts = primals, tangents, []
     if type(of_cotangents) is not ad.Zero:
         parts.append(VJP.bind(x, of_cotangents, **static))
     if type(of_x) is not ad.Zero:
@@ -122,21 +122,21 @@ def _vjp_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tu
     return VJP.bind(x, cotangents, **static), sum(parts[1:], parts[0])
 
 
-def _vjp_derivative_jvp(given: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
+def _vjp_derivative_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
     if type(tangents[0]) is not ad.Zero:
         raise MethodError("a flow has no third derivatives")
-    (x, cotangents, moved), (_, of_cotangents, of_moved), found = given, tangents, []
+    (x, cotangents, moved), (_, of_cotangents, of_moved), found = primals, tangents, []
     if type(of_cotangents) is not ad.Zero:
         found.append(VJP_DERIVATIVE.bind(x, of_cotangents, moved, **static))
     if type(of_moved) is not ad.Zero:
         found.append(VJP_DERIVATIVE.bind(x, cotangents, of_moved, **static))
-    return VJP_DERIVATIVE.bind(*given, **static), sum(found[1:], found[0])
+    return VJP_DERIVATIVE.bind(*primals, **static), sum(found[1:], found[0])
 
 
 def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
-    def transpose(cotangents: Any, x: Any, given: Any, **static: Any) -> tuple[None, Any]:
+    def transpose(cotangents: Any, x: Any, tangent: Any, **static: Any) -> tuple[None, Any]:
         if type(cotangents) is ad.Zero:
-            return None, ad.Zero(given.aval)
+            return None, ad.Zero(tangent.aval)
         return None, other.bind(x, cotangents, **static)
 
     return transpose

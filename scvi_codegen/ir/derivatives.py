@@ -45,7 +45,7 @@ class PointDerivatives:
     """Kernels of tangent and adjoint vectors by fixed-point iteration; entries are never empty.
 
     Attributes:
-        slopes: derivatives at the points, each distinct value once, after ``beside`` other values; on lanes.
+        partials: derivatives at the points, each distinct value once, after ``beside`` other values; on lanes.
         products: at u = (vectors, these) the matrix times the vectors, and its transpose; the same for a symmetric
             matrix.
         given: derivatives of forces, then momenta, with respect to parameters and time, on lanes.

@@ -55,7 +55,7 @@ class LoweredStageGroup:
 
     Attributes:
         arguments: names of the gathers, m each.
-        value, slope: the kernel, and the kernel with its derivatives.
+        value, derivative: the kernel, and the kernel with its derivatives.
         integrand: summed along the curve with h^(1 + integrand_power), or ``None``: the discrete Lagrangian, or with
             forces their work and impulse.
     """

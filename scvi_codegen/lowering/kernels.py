@@ -50,7 +50,7 @@ def system_kernel(
         system, name: the system, and the C identifier.
         values: expressions of the values.
         of: the arguments u.
-        slopes: expressions of derivatives, stored after the values.
+        partials: expressions of derivatives, stored after the values.
         purpose: one sentence on what it computes, for the comment above it.
     """
     kernel = lower_kernel(

@@ -156,13 +156,13 @@ def _stage_curve(stages: StageSystem) -> StageCurve | None:
     last one that it has, and also available for one velocity.
     """
     shape, count = stages.shape, len([block for block in stages.blocks if block.size is None])
-    held = any(block.name == END_VELOCITY for block in stages.blocks)
+    has_end_velocity = any(block.name == END_VELOCITY for block in stages.blocks)
     if isinstance(shape, Velocities) and _moves(stages, shape):
-        tables, last = velocity_tables(shape), len(shape.blocks) - 1 + held
-        degree = last if held or tables is None else resolved_degree(tables)
+        tables, last = velocity_tables(shape), len(shape.blocks) - 1 + has_end_velocity
+        degree = last if has_end_velocity or tables is None else resolved_degree(tables)
         if degree == 0:
             return None
-        first, tops = 0, _highest_of(shape, None if held else degree)
+        first, tops = 0, _highest_of(shape, None if has_end_velocity else degree)
         differences = [(0, last), (0, (last + 1) // 2)]
         rows = [tuple(mp.mpf((b == last) - (b == first)) for b in range(count)) for first, last in differences]
         power = 2 * degree

@@ -55,7 +55,7 @@ def change_coordinates(
             "coordinates must be equal"
         )
     variables = tuple(symbol(name) for name in new)
-    known = {given.name: given for given in (*variables, *system.parameters, system.time)}
+    known = {symbol.name: symbol for symbol in (*variables, *system.parameters, system.time)}
     positions = {symbol(name): parse_expression(text, known) for name, text in old.items()}
     replaced = {**positions, **{symbol(q.name + DOT): _rate(f, variables, system.time) for q, f in positions.items()}}
     clock = system.clock and replace(system.clock, rate=system.clock.rate.xreplace(replaced))

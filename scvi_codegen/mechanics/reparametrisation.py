@@ -152,5 +152,5 @@ def _distributed(factor: Expr, total: Expr) -> Expr:
 
 
 def _free_symbol(system: MechanicalSystem) -> Symbol:
-    taken = {given.name for given in (*system.coordinates, *system.auxiliaries, *system.parameters)}
+    taken = {symbol.name for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters)}
     return symbol(next(name for name in ENERGY_NAMES if name not in taken))

@@ -123,7 +123,7 @@ class MechanicalSystem(ABC):
     @property
     def momentum_symbols(self) -> tuple[Symbol, ...]:
         """Symbols of the m momenta: for a Lagrangian ``p_`` and the coordinate, preceded by ``_`` if not unique."""
-        taken = {given.name for given in (*self.coordinates, *self.velocities, *self.parameters)}
+        taken = {symbol.name for symbol in (*self.coordinates, *self.velocities, *self.parameters)}
         return self.auxiliaries or tuple(symbol(_free(f"p_{q.name}", taken)) for q in self.coordinates)
 
     @property
@@ -228,7 +228,7 @@ class MechanicalSystem(ABC):
         if self.time.name != TIME:
             raise SystemDefinitionError(f"time is called '{TIME}', not '{self.time}': build systems with from_sympy")
         coordinates, parameters, momenta = (
-            [given.name for given in group] for group in (self.coordinates, self.parameters, self.auxiliaries)
+            [symbol.name for symbol in group] for group in (self.coordinates, self.parameters, self.auxiliaries)
         )
         check_names(coordinates, [*parameters, *self.inputs], momenta)
         if len(self.defaults) != len(self.parameters):
@@ -257,7 +257,7 @@ class MechanicalSystem(ABC):
                 raise SystemDefinitionError(f"in the {where} of '{self.name}': {problem}")
             unknown = sorted(free.name for free in formula.free_symbols.difference(known))
             if unknown:
-                hint = closest(unknown[0], [given.name for given in known])
+                hint = closest(unknown[0], [symbol.name for symbol in known])
                 raise SystemDefinitionError(
                     f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
                     "Give it a default value among the parameters, or list it as a coordinate"

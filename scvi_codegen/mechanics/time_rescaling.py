@@ -50,7 +50,7 @@ def time_rescaling_function(system: MechanicalSystem, g: str | Expr, *, in_time:
         return TIME_RESCALINGS[g](system)
     driven = input_formulas(system.inputs, system.time) if in_time else {}
     time = (system.time, *driven) if in_time else ()
-    known = {given.name: given for given in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
+    known = {symbol.name: symbol for symbol in (*system.coordinates, *system.auxiliaries, *system.parameters, *time)}
     if isinstance(g, Expr):
         formula = g.xreplace({free: known[free.name] for free in g.free_symbols if free.name in known})
     elif isinstance(g, str):

@@ -168,7 +168,7 @@ class Model:
     def parameters(self) -> dict[str, float]:
         """Parameters by name: the system's defaults, without the energy of a transformation and inputs."""
         others = {self.system.clock.energy.name if self.system.clock else "", *input_parameters(self.system.inputs)}
-        return {given.name: value for given, value in self.system.constants.items() if given.name not in others}
+        return {symbol.name: value for symbol, value in self.system.constants.items() if symbol.name not in others}
 
     @property
     def step(self) -> float:

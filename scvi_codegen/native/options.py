@@ -103,14 +103,13 @@ def step_failure(
     *,
     step: int,
     h: float,
-    kept: object = None,
     failures: Mapping[str, tuple[str, str]] = FAILURES,
 ) -> StepFailedError:
-    """Return the exception for a failed step: number, time, step size (0: adaptive), cause, remedy, results so far."""
+    """Return the exception for a failed step: number, time, step size (0: adaptive), cause and remedy."""
     word = STATUS[status]
     length = f" with h = {h:g}" if h else ""
     what, remedy = failures[word]
     if word == NOT_CONVERGED:
         what += f" (last update {report.change:.3g}; {report.iterations} iterations in this call)"
     message = f"step {step} at t = {report.t:.17g}{length} failed: {what}. {remedy}"
-    return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change, trajectory=kept)
+    return StepFailedError(message, status=word, step=step, t=report.t, residual=report.change)

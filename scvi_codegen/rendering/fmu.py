@@ -28,7 +28,7 @@ def with_fmu(
         source, interface: of the integrator.
         start: initial state, with velocities instead of p if ``by_velocity``; parameters, time, and the step size.
         by_velocity: whether initial velocities are set instead of momenta.
-        places: index of the first parameter of each input.
+        input_indices: index of the first parameter of each input.
         token: instantiation token of the model description.
     """
     context = {

@@ -111,7 +111,7 @@ def iteration_source(
     """Return the template data of a fixed-point iteration.
 
     Args:
-        iteration: the iteration.
+        fixed_point: the iteration.
         meaning: of a lane.
         fallback: solver that is tried if it fails.
         kernels: those applied to vectors, if they are not the iteration's own.

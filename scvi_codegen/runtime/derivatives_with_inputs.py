@@ -139,9 +139,9 @@ class DerivativesWithInputs:
 
     def _without_inputs(self, derivatives: Array) -> Array:
         """Return adjoints without those of inputs and h, which differ in the previous piece."""
-        kept = derivatives.copy()
-        kept[..., [*self._input_indices, -1]] = 0.0
-        return kept
+        masked = derivatives.copy()
+        masked[..., [*self._input_indices, -1]] = 0.0
+        return masked
 
     def _gradient(self, by_pieces: Sequence[Array], shape: tuple[int, ...]) -> GradientWithInputs:
         """Construct from (k, variables) adjoints at the start of each piece."""

@@ -55,7 +55,7 @@ def describe_run(
         solver: solver of the stage equations, "" if unknown.
         run: the run.
         tau: whether steps are of transformed time.
-        awaited: inputs that are not set.
+        unset_inputs: inputs that are not set.
     """
     plan = "" if run.plan is None else f", t_end = {run.plan.t_end:g}"
     solved = f", solver {solver}" if solver else ""

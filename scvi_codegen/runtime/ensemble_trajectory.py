@@ -50,7 +50,7 @@ class EnsembleTrajectory(ConfirmedEnsemble):
         parameters: (k, number of parameters) values; zeros for the parameters of inputs.
         stepper: the compiled integrator.
         times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
-        goals: step plan of each trajectory for adaptive steps, else empty.
+        plans: step plan of each trajectory for adaptive steps, else empty.
         spans: with inputs, rows of states of a slice of trajectories and their parameters.
         confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
             empty.

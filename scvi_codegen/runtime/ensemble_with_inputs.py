@@ -40,7 +40,7 @@ class EnsembleWithInputs(Ensemble):
     """Ensemble with inputs, integrated from t to t_end; arguments as of :class:`Ensemble`.
 
     Attributes:
-        stretches: segments of equal steps from t to t_end.
+        segments: segments of equal steps from t to t_end.
         ends: number of steps up to the end of each segment.
         numbers: step numbers of the saved states.
     """

@@ -62,9 +62,9 @@ class GrowthCheck:
 
     Args:
         run: the run at its start.
-        asked: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a coarse
-            run shows exponential growth; ``False``: no check.
-        lead: function that advances the run to a time; by default adaptive steps to that time.
+        requested: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a
+            coarse run shows exponential growth; ``False``: no check.
+        advance_until: function that advances the run to a time; by default adaptive steps to that time.
 
     Raises:
         StateError: if the check is requested for a fixed step size.

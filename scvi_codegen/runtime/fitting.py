@@ -166,8 +166,8 @@ def fit(
     chain, x = chained(measurements, model.known, model.unknown_indices, checked_count(segments, "segments", least=1))
     chain, x, at_bound, evaluations = _solved(model, chain, x, bounds or {})
     fitted = model.fit(chain, x, at_bound, evaluations, known_noise=deviations is not None)
-    if determined := _step_size_warning(chain, fitted, x, ~at_bound):
-        warn(determined, AccuracyWarning)
+    if message := _step_size_warning(chain, fitted, x, ~at_bound):
+        warn(message, AccuracyWarning)
     return fitted
 
 
@@ -199,7 +199,7 @@ class _Model:
 
     Attributes:
         names, guess: (k,) names and initial guesses of the unknowns.
-        places: (k,) indices of the unknowns in (q, p, parameters).
+        unknown_indices: (k,) indices of the unknowns in (q, p, parameters).
         known: (2m + parameters,) values; those of the unknowns are overwritten.
     """
 
@@ -334,9 +334,9 @@ def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bo
 
     Args:
         names: names of the first unknowns; states of later segments have none.
-        slopes: (rows, unknowns) Jacobian of the residuals.
+        jacobian: (rows, unknowns) Jacobian of the residuals.
         sizes: (unknowns,) typical sizes, 0 if unknown.
-        held: (unknowns,) mask of those at bounds.
+        at_bound: (unknowns,) mask of those at bounds.
     """
     if at_bound.all():
         return

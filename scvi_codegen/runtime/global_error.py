@@ -181,7 +181,7 @@ def confirmed_run(
     again: Callable[..., Result],
     state: tuple[Any, Any, Any],
     common: Mapping[str, Any],
-    kept: Mapping[str, Any],
+    output_arguments: Mapping[str, Any],
 ) -> Result:
     """Return the run whose global error is at most ``wanted``, or the most accurate one with a warning.
 
@@ -191,7 +191,7 @@ def confirmed_run(
         again: function that makes the runs for comparison, without events.
         state: q, and p or the velocity.
         common: arguments of both, including the initial time ``t``.
-        kept: arguments of the returned run only: its end and its output options.
+        output_arguments: arguments of the returned run only: its end and its output options.
 
     Raises:
         StepFailedError: if the most accurate run fails.
@@ -200,7 +200,7 @@ def confirmed_run(
     start = checked_number(common["t"], "the time t")
 
     def tight(tolerance: float) -> Result:
-        return integrate(q, p, velocity=velocity, tolerance=tolerance or None, **common, **kept)
+        return integrate(q, p, velocity=velocity, tolerance=tolerance or None, **common, **output_arguments)
 
     def other(tolerance: float, number: int, end: float) -> Result:
         nearby, moving = _nudged(p, number), _nudged(velocity, number)

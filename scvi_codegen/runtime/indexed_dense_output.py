@@ -28,7 +28,7 @@ class Continuation:
     Attributes:
         problem: the problem with the parameters from there on.
         h: fixed step size.
-        goal: step plan for adaptive steps, else ``None``.
+        plan: step plan for adaptive steps, else ``None``.
         options: solver options.
     """
 

@@ -22,7 +22,7 @@ class IndexedProblem:
     Attributes:
         interface, binding: those of the integrator.
         arrays: the data of the problem; its state is the initial one.
-        awaited: inputs that are not set; steps require all inputs to be set.
+        unset_inputs: inputs that are not set; steps require all inputs to be set.
         struct: the C struct.
     """
 

@@ -62,13 +62,13 @@ class IndexedRun(OneThread):
         q: positions by name, of the shapes of the problem.
         moving: momenta, velocities or ``None``, by name, and the word ``"momenta"`` or ``"velocities"``.
         h, t: step size (0 for adaptive steps) and initial time.
-        goal: step plan of adaptive steps.
+        plan: step plan of adaptive steps.
         options: convergence criterion of the solver.
         threads: number of threads per step.
 
     Attributes:
         problem: current problem data; its parameters may change during the run.
-        goal, options, threads: as above.
+        plan, options, threads: as above.
         state: positions and momenta of all coordinates in one vector.
         iterations: total solver iterations.
     """
@@ -190,9 +190,9 @@ class IndexedRun(OneThread):
     @property
     def snapshot(self) -> IndexedSnapshot:
         """Snapshot of the present state for :meth:`rollback`."""
-        kept = {name: self._numbers[name].copy() for name in STATE}
+        arrays = {name: self._numbers[name].copy() for name in STATE}
         run_fields = {name: getattr(self._run, name) for name in RUN_FIELDS}
-        return IndexedSnapshot(kept, run_fields, self.iterations)
+        return IndexedSnapshot(arrays, run_fields, self.iterations)
 
     @alone
     def move_to(self, other: IndexedRun) -> None:
@@ -332,7 +332,7 @@ class IndexedRun(OneThread):
         saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
         saved |= {"moments": [float(getattr(self._run, name)) for name in RUN_FIELDS], "iterations": self.iterations}
-        saved |= {"unset_inputs": np.array(self.problem.unset_inputs, dtype=str), "to a goal": self.plan is not None}
+        saved |= {"unset_inputs": np.array(self.problem.unset_inputs, dtype=str), "to a time": self.plan is not None}
         return saved_bytes(saved, self.problem.arrays, self.interface)
 
     def __reduce__(self) -> tuple[Any, ...]:

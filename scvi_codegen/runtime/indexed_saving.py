@@ -59,7 +59,7 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_time: bool) ->
             raise StateError(f"the saved run is one of '{found['integrator']}', not of '{interface.integrator}'")
         if str(found.pop(CHECKSUM)) != _checksum(found):
             raise StateError("invalid saved run: the checksum differs. Save the run again")
-        if bool(found["to a goal"]) == to_a_time:
+        if bool(found["to a time"]) == to_a_time:
             return found
     raise StateError(
         "the saved run has fixed steps: omit t_end" if to_a_time else "the saved run has adaptive steps: give t_end"

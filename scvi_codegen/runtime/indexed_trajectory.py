@@ -43,10 +43,10 @@ class IndexedTrajectory(Confirmed):
         steps, iterations: numbers of steps and of solver iterations.
         step_error, worst_step_time: estimated error of the worst step, relative to the largest coordinate, and its
             start time; NaN for explicit methods.
-        goal: step plan of adaptive steps, else ``None``.
+        plan: step plan of adaptive steps, else ``None``.
         rejected_steps: number of rejected adaptive steps.
         events: crossings of each event, in their order.
-        departures: data for dense output after each state.
+        continuations: data for dense output after each state.
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
     """
 

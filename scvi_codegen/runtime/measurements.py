@@ -33,7 +33,7 @@ class Measurements:
         measured, used: (n, c) values, and mask of the values that exist.
         columns: (c,) indices of the measured quantities in (q, p).
         pieces: times and sizes of the steps, grouped by pieces of the inputs.
-        places: (n,) number of steps up to each measurement.
+        step_numbers: (n,) number of steps up to each measurement.
     """
 
     stepper: Stepper

@@ -119,13 +119,13 @@ class _OrbitSearch:
     """Equations of a periodic orbit as a function of z = (q, p, period).
 
     Attributes:
-        held: indices of the fixed entries of z, -1 that of the period.
+        fixed_indices: indices of the fixed entries of z, -1 that of the period.
     """
 
     stepper: Stepper
     period: float
     steps: int
-    held: tuple[int, ...]
+    fixed_indices: tuple[int, ...]
     energy: float | None
     gain: Array
     t: float
@@ -169,7 +169,7 @@ class _OrbitSearch:
             stepper=stepper,
             period=period,
             steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
-            held=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+            fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
             energy=None if energy is None else checked_number(energy, "the energy"),
             gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
             t=checked_number(t, "the time t"),
@@ -251,7 +251,7 @@ class _OrbitSearch:
     def _check_repeats(self, z: Array, found: _ClosingEquations, allowed: float) -> None:
         """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
         period = float(z[-1])
-        if -1 not in self.held:
+        if -1 not in self.fixed_indices:
             raise MethodError(
                 f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
                 "with fixed_period=True"
@@ -270,7 +270,7 @@ class _OrbitSearch:
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
-        free = np.delete(np.arange(len(z)), self.held)
+        free = np.delete(np.arange(len(z)), self.fixed_indices)
         inverse = np.zeros((len(z), len(found.defects)))
         inverse[free] = np.linalg.pinv(found.partials[:, free], NULL_SINGULAR_VALUE)
         change = inverse @ found.defects
@@ -341,13 +341,13 @@ class _OrbitSearch:
 
         Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
         """
-        kept = []
+        conserved_masks = []
         for start, segment in zip(starts, segments, strict=True):
             begin = self._integral_gradients(start, segment.start_time)
             end = self._integral_gradients(segment.states[-1], segment.end_time)
             sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(segment.monodromy, 2)
-            kept.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= CONSERVED * sizes)
-        conserved = self._integral_gradients(starts[0], self.t)[np.all(kept, axis=0)]
+            conserved_masks.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= CONSERVED * sizes)
+        conserved = self._integral_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
         directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
         directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
         projection: Array = np.eye(starts.shape[1]) - directions @ directions.T
@@ -395,7 +395,7 @@ class _ClosingEquations:
         segments: in their order.
         error: largest entry of the ends minus the starts that follow.
         defects: (r,) residuals.
-        slopes: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+        partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
     """
 
     segments: Sequence[_Segment]

@@ -53,7 +53,7 @@ class Chain:
     Attributes:
         parts: measurements of each segment.
         known: (2m + parameters,) values; those of the unknowns are overwritten.
-        places: (k,) indices of the unknowns in (q, p, parameters).
+        unknown_indices: (k,) indices of the unknowns in (q, p, parameters).
         sizes: (2m,) sizes of state entries.
         jump: jump relative to ``sizes`` that weighs as much as a residual of ``unit``.
     """

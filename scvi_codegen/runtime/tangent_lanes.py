@@ -42,10 +42,10 @@ def propagate_in_lanes(
 
     Args:
         binding: library with k tangent vectors per trajectory.
-        changes: (2m, k) initial tangent vectors of length 1, common to all trajectories.
+        tangents: (2m, k) initial tangent vectors of length 1, common to all trajectories.
         q, p: (K, m) initial states.
         parameters: (K, number of parameters).
-        heed: called with the completed steps before each block; may raise to stop.
+        check_stop: called with the completed steps before each block; may raise to stop.
 
     Returns:
         (5, n, K, k) series of :class:`Growth`, and (K,) flags of the trajectories that completed all steps.

@@ -129,7 +129,7 @@ def ahead(
     """Integrate from (q, p) with tangent vectors over (steps + 1,) times t, saving every ``save_every``-th value.
 
     Args:
-        heed: called before each chunk; may raise to stop.
+        check_stop: called before each chunk; may raise to stop.
 
     Returns:
         The series of :class:`Growth`, NaN after a failed step, ``None`` if the first step fails; and the failure.
@@ -164,7 +164,7 @@ class _TangentPropagation:
     """Propagation of tangent vectors.
 
     Args:
-        changes: (2m, k) initial vectors of length 1.
+        tangents: (2m, k) initial vectors of length 1.
         given: number of variables of a step.
         t: (n,) times of saved values.
     """
@@ -183,11 +183,11 @@ class _TangentPropagation:
             done, steps = 0, len(starts.h)
             while done < steps:
                 end = min(done + self._size, steps)
-                part, kept = starts.part(done, end), numbers[done : end + 1]
+                part, saved = starts.part(done, end), numbers[done : end + 1]
                 vectors = np.zeros((end - done + 1, self._frame.shape[1], self._given))
                 vectors[0, :, : len(self._frame)] = self._frame.T
-                propagate_chunk(part, kept, vectors)
-                done += self._take(part, kept[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))
+                propagate_chunk(part, saved, vectors)
+                done += self._take(part, saved[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))
 
     def _take(self, part: Starts, numbers: NDArray[np.intp], images: Array) -> int:
         """Accumulate as many (2m, k) images as are well conditioned, at least one; return their number."""

@@ -60,7 +60,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
         stepper: the compiled integrator.
         options: convergence criterion of the solver, ``None`` for the defaults.
         events: zero crossings found, parallel to ``stepper.events``.
-        goal: step plan of adaptive steps, else ``None``.
+        plan: step plan of adaptive steps, else ``None``.
         steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
         step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
             error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods

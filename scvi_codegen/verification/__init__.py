@@ -100,7 +100,7 @@ def verify(
         steps = compile_stepper(single, method, solver=solver, flags=flags)
     tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), given)
     paced = steps is not stepper or tolerance is not None
-    runs_tested = VariableSteps(tested, stepper, _in_own_time(system), system, tolerance)
+    runs_tested = VariableSteps(tested, stepper, _in_transformed_time(system), system, tolerance)
     checks = (
         *(variable_step_checks(runs_tested) if paced else ()),
         *step_checks(tested),
@@ -129,7 +129,7 @@ def verify(
     )
 
 
-def _in_own_time(system: MechanicalSystem) -> MechanicalSystem:
+def _in_transformed_time(system: MechanicalSystem) -> MechanicalSystem:
     if system.clock is None:
         return system
     assert system.clock.plain is not None

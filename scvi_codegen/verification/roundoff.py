@@ -126,7 +126,7 @@ def _low_words(tested: SystemUnderTest) -> Finding | None:
     """Compare runs from one state split differently into high and low word; Newton's method ignores the low word."""
     if not (_has_compensation(tested) and _compensated(tested)):
         return None
-    state, m = tested.states[0], len(tested.given.q)
+    state, m = tested.states[0], len(tested.initial.q)
     carry = _large_compensation(state, tested.scales(state))
     whole = state.z + carry
     rest = (state.z - whole) + carry
@@ -262,13 +262,13 @@ def _walks(tested: SystemUnderTest, run: Callable[[Array, Array, int], tuple[Arr
     invariants = _invariants(tested)
     if not invariants:
         return
-    given, m = tested.given, len(tested.given.q)
-    starts = given.z + SPREAD * tested.scales(given) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
+    initial, m = tested.initial, len(tested.initial.q)
+    starts = initial.z + SPREAD * tested.scales(initial) * np.random.default_rng(0).uniform(-1.0, 1.0, (RUNS, 2 * m))
     steps = min(MAX_STEPS, max(MIN_STEPS, WORK // m))
     end = run(starts[:, :m], starts[:, m:], steps)
     for invariant in invariants:
-        before, sizes = invariant.values(starts[:, :m], starts[:, m:], given.t)
-        after, _ = invariant.values(*end, given.t + steps * given.h)
+        before, sizes = invariant.values(starts[:, :m], starts[:, m:], initial.t)
+        after, _ = invariant.values(*end, initial.t + steps * initial.h)
         changes = (after - before) / sizes
         changes = changes[np.isfinite(changes)]
         if len(changes) < RUNS // 2:
@@ -281,9 +281,9 @@ def _runs(
 ) -> tuple[Array, Array]:
     """Return the final states of runs, one by one."""
     ends = []
-    given: dict[str, Any] = {"h": tested.given.h, "t": tested.given.t, "parameters": tested.parameters}
+    arguments: dict[str, Any] = {"h": tested.initial.h, "t": tested.initial.t, "parameters": tested.parameters}
     for start in zip(q, p, strict=True):
-        own = tested.stepper.start(*start, **given, options=options)
+        own = tested.stepper.start(*start, **arguments, options=options)
         own.advance(steps)
         ends.append((own.q, own.p))
     return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
@@ -308,14 +308,14 @@ def _drift_of_lanes(tested: SystemUnderTest) -> Finding | None:
         return None
 
     def run(q: Array, p: Array, steps: int) -> tuple[Array, Array]:
-        given = tested.given
+        initial = tested.initial
         runs = tested.stepper.integrate_ensemble(
             q,
             p,
-            h=given.h,
+            h=initial.h,
             steps=steps,
             save_every=steps,
-            t=given.t,
+            t=initial.t,
             parameters=tested.parameters,
             options=TO_CONVERGENCE,
         )

@@ -157,14 +157,16 @@ def _propagated_back(tested: SystemUnderTest, back: State, rounding: Array) -> A
 
 def _momentum(tested: SystemUnderTest, k: int) -> Finding:
     """Measure the change of the k-th momentum map along a run."""
-    given, stepper = tested.given, tested.stepper
+    initial, stepper = tested.initial, tested.stepper
     try:
-        run = stepper.integrate(given.q, given.p, h=given.h, steps=STEPS, t=given.t, parameters=stepper.defaults)
+        run = stepper.integrate(
+            initial.q, initial.p, h=initial.h, steps=STEPS, t=initial.t, parameters=stepper.defaults
+        )
     except StepFailedError as failure:
         run = Trajectory.before(failure)
         if len(run) <= CONSECUTIVE_STEPS:
             raise
-    return momentum_error(run, k, f" of {given.h:g}")
+    return momentum_error(run, k, f" of {initial.h:g}")
 
 
 def momentum_error(run: Trajectory, k: int, such: str = "") -> Finding:
@@ -178,20 +180,20 @@ def momentum_error(run: Trajectory, k: int, such: str = "") -> Finding:
 def largest_step(tested: SystemUnderTest) -> Check:
     """Return the largest step size at which the stage equations are solved three times in a row, by bisection."""
     name, what = "largest step", f"largest h at which {CONSECUTIVE_STEPS} steps in a row are solved"
-    given = tested.states[0]
+    state = tested.states[0]
 
     def usable(h: float) -> bool:
         try:
             tested.stepper.integrate(
-                given.q, given.p, h=h, steps=CONSECUTIVE_STEPS, t=given.t, parameters=tested.parameters
+                state.q, state.p, h=h, steps=CONSECUTIVE_STEPS, t=state.t, parameters=tested.parameters
             )
         except StepFailedError:
             return False
         return True
 
-    good, bad = 0.0, given.h
-    if usable(given.h):
-        good = given.h
+    good, bad = 0.0, state.h
+    if usable(state.h):
+        good = state.h
         for _ in range(DOUBLINGS):
             bad = 2 * good
             if not usable(bad):

@@ -63,14 +63,14 @@ class SystemUnderTest:
         method: method of the stepper.
         stepper: stepper as built.
         newton: stepper with Newton's method alone, or ``None``.
-        given: state and step size of the certificate.
+        initial: state and step size of the certificate.
     """
 
     system: MechanicalSystem
     method: Method
     stepper: Stepper
     newton: Stepper | None
-    given: State
+    initial: State
 
     @cached_property
     def parameters(self) -> dict[str, float]:
@@ -105,7 +105,7 @@ class SystemUnderTest:
 
     def _works(self, parameters: Mapping[str, float]) -> bool:
         try:
-            self.stepper.step(self.given.q, self.given.p, self.given.h, self.given.t, parameters)
+            self.stepper.step(self.initial.q, self.initial.p, self.initial.h, self.initial.t, parameters)
         except StepFailedError:
             return False
         return True
@@ -140,19 +140,19 @@ class SystemUnderTest:
         return first, State(now.q, now.p, now.t, -now.h / 2)
 
     def _perturbed(self) -> State:
-        given, m = self.given, len(self.given.q)
-        sizes = self.scales(given)
+        initial, m = self.initial, len(self.initial.q)
+        sizes = self.scales(initial)
         directions = np.concatenate([np.cos(1.0 + np.arange(m)), np.sin(2.0 + 1.3 * np.arange(m))])
         for k in range(PERTURBATIONS):
-            z = given.z + PERTURBATION / 4**k * sizes * directions
-            t = given.t + 0.37 * given.h
+            z = initial.z + PERTURBATION / 4**k * sizes * directions
+            t = initial.t + 0.37 * initial.h
             try:
-                state = State(*self._projected(z[:m], z[m:], t), t, given.h)
+                state = State(*self._projected(z[:m], z[m:], t), t, initial.h)
                 self.step(state)
             except (StateError, StepFailedError):
                 continue
             return state
-        return given
+        return initial
 
     def _projected(self, q: Array, p: Array, t: float) -> tuple[Array, Array]:
         """Return the projection of (q, p) onto the constraint manifold, if there are constraints."""

@@ -48,7 +48,7 @@ class VariableSteps:
     """Runs with variable step sizes, and the fixed steps to compare with.
 
     Attributes:
-        subject: fixed steps; for a time transformation those of the transformed system as an ordinary system in tau.
+        tested: fixed steps; for a time transformation those of the transformed system as an ordinary system in tau.
         stepper: stepper of the runs: with a time transformation, a time-rescaling function or adaptive step size.
         system: system in time t.
         transformed: system in the time of the stepper.

@@ -15,6 +15,7 @@ from language import (
     messages,
     names_in_tests,
     prose,
+    unknown_arguments,
     words_of,
 )
 
@@ -36,6 +37,10 @@ def test_docstrings_name_the_thing():
     fragments = [f"{place(text)}: {text.text.splitlines()[0]}" for text in found if FRAGMENT.match(text.text)]
     assert len(found) > 3000
     assert len(fragments) < MOST_FRAGMENTS * len(found), fragments
+
+
+def test_docstrings_describe_parameters_of_their_function():
+    assert [f"{place(text)}: {text.text}" for text in unknown_arguments()] == []
 
 
 def test_no_retired_term_is_read_anywhere():

@@ -58,8 +58,10 @@ def of_source(source: Source | None, main: str) -> Program:
     return Program(whole.prefix, whole.header, whole.code, main)
 
 
-def sources_of(system: MechanicalSystem, method: str, prefix: str, solver: str, monitor: str | None) -> _Sources:
-    return _Sources(system, as_method(method, system), solver, prefix, (), monitor)
+def sources_of(
+    system: MechanicalSystem, method: str, prefix: str, solver: str, time_transformation: str | None
+) -> _Sources:
+    return _Sources(system, as_method(method, system), solver, prefix, (), time_transformation)
 
 
 def single(
@@ -73,13 +75,13 @@ def single(
     steps: int = 1000,
     kind: str = "fixed",
     solver: str = "auto",
-    monitor: str | None = None,
+    time_transformation: str | None = None,
     tolerance: float = 0.0,
     t_end: float = 20.0,
 ) -> Program:
     """A run of a system with named coordinates."""
     found = system()
-    sources = sources_of(found, method, name, solver, monitor)
+    sources = sources_of(found, method, name, solver, time_transformation)
     parameters = found.defaults
     if kind == "ensemble":
         source = sources.remembered("ensemble", lambda: render_ensemble(sources.program()))()
@@ -258,7 +260,9 @@ CELLS: dict[str, Callable[..., Program]] = {
     "kepler_collocation": partial(KEPLER, method="sc:4"),
     "kepler_shooting": partial(KEPLER, method="scvi:4"),
     "kepler_gauss": partial(KEPLER, method="gauss:3"),
-    "kepler_monitor": partial(KEPLER, method="svi:4", kind="adaptive", monitor="q1**2 + q2**2", tolerance=0.05),
+    "kepler_monitor": partial(
+        KEPLER, method="svi:4", kind="adaptive", time_transformation="q1**2 + q2**2", tolerance=0.05
+    ),
     "kepler_embedded": partial(KEPLER, method="svi:2", kind="embedded", steps=100),
     "kepler_fallback": partial(KEPLER, method="svi:6", h=0.45, steps=100),
     "kepler_clock": partial(KEPLER, system=transformed, method="svi:4"),

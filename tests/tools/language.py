@@ -58,13 +58,14 @@ RETIRED_PHRASES = {
     r"\bborrow(s|ed)?\b|\blent\b": "fallback library",
     r"\btold\b|\bsays? so\b|\bis said\b|\bare said\b": "reported, computed",
     r"\bno number\b": "NaN",
+    r"\b(a|the|its) monitor\b|\bmonitor functions?\b": "time transformation",
 }
 RETIRED_NAMES = frozenset(
     re.findall(
         r"\w+",
         "slopes sweep sweeps swept sweeping goal goals rung rungs ladder octave octaves crowd lent borrowed told said "
         "bent promise promises pace paces companions stretch portions gather_sums expand_sums drive_ensemble "
-        "solve_motion",
+        "solve_motion monitor monitors monitored strayed stray strays vanished stalled bends heed awaited octave",
     )
 )
 """Words of identifiers that have a standard term; see the glossary of the documentation."""
@@ -111,6 +112,20 @@ def docstrings() -> Iterator[Text]:
                 text = ast.get_docstring(node)
                 if text:
                     yield Text(path, getattr(node, "lineno", 1), text)
+
+
+def unknown_arguments() -> Iterator[Text]:
+    """Names under ``Args:`` of a function that are none of its parameters."""
+    for path in package():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                own = {each.arg for each in ast.walk(node.args) if isinstance(each, ast.arg)}
+                entries = re.search(r"^Args:\n((?: .*\n?|\n)*)", ast.get_docstring(node) or "", re.MULTILINE)
+                for names in re.findall(
+                    r"^    ((?:\*{0,2}\w+, )*\*{0,2}\w+):", entries[1] if entries else "", re.MULTILINE
+                ):
+                    if unknown := set(names.replace("*", "").split(", ")) - own:
+                        yield Text(path, node.lineno, ", ".join(sorted(unknown)))
 
 
 def messages() -> Iterator[Text]:

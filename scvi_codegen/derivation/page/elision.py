@@ -31,7 +31,7 @@ def formulas(all_formulas: Sequence[Formula], what: str, *, together: int = MOST
     """Yield the first formulas, and the number of the others.
 
     Args:
-        given: all of them.
+        all_formulas: all of them.
         what: the word for one of them.
         together: operations of those shown.
     """

@@ -149,7 +149,7 @@ class MiddleValue:
 
     Attributes:
         condition: h^2 times the sum of the two collocation equations, in which v_0 cancels; it is 0.
-        slopes: dQ_1/dq_k and dQ_1/dQ_2, by implicit differentiation of the condition.
+        derivatives: dQ_1/dq_k and dQ_1/dQ_2, by implicit differentiation of the condition.
         inner: X = dL_d/dQ_1 from the compiler, simplified with the condition.
         leading: its leading term for small h, with position q and velocity v.
     """

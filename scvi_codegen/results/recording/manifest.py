@@ -72,7 +72,7 @@ class Manifest:
         t: initial time.
         save_every: steps between saved states.
         steps: requested number of steps, ``None`` for adaptive steps.
-        goal: step plan of adaptive steps, else ``None``.
+        plan: step plan of adaptive steps, else ``None``.
         rows: states in a full file.
         model: text of the model file, if there is one.
         certificate: verification report as JSON, if there is one.

@@ -99,7 +99,7 @@ def verify_indexed(
         *convergence_checks(tested),
         *whole_checks(start),
     )
-    given = tested.given
+    given = tested.initial
     return issued(
         stepper.source.files,
         title=stepper.interface.title,

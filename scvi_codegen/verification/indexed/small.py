@@ -133,7 +133,7 @@ class SmallStepper:
     Args:
         stepper: stepper of any size.
         start: sizes, fields and tables.
-        written: unrolled system, whose parameters include the entries of fields.
+        unrolled: unrolled system, whose parameters include the entries of fields.
     """
 
     interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
