@@ -122,7 +122,7 @@ def _example(name: str) -> Mapping[str, Any]:
 def _option(name: str, arguments: Mapping[str, Any]) -> str:
     """Return a method as ``--method`` accepts it, followed by further options."""
     size = size_of(name)
-    words = [f"{name}:{arguments[size]}" if size in arguments else name]
+    words = [f"{name}:{arguments[size]}" if size and size in arguments else name]
     if "abscissae" in arguments:
         words.append(f"--abscissae {','.join(map(str, arguments['abscissae']))}")
     if not arguments.get("variational", True):
