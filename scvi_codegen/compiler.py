@@ -70,10 +70,9 @@ from scvi_codegen.rendering.program_source import (
     render_ensemble,
     workspace_size,
 )
-from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
 from scvi_codegen.runtime.events import EventLike, as_events
-from scvi_codegen.runtime.indexed_interface import IndexedInterface
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.validation.argument_types import MAPPING, SWITCH, TEXT, TEXTS, checks_arguments
@@ -338,36 +337,40 @@ class _ArraySources:
         return cached_source((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
 
     @property
-    def interface(self) -> IndexedInterface:
+    def interface(self) -> Interface:
         """Interface of the generated library."""
         system, method = self.system, self.method
-        return IndexedInterface(
-            prefix=self.prefix,
-            title=f"{system.name}: {method.title}",
-            system=system.name,
-            method=method.name,
+        layout = ArrayLayout(
             sizes=system.sizes,
             coordinates=system.coordinates,
             momenta=system.momenta,
             fields=system.fields,
             tables=system.tables,
-            parameters=tuple(parameter.name for parameter in system.parameters),
-            defaults=system.defaults,
             field_defaults=system.field_defaults,
             maps=momentum_maps(system),
             accesses=system.accesses,
             depends_on_time=system.depends_on_time,
-            inputs=system.inputs,
             constraints=tuple(term.loops for term in system.constraints),
-            conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
             continued=not (method.fractions or system.constraints),
+        )
+        return Interface(
+            prefix=self.prefix,
+            title=f"{system.name}: {method.title}",
+            system=system.name,
+            method=method.name,
+            coordinates=tuple(array.name for array in system.coordinates),
+            parameters=tuple(parameter.name for parameter in system.parameters),
+            defaults=system.defaults,
+            inputs=system.inputs,
+            conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
             solver="rattle" if system.constraints else self.solver,
+            layout=layout,
         )
 
 
 def generate_array_source(
     system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
-) -> tuple[Source, IndexedInterface]:
+) -> tuple[Source, Interface]:
     """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
     sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
     return sources.plain, sources.interface

@@ -50,16 +50,16 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
     example = render_array_example(
         source.prefix,
         title=interface.title,
-        momenta=bool(interface.momenta),
+        momenta=bool(interface.layout.momenta),
         numbers=problem.numbers,
-        sizes={name: problem.sizes[name] for name in interface.sizes},
+        sizes={name: problem.sizes[name] for name in interface.layout.sizes},
         fields={f"field_{name}": values.size for name, values in problem.fields.items()},
         tables={
             f"table_{name}": (problem.places[name].size, limits)
             for name, limits in table_limits(interface, problem.sizes)
         },
         moving=moving if moving in arrays else "",
-        constraints=bool(interface.constraints),
+        constraints=bool(interface.layout.constraints),
         run={"t": model.t, "h": model.step, "steps": model.whole_step_count(), "save_every": model.save_every},
     )
     texts = {**source.files, **example, **{f"{name}.txt": _lines(values) for name, values in arrays.items()}}

@@ -14,9 +14,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from scvi_codegen.indices import Access, Array, IndexedMap, Loop
 from scvi_codegen.version import __version__
 
-__all__ = ["Interface", "Source", "check_interface", "included"]
+__all__ = ["ArrayLayout", "Interface", "Source", "check_interface", "included"]
 
 
 TEXTS = ("header", "code", "declarations")
@@ -30,6 +31,7 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "tuple[str, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, str) for each in value),
     "tuple[bool, ...]": lambda value: isinstance(value, tuple) and all(isinstance(each, bool) for each in value),
     "tuple[float, ...]": lambda value: isinstance(value, tuple) and all(map(_is_number, value)),
+    "ArrayLayout": lambda value: False,
 }
 """Checks of values read from JSON against the annotations of :class:`Interface`."""
 INCLUDED = re.compile(r'^#include "(support/\w+\.h)"\n', re.MULTILINE)
@@ -162,6 +164,35 @@ def included(code: str) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayLayout:
+    """Arrays of an integrator, whose sizes follow from those of a run.
+
+    Attributes:
+        sizes: names of sizes, in the order of the C struct.
+        coordinates, fields, tables: array declarations, in that order.
+        momenta: momentum arrays of a Hamiltonian system.
+        field_defaults: fill values of fields that are not passed.
+        maps: momentum maps.
+        accesses: every array access, with the loops around it.
+        depends_on_time: whether L or H depends on t explicitly.
+        constraints: loops of each constraint.
+        continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
+    """
+
+    sizes: tuple[str, ...] = ()
+    coordinates: tuple[Array, ...] = ()
+    momenta: tuple[Array, ...] = ()
+    fields: tuple[Array, ...] = ()
+    tables: tuple[Array, ...] = ()
+    field_defaults: tuple[float, ...] = ()
+    maps: tuple[IndexedMap, ...] = ()
+    accesses: tuple[tuple[Access, tuple[Loop, ...]], ...] = ()
+    depends_on_time: bool = False
+    constraints: tuple[tuple[Loop, ...], ...] = ()
+    continued: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Interface:
     """Interface of a compiled integrator.
 
@@ -189,19 +220,20 @@ class Interface:
             those whose entries are parameters; none without arrays.
         solver: of the stage equations, as in ``compile_stepper``, with or without a fallback; unknown for folders of
             version 0.1.
+        layout: of arrays whose sizes are known at run time; the coordinates are their names.
     """
 
     prefix: str
     title: str
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     system: str
     method: str
     coordinates: tuple[str, ...]
     parameters: tuple[str, ...]
     defaults: tuple[float, ...]
-    unknowns: int
-    workspace: int
-    has_action: bool
+    unknowns: int = 0
+    workspace: int = 0
+    has_action: bool = False
     map_names: tuple[str, ...] = ()
     map_formulas: tuple[str, ...] = ()
     map_exact: tuple[bool, ...] = ()
@@ -215,6 +247,7 @@ class Interface:
     conserves_energy: bool = False
     solver: str = ""
     arrays: tuple[str, ...] = ()
+    layout: ArrayLayout = ArrayLayout()
 
     @property
     def dimension(self) -> int:
@@ -231,8 +264,9 @@ class Interface:
         return self.momentum_names or tuple(f"p_{name}" for name in self.coordinates)
 
     def to_json(self) -> str:
-        """Return text for :meth:`from_json`."""
-        return json.dumps(asdict(self), indent=2, ensure_ascii=True) + "\n"
+        """Return text for :meth:`from_json`, which supports named coordinates only."""
+        record = {name: value for name, value in asdict(self).items() if name != "layout"}
+        return json.dumps(record, indent=2, ensure_ascii=True) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Interface:

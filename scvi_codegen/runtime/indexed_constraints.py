@@ -150,14 +150,14 @@ def _dependent(run: ConstrainedRun, *, nearest: bool = False) -> str:
 
 
 def _count(run: ConstrainedRun) -> int:
-    if not run.problem.interface.constraints:
+    if not run.problem.interface.layout.constraints:
         raise MethodError(f"'{run.problem.interface.system}' has no constraints")
     return sum(int(np.prod(shape)) for shape in _shapes(run))
 
 
 def _shapes(run: ConstrainedRun) -> list[list[int]]:
     """Return the shape of the loops of each constraint."""
-    return [_shape(loops, run.problem.arrays.sizes) for loops in run.problem.interface.constraints]
+    return [_shape(loops, run.problem.arrays.sizes) for loops in run.problem.interface.layout.constraints]
 
 
 def _apart(run: ConstrainedRun, values: Numbers) -> tuple[Numbers, ...]:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
+from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.events import ACCUMULATED, Event
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, check_accesses
+from scvi_codegen.runtime.indexed_interface import Numbers, check_accesses
 from scvi_codegen.runtime.indexed_memory import IndexedSnapshot
 from scvi_codegen.runtime.indexed_run import IndexedRun
 
@@ -186,7 +187,7 @@ class IndexedSearch:
 
     def crossings(self) -> tuple[IndexedCrossings, ...]:
         """Return the crossings by event."""
-        names = [array.name for array in self.run.interface.coordinates]
+        names = list(self.run.interface.coordinates)
         return tuple(
             IndexedCrossings(
                 event=event,
@@ -248,7 +249,7 @@ class _Function:
         self.terms = _terms(interface, event)
         accesses = tuple((access, term.loops) for term in self.terms for _, access in term.slots)
         try:
-            check_accesses(replace(interface, accesses=accesses), arrays.sizes, arrays.places)
+            check_accesses(replace(interface.layout, accesses=accesses), arrays.sizes, arrays.places)
         except ScviCodegenError as error:
             raise EventError(f"the event function '{event.function}': {error}") from error
         self.needs = {access.array.name for access, _ in accesses}
@@ -268,28 +269,28 @@ class _Function:
         return float(sum(np.sum(value) for value in values))
 
 
-def _velocities(interface: IndexedInterface) -> dict[str, str]:
+def _velocities(interface: Interface) -> dict[str, str]:
     """Return the names of the velocity arrays by coordinate array."""
-    return {} if interface.momenta else {array.name: f"{array.name}_dot" for array in interface.coordinates}
+    return {} if interface.layout.momenta else {name: f"{name}_dot" for name in interface.coordinates}
 
 
-def _momenta(interface: IndexedInterface) -> dict[str, str]:
+def _momenta(interface: Interface) -> dict[str, str]:
     """Return the names of the momentum arrays by coordinate array."""
-    own = [array.name for array in interface.momenta] or [f"p_{array.name}" for array in interface.coordinates]
-    return dict(zip((array.name for array in interface.coordinates), own, strict=True))
+    own = [array.name for array in interface.layout.momenta] or interface.momenta
+    return dict(zip(interface.coordinates, own, strict=True))
 
 
-def _terms(interface: IndexedInterface, event: Event) -> tuple[IndexedTerm, ...]:
+def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
     from scvi_codegen.formulas.indexed import parse_indexed  # here, because it imports SymPy
     from scvi_codegen.formulas.symbols import TIME, symbol
 
-    axes = {array.name: array.axes for array in interface.coordinates}
-    known = [*interface.coordinates, *interface.fields]
+    axes = {array.name: array.axes for array in interface.layout.coordinates}
+    known = [*interface.layout.coordinates, *interface.layout.fields]
     for others in (_velocities(interface), _momenta(interface)):
         known += [Array(other, axes[name]) for name, other in others.items()]
     symbols = {name: symbol(name) for name in (*interface.parameters, TIME)}
     try:
-        return parse_indexed(str(event.function), known, symbols, interface.tables)
+        return parse_indexed(str(event.function), known, symbols, interface.layout.tables)
     except ScviCodegenError as error:
         raise EventError(f"the event function '{event.function}': {error}") from error
 

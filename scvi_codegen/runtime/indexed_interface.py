@@ -1,4 +1,4 @@
-"""Interface of an integrator of an indexed system, and validation of the arrays of a run."""
+"""Validation of the arrays of a run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.errors import StateError, closest
-from scvi_codegen.indices import Access, Array, IndexedMap, Loop, Place
+from scvi_codegen.indices import Array, Loop, Place
 from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.rendering.source import ArrayLayout, Interface
 
 __all__ = [
-    "IndexedInterface",
     "Numbers",
     "RunArrays",
     "read_arrays",
@@ -24,57 +24,6 @@ __all__ = [
 
 Numbers = NDArray[np.float64]
 IndexTable = NDArray[np.int32]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedInterface:
-    """Names and shapes of a generated integrator.
-
-    Attributes:
-        prefix: prefix of every exported C name.
-        title, system, method: descriptive names.
-        sizes: names of sizes, in the order of the C struct.
-        coordinates, fields, tables: array declarations, in that order.
-        momenta: momentum arrays of a Hamiltonian system.
-        parameters, defaults: names and default values of scalar parameters.
-        field_defaults: fill values of fields that are not passed.
-        maps: momentum maps.
-        accesses: every array access, with the loops around it.
-        depends_on_time: whether L or H depends on t explicitly.
-        inputs: names of inputs; each occupies five parameters.
-        solver: solver of the stage equations.
-        constraints: loops of each constraint.
-        conserves_energy: whether the Lagrangian system conserves energy.
-        continued: whether the predictor extrapolates previous steps instead of reusing the forces at their end.
-    """
-
-    prefix: str
-    title: str
-    system: str
-    method: str
-    sizes: tuple[str, ...]
-    coordinates: tuple[Array, ...]
-    momenta: tuple[Array, ...]
-    fields: tuple[Array, ...]
-    tables: tuple[Array, ...]
-    parameters: tuple[str, ...]
-    defaults: tuple[float, ...]
-    field_defaults: tuple[float, ...]
-    maps: tuple[IndexedMap, ...]
-    accesses: tuple[tuple[Access, tuple[Loop, ...]], ...]
-    depends_on_time: bool
-    inputs: tuple[str, ...] = ()
-    solver: str = "fixed-point"
-    constraints: tuple[tuple[Loop, ...], ...] = ()
-    conserves_energy: bool = False
-    continued: bool = False
-    energy_parameter = ""
-    """Name of the energy parameter of transformed time; indexed systems have none."""
-
-    @property
-    def integrator(self) -> str:
-        """Identification of saved runs; runs of another solver have another memory layout."""
-        return f"{self.title}, {self.solver}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +38,7 @@ class RunArrays:
 
 
 def read_arrays(
-    interface: IndexedInterface,
+    interface: Interface,
     q: ArrayLike | Mapping[str, ArrayLike],
     parameters: Mapping[str, ArrayLike] | None,
     tables: Mapping[str, ArrayLike] | None,
@@ -100,53 +49,52 @@ def read_arrays(
         StateError: if a name, shape or number is invalid, or an index would leave its array.
     """
     places, state = read_tables(interface, tables), read_state(interface, q, "positions")
-    shapes = [(array, state[array.name].shape) for array in interface.coordinates]
-    shapes += [(table, places[table.name].shape) for table in interface.tables]
+    shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
+    shapes += [(table, places[table.name].shape) for table in interface.layout.tables]
     argument = dict(parameters or {})
     numbers = number_values(interface, argument)
     shapes += [
         (field, real_array(argument[field.name], field.name).shape)
-        for field in interface.fields
+        for field in interface.layout.fields
         if field.name in argument
     ]
-    sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.sizes)
+    sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.layout.sizes)
     fields = field_values(interface, argument, sizes)
-    check_accesses(interface, sizes, places)
+    check_accesses(interface.layout, sizes, places)
     return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=places)
 
 
-def read_state(
-    interface: IndexedInterface, argument: ArrayLike | Mapping[str, ArrayLike], what: str
-) -> dict[str, Numbers]:
+def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:
     """Return the coordinate arrays (or velocities, momenta) by name, from a mapping or a single array.
 
     Raises:
         StateError: if a name, a number of axes or a value is invalid.
     """
-    names = [array.name for array in interface.coordinates]
+    names = list(interface.coordinates)
     if not isinstance(argument, Mapping):
         if len(names) > 1:
             raise StateError(f"{what} must be given by name, as {{'{names[0]}': .., '{names[1]}': ..}}")
         argument = {names[0]: argument}
     _check_named(argument, names, what, whole=True)
     return {
-        array.name: _of_axes(array, real_array(argument[array.name], what), what) for array in interface.coordinates
+        array.name: _of_axes(array, real_array(argument[array.name], what), what)
+        for array in interface.layout.coordinates
     }
 
 
-def number_values(interface: IndexedInterface, argument: Mapping[str, ArrayLike]) -> list[float]:
+def number_values(interface: Interface, argument: Mapping[str, ArrayLike]) -> list[float]:
     """Return the scalar parameters in order."""
     known = dict(zip(interface.parameters, interface.defaults, strict=True))
-    _check_named(argument, [*known, *(field.name for field in interface.fields)], "parameters", whole=False)
+    _check_named(argument, [*known, *(field.name for field in interface.layout.fields)], "parameters", whole=False)
     return [checked_number(argument.get(name, value), name) for name, value in known.items()]
 
 
 def field_values(
-    interface: IndexedInterface, argument: Mapping[str, ArrayLike], sizes: Mapping[str, int]
+    interface: Interface, argument: Mapping[str, ArrayLike], sizes: Mapping[str, int]
 ) -> dict[str, Numbers]:
     """Return the field arrays by name, in full shape; a scalar fills its array."""
     found = {}
-    for array, default in zip(interface.fields, interface.field_defaults, strict=True):
+    for array, default in zip(interface.layout.fields, interface.layout.field_defaults, strict=True):
         values = real_array(argument.get(array.name, default), array.name)
         _check_finite(values, array.name)
         shape = array.shape(sizes)
@@ -156,11 +104,11 @@ def field_values(
     return found
 
 
-def read_tables(interface: IndexedInterface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
+def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
-    _check_named(argument or {}, [table.name for table in interface.tables], "tables", whole=True)
+    _check_named(argument or {}, [table.name for table in interface.layout.tables], "tables", whole=True)
     found = {}
-    for table in interface.tables:
+    for table in interface.layout.tables:
         try:
             values = np.asarray((argument or {})[table.name])
         except (TypeError, ValueError, OverflowError) as error:
@@ -209,10 +157,10 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
     return {name: length for name, (length, _) in found.items()}
 
 
-def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables: Mapping[str, IndexTable]) -> None:
+def check_accesses(layout: ArrayLayout, sizes: Mapping[str, int], tables: Mapping[str, IndexTable]) -> None:
     """Raise :class:`StateError` if an access leaves its array, or an index its table, for these sizes and tables."""
-    rows = {table.name: table for table in interface.tables}
-    for access, loops in interface.accesses:
+    rows = {table.name: table for table in layout.tables}
+    for access, loops in layout.accesses:
         spans = {loop.index: loop for loop in loops}
         if any(loop.end.at(sizes) <= loop.first.at(sizes) for loop in loops):
             continue  # empty loop
@@ -223,10 +171,10 @@ def check_accesses(interface: IndexedInterface, sizes: Mapping[str, int], tables
             _check_span(f"{access}", span, access.array, k, sizes)
 
 
-def table_limits(interface: IndexedInterface, sizes: Mapping[str, int]) -> list[tuple[str, list[int]]]:
+def table_limits(interface: Interface, sizes: Mapping[str, int]) -> list[tuple[str, list[int]]]:
     """Return for each table and column the length of the shortest axis that its entries index."""
-    found = {table.name: [2**31] * table.axes[1].number for table in interface.tables}
-    for access, _ in interface.accesses:
+    found = {table.name: [2**31] * table.axes[1].number for table in interface.layout.tables}
+    for access, _ in interface.layout.accesses:
         for axis, place in zip(access.array.axes, access.places, strict=True):
             if place.table:
                 limits = found[place.table]

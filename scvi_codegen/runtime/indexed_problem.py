@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, field_values, number_values
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.indexed_interface import Numbers, RunArrays, field_values, number_values
 from scvi_codegen.runtime.inputs import inputs_not_given, no_input
 
 __all__ = ["IndexedProblem"]
@@ -27,15 +28,15 @@ class IndexedProblem:
     """
 
     def __init__(
-        self, interface: IndexedInterface, binding: Binding, arrays: RunArrays, unset_inputs: tuple[str, ...] = ()
+        self, interface: Interface, binding: Binding, arrays: RunArrays, unset_inputs: tuple[str, ...] = ()
     ) -> None:
         self.interface, self.binding, self.arrays, self.unset_inputs = interface, binding, arrays, unset_inputs
         self.struct = binding.new("problem *")
-        for k, name in enumerate(interface.sizes):
+        for k, name in enumerate(interface.layout.sizes):
             self.struct.size[k] = arrays.sizes[name]
-        for k, array in enumerate(interface.fields):
+        for k, array in enumerate(interface.layout.fields):
             self.struct.field[k] = binding.pointer(arrays.fields[array.name].reshape(-1))
-        for k, table in enumerate(interface.tables):
+        for k, table in enumerate(interface.layout.tables):
             self.struct.table[k] = binding.pointer(arrays.places[table.name].reshape(-1))
         for k, value in enumerate(arrays.numbers):
             self.struct.parameters[k] = value

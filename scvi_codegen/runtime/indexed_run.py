@@ -12,9 +12,10 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED, SolverOptions, step_failure
+from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.descriptions import describe_run, short_title
 from scvi_codegen.runtime.indexed_constraints import check_reachable, constraint_values, multipliers
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, read_state
+from scvi_codegen.runtime.indexed_interface import Numbers, read_state
 from scvi_codegen.runtime.indexed_maps import momentum_of
 from scvi_codegen.runtime.indexed_memory import RUN_FIELDS, STATE, IndexedSnapshot, aligned, constraint_memory
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
@@ -98,7 +99,7 @@ class IndexedRun(OneThread):
         )
 
     @property
-    def interface(self) -> IndexedInterface:
+    def interface(self) -> Interface:
         """Names and shapes of the integrator."""
         return self.problem.interface
 
@@ -127,7 +128,7 @@ class IndexedRun(OneThread):
             self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
         self._run.t, self._run.h, self._run.threads = t, h, self.threads
-        if self.interface.constraints:
+        if self.interface.layout.constraints:
             self._numbers |= constraint_memory(self._binding, self._run, self.problem.struct, n)
         for name in self._numbers:
             setattr(self._run, name, self._pointer(name))
@@ -163,9 +164,9 @@ class IndexedRun(OneThread):
     def _take(self, problem: IndexedProblem) -> None:
         """Set another problem of equal sizes; reused forces are discarded, an extrapolated predictor is kept."""
         former, self.problem = self.problem, problem
-        self._run.guess *= self.interface.continued
+        self._run.guess *= self.interface.layout.continued
         self._find_masses()
-        if self.interface.constraints:
+        if self.interface.layout.constraints:
             try:
                 check_reachable(self)
             except StateError:
@@ -249,7 +250,7 @@ class IndexedRun(OneThread):
         Raises:
             StateError: if the system is defined by a Hamiltonian.
         """
-        if self.interface.momenta:
+        if self.interface.layout.momenta:
             raise StateError("velocities are unavailable for a system defined by a Hamiltonian: use the momenta p")
         return self._arrays(self._numbers["p"] * self._numbers["inverse_mass"])
 
@@ -261,11 +262,11 @@ class IndexedRun(OneThread):
     @property
     def inverse_masses(self) -> dict[str, Numbers]:
         """Copies of 1/m of every coordinate by array name; empty for a Hamiltonian."""
-        return {} if self.interface.momenta else self._arrays(self._numbers["inverse_mass"])
+        return {} if self.interface.layout.momenta else self._arrays(self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
         found, start = {}, 0
-        for array in self.interface.coordinates:
+        for array in self.interface.layout.coordinates:
             shape = array.shape(self.sizes)
             size = int(np.prod(shape))
             found[array.name] = flat[start : start + size].reshape(shape).copy()
@@ -288,7 +289,7 @@ class IndexedRun(OneThread):
     def momentum_maps(self) -> Numbers:
         """(count,) conserved quantities (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`)."""
         q, p = self.q, self.p
-        return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.maps])
+        return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.layout.maps])
 
     @property
     @alone
@@ -342,7 +343,7 @@ class IndexedRun(OneThread):
     @classmethod
     def restored(
         cls,
-        interface: IndexedInterface,
+        interface: Interface,
         binding: Binding,
         saved: bytes,
         options: SolverOptions | None,

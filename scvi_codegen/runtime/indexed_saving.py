@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, RunArrays, read_arrays
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.indexed_interface import RunArrays, read_arrays
 from scvi_codegen.runtime.indexed_memory import RUN_FIELDS, STATE
 
 __all__ = ["damage_as_state_error", "read_saved", "restore_memory", "saved_arrays", "saved_bytes"]
@@ -33,11 +34,11 @@ COMPUTED = ("inverse_mass", "places", "columns")
 CHECKSUM = "checksum"
 
 
-def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInterface) -> bytes:
+def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: Interface) -> bytes:
     """Return the data and the arrays of a run as NumPy's format (.npz), with a checksum."""
     saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
     saved |= {f"field {name}": array for name, array in arrays.fields.items()}
-    saved |= {"integrator": interface.integrator, "parameters": arrays.numbers, **run}
+    saved |= {"integrator": _integrator(interface), "parameters": arrays.numbers, **run}
     found: dict[str, Any] = {name: np.asarray(array) for name, array in saved.items()}
     file = io.BytesIO()
     found[CHECKSUM] = _checksum(found)
@@ -45,7 +46,7 @@ def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: IndexedInt
     return file.getvalue()
 
 
-def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_time: bool) -> dict[str, NDArray[Any]]:
+def read_saved(saved: bytes, interface: Interface, *, to_a_time: bool) -> dict[str, NDArray[Any]]:
     """Return the arrays of :func:`saved_bytes`.
 
     Raises:
@@ -55,8 +56,8 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_time: bool) ->
         raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
     with damage_as_state_error():
         found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
-        if str(found["integrator"]) != interface.integrator:
-            raise StateError(f"the saved run is one of '{found['integrator']}', not of '{interface.integrator}'")
+        if str(found["integrator"]) != _integrator(interface):
+            raise StateError(f"the saved run is one of '{found['integrator']}', not of '{_integrator(interface)}'")
         if str(found.pop(CHECKSUM)) != _checksum(found):
             raise StateError("invalid saved run: the checksum differs. Save the run again")
         if bool(found["to a time"]) == to_a_time:
@@ -66,14 +67,14 @@ def read_saved(saved: bytes, interface: IndexedInterface, *, to_a_time: bool) ->
     )
 
 
-def saved_arrays(found: Mapping[str, NDArray[Any]], interface: IndexedInterface) -> RunArrays:
+def saved_arrays(found: Mapping[str, NDArray[Any]], interface: Interface) -> RunArrays:
     """Return the validated problem data of a saved run."""
     numbers = dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
     return read_arrays(
         interface,
-        {array.name: found[f"state {array.name}"] for array in interface.coordinates},
-        numbers | {field.name: found[f"field {field.name}"] for field in interface.fields},
-        {table.name: found[f"table {table.name}"] for table in interface.tables},
+        {array.name: found[f"state {array.name}"] for array in interface.layout.coordinates},
+        numbers | {field.name: found[f"field {field.name}"] for field in interface.layout.fields},
+        {table.name: found[f"table {table.name}"] for table in interface.layout.tables},
     )
 
 
@@ -123,3 +124,8 @@ def _checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
         found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
         found.update(array.tobytes() if array.dtype.kind == "U" else array.data)
     return found.hexdigest()
+
+
+def _integrator(interface: Interface) -> str:
+    """Return the identification of saved runs; runs of another solver have another memory layout."""
+    return f"{interface.title}, {interface.solver}"

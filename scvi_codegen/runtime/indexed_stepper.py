@@ -14,7 +14,7 @@ from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.building import TUNED_FLAGS, load
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.rendering.source import Source
+from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.thread_partition import MOST_THREADS
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.accuracy import FIXED_STEP_REMEDY, GROSS_ERROR, warn_of_energies, warn_of_large_steps
@@ -23,7 +23,7 @@ from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.global_error import checked_error, confirmed_run
 from scvi_codegen.runtime.indexed_constraints import consistent, project
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, Numbers, RunArrays, read_arrays
+from scvi_codegen.runtime.indexed_interface import Numbers, RunArrays, read_arrays
 from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
@@ -60,7 +60,7 @@ class IndexedStepper:
     def __init__(
         self,
         source: Source,
-        interface: IndexedInterface,
+        interface: Interface,
         *,
         controlled: Callable[[], Source | None] = no_source,
         flags: tuple[str, ...] = TUNED_FLAGS,
@@ -76,7 +76,7 @@ class IndexedStepper:
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
         """Names of the conserved quantities: translations and rotations of whole arrays."""
-        return tuple(each.name for each in self.interface.maps)
+        return tuple(each.name for each in self.interface.layout.maps)
 
     @cached_property
     def _binding(self) -> Binding:
@@ -135,14 +135,14 @@ class IndexedStepper:
             options=options,
             threads=self._threads(threads),
         )
-        if self.interface.constraints:
+        if self.interface.layout.constraints:
             consistent(run)
         return run
 
     def _threads(self, given: int | None) -> int:
         """Return the number of threads; systems with constraints use one."""
         threads = checked_count(1 if given is None else given, "threads", least=1, most=MOST_THREADS)
-        if threads > 1 and self.interface.constraints:
+        if threads > 1 and self.interface.layout.constraints:
             raise MethodError("systems with constraints use one thread: omit threads")
         return threads
 
@@ -162,7 +162,7 @@ class IndexedStepper:
             MethodError: if the system has no constraints.
             StateError: if the projection fails, or if the constraints are linearly dependent there.
         """
-        if not self.interface.constraints:
+        if not self.interface.layout.constraints:
             raise MethodError(f"'{self.interface.system}' has no constraints")
         arrays, moving = self._given(q, p, velocity, parameters, tables)
         problem = IndexedProblem(self.interface, self._binding, arrays)
@@ -172,7 +172,7 @@ class IndexedStepper:
 
     def _given(self, q: Any, p: Any, velocity: Any, parameters: Any, tables: Any) -> tuple[RunArrays, tuple[Any, str]]:
         """Return the validated arrays of a run, and its initial momenta or velocities with their kind."""
-        if velocity is not None and self.interface.momenta:
+        if velocity is not None and self.interface.layout.momenta:
             raise StateError("the system is defined by a Hamiltonian: give momenta p instead of velocity")
         if p is not None and velocity is not None:
             raise StateError("give either p or velocity, not both")
@@ -359,7 +359,5 @@ def _warn_of_energy_error(found: IndexedTrajectory) -> None:
         warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 
-def _rebuild(
-    source: Source, interface: IndexedInterface, controlled: Source | None, flags: tuple[str, ...]
-) -> IndexedStepper:
+def _rebuild(source: Source, interface: Interface, controlled: Source | None, flags: tuple[str, ...]) -> IndexedStepper:
     return IndexedStepper(source, interface, controlled=lambda: controlled, flags=flags)

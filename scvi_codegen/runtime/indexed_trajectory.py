@@ -258,7 +258,7 @@ class IndexedRecord:
     def trajectory(self) -> IndexedTrajectory:
         """Return the recorded trajectory."""
         run = self.run
-        names = [array.name for array in run.interface.coordinates]
+        names = list(run.interface.coordinates)
         return IndexedTrajectory(
             t=np.array(self.t),
             q={name: np.array([q[name] for q, _ in self.states]) for name in names},

@@ -49,7 +49,7 @@ def pendulums() -> sc.IndexedStepper:
 
 def start(stepper: sc.IndexedStepper, **given: Any) -> Any:
     """A run of either system."""
-    if stepper.interface.constraints:
+    if stepper.interface.layout.constraints:
         return stepper.start({"x": [0.6, 1.0], "y": [0.8, 0.0]}, **({"h": 0.05} | given))
     return stepper.start(Q, **({"h": 0.05, "tables": {"bonds": BONDS}, "parameters": {"k": K, "F_0": 0.5}} | given))
 

@@ -398,7 +398,7 @@ def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -
     texts = {
         "count": sizes["N"],
         "bonds": ", ".join(map(str, BONDS.reshape(-1))),
-        "sizes": ", ".join(str(sizes[size]) for size in interface.sizes),
+        "sizes": ", ".join(str(sizes[size]) for size in interface.layout.sizes),
     }
     (folder / "main.c").write_text(RACES.format(**texts, **numbers))
 

@@ -14,7 +14,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.indexed_interface import IndexedInterface, RunArrays, check_accesses
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.indexed_interface import RunArrays, check_accesses
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 
@@ -36,7 +37,7 @@ class SmallStart:
     p: dict[str, Numbers]
 
 
-def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
+def small_start(interface: Interface, given: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
     """Cut out a few indices where the arrays are largest, and table rows with the indices that occur in them.
 
     Raises:
@@ -46,7 +47,7 @@ def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, N
     for window, rows in CUT_SIZES:
         start = _cut(interface, given, p, _indices_to_keep(interface, given, p, window, rows))
         try:
-            check_accesses(interface, start.given.sizes, start.given.places)
+            check_accesses(interface.layout, start.given.sizes, start.given.places)
         except StateError:
             continue
         count = sum(values.size for values in start.given.state.values())
@@ -59,12 +60,12 @@ def small_start(interface: IndexedInterface, given: RunArrays, p: Mapping[str, N
 
 
 def _indices_to_keep(
-    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
+    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
 ) -> dict[str, NDArray[np.int64]]:
     """Return the indices to keep for each size."""
-    tables = {table.axes[0].name for table in interface.tables}
+    tables = {table.axes[0].name for table in interface.layout.tables}
     kept = {name: np.arange(min(given.sizes[name], rows)) for name in tables}
-    for name in interface.sizes:
+    for name in interface.layout.sizes:
         if name in kept:
             continue
         used = [given.places[table][kept[row], column] for table, row, column, of in _columns(interface) if of == name]
@@ -74,21 +75,21 @@ def _indices_to_keep(
     return kept
 
 
-def _columns(interface: IndexedInterface) -> Iterator[tuple[str, str, int, str]]:
+def _columns(interface: Interface) -> Iterator[tuple[str, str, int, str]]:
     """Yield table, row size and column of each table access, and the size that its indices refer to."""
-    rows = {table.name: table.axes[0].name for table in interface.tables}
-    for access, _ in interface.accesses:
+    rows = {table.name: table.axes[0].name for table in interface.layout.tables}
+    for access, _ in interface.layout.accesses:
         for place, axis in zip(access.places, access.array.axes, strict=True):
             if place.table and axis.name:
                 yield place.table, rows[place.table], place.column, axis.name
 
 
 def _around(
-    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], size: str, window: int
+    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], size: str, window: int
 ) -> NDArray[np.int64]:
     """Return consecutive indices around the maximum of the first array of that size."""
     length, centre = given.sizes[size], 0
-    for array in interface.coordinates:
+    for array in interface.layout.coordinates:
         axes = [k for k, axis in enumerate(array.axes) if axis.name == size]
         if axes:
             others = tuple(k for k in range(len(array.axes)) if k != axes[0])
@@ -99,32 +100,32 @@ def _around(
 
 
 def _cut(
-    interface: IndexedInterface, given: RunArrays, p: Mapping[str, Numbers], kept: Mapping[str, NDArray[np.int64]]
+    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], kept: Mapping[str, NDArray[np.int64]]
 ) -> SmallStart:
     def part(array: Array, values: Numbers) -> Numbers:
         return np.ascontiguousarray(
             values[np.ix_(*(kept[axis.name] if axis.name else np.arange(axis.number) for axis in array.axes))]
         )
 
-    places = {table.name: given.places[table.name][kept[table.axes[0].name]] for table in interface.tables}
+    places = {table.name: given.places[table.name][kept[table.axes[0].name]] for table in interface.layout.tables}
     for table, _, column, size in _columns(interface):
         old = given.places[table][kept[_row_size(interface, table)], column]
         new = np.minimum(np.searchsorted(kept[size], old), len(kept[size]) - 1)
         places[table][:, column] = np.where(kept[size][new] == old, new, old % len(kept[size]))
     return SmallStart(
         RunArrays(
-            sizes={name: len(kept[name]) for name in interface.sizes},
-            state={array.name: part(array, given.state[array.name]) for array in interface.coordinates},
+            sizes={name: len(kept[name]) for name in interface.layout.sizes},
+            state={array.name: part(array, given.state[array.name]) for array in interface.layout.coordinates},
             numbers=given.numbers,
-            fields={array.name: part(array, given.fields[array.name]) for array in interface.fields},
+            fields={array.name: part(array, given.fields[array.name]) for array in interface.layout.fields},
             places=places,
         ),
-        {array.name: part(array, p[array.name]) for array in interface.coordinates},
+        {array.name: part(array, p[array.name]) for array in interface.layout.coordinates},
     )
 
 
-def _row_size(interface: IndexedInterface, table: str) -> str:
-    return next(each.axes[0].name for each in interface.tables if each.name == table)
+def _row_size(interface: Interface, table: str) -> str:
+    return next(each.axes[0].name for each in interface.layout.tables if each.name == table)
 
 
 class SmallStepper:
@@ -215,7 +216,7 @@ class SmallStepper:
         given = self.defaults if parameters is None else parameters
         known = dict(given) if isinstance(given, Mapping) else dict(zip(names, given, strict=True))
         result: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
-        for array in self.stepper.interface.fields:
+        for array in self.stepper.interface.layout.fields:
             shape = array.shape(self.arrays.sizes)
             entries = ["_".join([array.name, *map(str, place)]) for place in np.ndindex(*shape)]
             result[array.name] = np.array([known[name] for name in entries]).reshape(shape)
