@@ -6,9 +6,11 @@ for any number of threads. C runs without the GIL.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -20,15 +22,24 @@ from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
-from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
+from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory, Span
 from scvi_codegen.runtime.global_error import GlobalError
 from scvi_codegen.runtime.inputs import Array, columns_of_inputs
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.observation import Observation
 from scvi_codegen.runtime.run_loop import record
+from scvi_codegen.runtime.runs_with_inputs import (
+    Input,
+    breakpoints_until,
+    first_inner_time,
+    inputs_of_slice,
+    parameters_at,
+    prepared_segments,
+)
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.workers import StopCheck, run_jobs
 from scvi_codegen.validation.counts import checked_count
 
@@ -71,6 +82,7 @@ class AdaptiveEnsemble:
         p: ArrayLike,
         *,
         t_end: ArrayLike,
+        inputs: Mapping[str, Input] | None = None,
         tolerance: float | None = None,
         save_every: int = 1,
         t: float = 0.0,
@@ -80,7 +92,7 @@ class AdaptiveEnsemble:
     ) -> None:
         if stepper.interface.energy_parameter:
             raise StateError("adaptive steps are unavailable in transformed time: give h and steps (fixed step in tau)")
-        self.stepper, self.options = stepper._adaptive(), checked_options(options)
+        self.stepper, self.options, self.inputs = stepper._adaptive(), checked_options(options), inputs or {}
         self.t0, self.save_every = checked_number(t, "the time t"), checked_count(save_every, "save_every", least=1)
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.plans = self._plans(t_end, tolerance)
@@ -90,6 +102,10 @@ class AdaptiveEnsemble:
                 raise StateError(f"give either t_eval or save_every={save_every}, not both")
             farthest = max((plan.t_end for plan in self.plans), key=lambda end: abs(end - self.t0))
             self.t_eval = times_of_run(t_eval, self.t0, farthest)
+        for plan in self.plans if inputs else ():
+            breakpoints_until(self.t0, plan.t_end, self.inputs)
+        if inputs:
+            self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
         self.saved: dict[int, SavedLane] = {}
         self.confirmations: list[GlobalError | None] = []
 
@@ -118,6 +134,7 @@ class AdaptiveEnsemble:
             "q": self.q[part],
             "p": self.p[part],
             "t_end": [plan.t_end for plan in self.plans[part]],
+            "inputs": inputs_of_slice(self.inputs, part) or None,
             "tolerance": self.plans[0].tolerance or None,
             "save_every": self.save_every,
             "t": self.t0,
@@ -152,9 +169,16 @@ class AdaptiveEnsemble:
 
     def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
         """Return the arguments ``parameters`` and ``inputs`` of a single run of trajectory j."""
-        of_inputs = set(columns_of_inputs(self.stepper.interface))
+        of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
         values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
-        return {"parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs}}
+        own = {
+            name: replace(each, pieces=each.pieces[:, j]) if each.pieces.ndim == 3 else each
+            for name, each in self.inputs.items()
+        }
+        return {
+            "parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs},
+            "inputs": own or None,
+        }
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all trajectories with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
@@ -179,7 +203,7 @@ class AdaptiveEnsemble:
                 self.p[j],
                 h=self.plans[j],
                 t=self.t0,
-                parameters=self._first_parameters(j),
+                parameters=self._values(j, first_inner_time(self.t0, self.plans[j].t_end)),
                 options=self.options,
             )
             found, status = self._states(j, run, check_stop)
@@ -187,20 +211,26 @@ class AdaptiveEnsemble:
             return SavedLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
         return SavedLane(found.t, found.q, found.p, status, run.steps)
 
-    def _first_parameters(self, j: int) -> Array:
-        """Return the initial parameters of trajectory j."""
-        found: Array = self.parameters[j]
+    def _values(self, j: int, t: float) -> Array:
+        """Return the parameters of trajectory j for the pieces of the inputs that contain t."""
+        found: Array = parameters_at(self.stepper.parameters, self.parameters, self.inputs, t, slice(j, j + 1))[0]
         return found
 
     def _states(self, j: int, run: Memory, check_stop: StopCheck) -> tuple[LaneStates, str]:
         """Return the saved states of trajectory j and its status."""
+        pieces: list[Trajectory] = []
         try:
-            if self.t_eval is None:
+            if self.t_eval is not None:
+                reached = np.abs(self.t_eval - self.t0) <= abs(self.plans[j].t_end - self.t0)
+                return Observation(run, times=self.t_eval[reached]).advance(None, check_stop), OK
+            if not self.inputs:
                 return record(run, None, save_every=self.save_every, progress=check_stop), OK
-            reached = np.abs(self.t_eval - self.t0) <= abs(self.plans[j].t_end - self.t0)
-            return Observation(run, times=self.t_eval[reached]).advance(None, check_stop), OK
+            segments = prepared_segments(run, self.inputs, self.plans[j].t_end, partial(self._values, j))
+            pieces.extend(record(run, steps, save_every=self.save_every, progress=check_stop) for steps in segments)
         except StepFailedError as failure:
-            return Trajectory.before(failure), failure.status
+            found = Trajectory.before(failure)
+            return DrivenTrajectory((*pieces, found)) if pieces else found, failure.status
+        return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; incomplete ones are ``"interrupted"`` after their initial state."""
@@ -225,7 +255,21 @@ class AdaptiveEnsemble:
             confirmations=tuple(self.confirmations),
             parameters=self.parameters,
             stepper=self.stepper,
+            spans=tuple(span for j in range(len(self)) for span in self._spans(j, times)),
         )
+
+    def _spans(self, j: int, times: Array | None) -> Iterator[Span]:
+        """Yield the rows of trajectory j in each piece of the inputs and their parameters."""
+        if times is None or not self.inputs:
+            return
+        t = times[:, j]
+        plan = self.plans[j].t_end
+        forward = -1.0 if plan < self.t0 else 1.0
+        ends = breakpoints_until(self.t0, plan, self.inputs) or [plan]
+        last = np.searchsorted(forward * t[np.isfinite(t)], forward * np.array(ends), side="right").tolist()
+        for (start, end), (first, until) in zip(pairwise([self.t0, *ends]), pairwise([0, *last]), strict=True):
+            values = partial(parameters_at, self.stepper.parameters, self.parameters, self.inputs, (start + end) / 2)
+            yield slice(first, until), slice(j, j + 1), values
 
     def _by_number(self, found: list[SavedLane]) -> tuple[Array, Array, list[slice]]:
         """Return row numbers, (n, k) times padded with NaN, and the rows of each trajectory."""

@@ -1,4 +1,6 @@
-"""Ensembles with fixed step size: trajectories are SIMD lanes, blocks of lanes run on all cores.
+"""Ensembles with common fixed steps: trajectories are SIMD lanes, blocks of lanes run on all cores.
+
+With inputs or a final time there are segments of equal steps between breakpoints, whose final states are saved.
 
 Blocks run in C without the GIL, so threads work in parallel. A lane whose step fails keeps its last good state and is
 continued by the single integrator (which falls back on Newton's iteration); if that fails too, its later states are NaN
@@ -8,9 +10,12 @@ and its status gives the reason. Other lanes are unaffected. Results are bitwise
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import suppress
+from functools import partial
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +27,19 @@ from scvi_codegen.native.arguments import checked_number, checked_step, empty_ar
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import SolverOptions, checked_options
 from scvi_codegen.runtime.ensemble_states import EnsembleParameters, start_of_ensemble
-from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory
-from scvi_codegen.runtime.inputs import Array, parameter_index
+from scvi_codegen.runtime.ensemble_trajectory import INTERRUPTED, OK, EnsembleTrajectory, Span
+from scvi_codegen.runtime.inputs import Array, columns_of_inputs, parameter_index
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.memory import Memory
 from scvi_codegen.runtime.run_loop import drive, record
+from scvi_codegen.runtime.runs_with_inputs import (
+    Input,
+    Segment,
+    inputs_of_slice,
+    parameters_at,
+    planned_segments,
+    time_after_steps,
+)
 from scvi_codegen.runtime.times import times_after
 from scvi_codegen.runtime.trajectory import Trajectory
 from scvi_codegen.runtime.workers import MOST_JOBS, PROGRESS_SECONDS, workers_of
@@ -68,7 +81,17 @@ class StepChunk(NamedTuple):
 
 
 class Ensemble:
-    """Ensemble integration: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``."""
+    """Ensemble integration: arrays that blocks of trajectories fill; arguments as of ``integrate_ensemble``.
+
+    Args:
+        steps, t_end: number of steps, or final time, with a shorter step before each breakpoint and at the end.
+        inputs: validated inputs, with ``t_end``.
+
+    Attributes:
+        segments: segments of equal steps.
+        ends: number of steps up to the end of each segment.
+        numbers: step numbers of the saved states.
+    """
 
     def __init__(
         self,
@@ -77,29 +100,38 @@ class Ensemble:
         p: ArrayLike,
         *,
         h: float,
-        steps: int,
+        steps: int | None = None,
+        t_end: float | None = None,
+        inputs: Mapping[str, Input] | None = None,
         save_every: int = 1,
         t: float = 0.0,
         parameters: EnsembleParameters = None,
         options: SolverOptions | None = None,
     ) -> None:
-        self.stepper, self.options = stepper, checked_options(options)
+        self.stepper, self.options, self.inputs, self.t_end = stepper, checked_options(options), inputs or {}, t_end
         self.h, self.t0 = checked_step(h), checked_number(t, "the time t")
-        self.steps = checked_count(steps, "steps", least=0)
-        self.save_every = checked_count(save_every, "save_every", least=1)
+        count = 0 if t_end is not None else checked_count(steps, "steps", least=0)
+        self.segments = [Segment(count, self.h, (self.t0, 0.0), self.t0)]
+        if t_end is not None:
+            self.segments = planned_segments(self.t0, t_end, self.h, self.inputs) or self.segments
+        self.ends = list(accumulate(segment.steps for segment in self.segments))
+        self.steps, self.save_every = self.ends[-1], checked_count(save_every, "save_every", least=1)
+        multiples = np.arange(0, self.steps + 1, self.save_every)
+        self.numbers = multiples if t_end is None else np.union1d(multiples, self.ends)
         start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
         self.count = len(start_q)
         if not stepper._has_energy(parameters):
             for j in range(self.count):
                 level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
                 self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
-        saved_count = self.row(self.steps)
-        self.q, self.p = (empty_array((saved_count, self.count, stepper.dimension)) for _ in "qp")
+        if self.inputs:
+            self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
+        self.q, self.p = (empty_array((len(self.numbers), self.count, stepper.dimension)) for _ in "qp")
         self.q[:] = self.p[:] = np.nan
         self.q[0], self.p[0] = start_q, start_p
         self.times = None
         if stepper.interface.energy_parameter:
-            self.times = np.full((saved_count, self.count), np.nan)
+            self.times = np.full((len(self.numbers), self.count), np.nan)
             self.times[0] = self.t0
         self.status = np.full(self.count, OK, dtype="<U32")
         self.done = np.zeros(self.count, dtype=np.int64)
@@ -114,34 +146,60 @@ class Ensemble:
 
     def row(self, step: int) -> int:
         """Return the index of the first saved state after ``step`` steps."""
-        return step // self.save_every + 1
+        return int(self.numbers.searchsorted(step, side="right"))
 
     def step_chunks(self, begin: int, size: int) -> Iterator[StepChunk]:
-        """Yield the chunks that advance from step ``begin`` by ``size`` steps."""
-        yield StepChunk(size, self.save_every)
+        """Split steps at breakpoints; the last step of a segment is separate if the output stride skips its state."""
+        end, step = begin + size, begin
+        while step < end:
+            k = bisect_right(self.ends, step)
+            last, entering = self.ends[k], self.t_end is not None and step == self._first(k)
+            odd = self.t_end is not None and last % self.save_every != 0
+            until = min(end, last - 1 if odd and step < last - 1 else last)
+            save_every = last if odd and until == last else self.save_every
+            yield StepChunk(until - step, save_every, self._change(self.segments[k]) if entering else None)
+            step = until
 
     def step_data(self, step: int, j: int) -> tuple[float, tuple[float, float], Array]:
         """Return h, the time and the parameters of trajectory j after ``step`` steps."""
-        high, low = times_after(self.t0, self.h, step)
-        return self.h, (float(high), float(low)), self.parameters[j]
+        k = min(bisect_right(self.ends, step), len(self.ends) - 1)
+        segment = self.segments[k]
+        now = time_after_steps(segment.start, segment.h, step - self._first(k))
+        return segment.h, now, self._change(segment).parameters(slice(j, j + 1))[0]
+
+    def _first(self, k: int) -> int:
+        """Return the number of steps before segment k."""
+        return self.ends[k] - self.segments[k].steps
+
+    def _change(self, segment: Segment) -> Change:
+        return Change(
+            segment.h, partial(parameters_at, self.stepper.parameters, self.parameters, self.inputs, segment.middle)
+        )
 
     def saved_times(self) -> Array:
-        """Return the (n,) times of the saved states."""
-        number = self.save_every * np.arange(len(self.q), dtype=np.float64)
-        return times_after(self.t0 if self.times is None else 0.0, self.h, number)[0]
+        """Return the (n,) times of the saved states; tau from 0 in transformed time."""
+        found, first = np.empty(len(self.numbers)), 0
+        for k, segment in enumerate(self.segments):
+            rows = slice(first, self.row(self.ends[k]))
+            (start, low), first = segment.start if self.times is None else (0.0, 0.0), rows.stop
+            high, rest = times_after(start, segment.h, self.numbers[rows] - self._first(k))
+            found[rows] = high + (rest + low)
+        return found
 
     def part(self, part: slice) -> dict[str, object]:
         """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
-        return {
+        found: dict[str, object] = {
             "q": self.q[0, part],
             "p": self.p[0, part],
             "h": self.h,
-            "steps": self.steps,
             "save_every": self.save_every,
             "t": self.t0,
             "parameters": self.parameters[part],
             "options": self.options,
         }
+        if self.t_end is None:
+            return found | {"steps": self.steps}
+        return found | {"t_end": self.t_end, "inputs": inputs_of_slice(self.inputs, part)}
 
     def keep(self, part: slice, found: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
@@ -220,7 +278,15 @@ class Ensemble:
             h=self.h,
             parameters=self.parameters,
             stepper=self.stepper,
+            spans=() if self.t_end is None else tuple(self._spans()),
         )
+
+    def _spans(self) -> Iterator[Span]:
+        """Yield the saved states of each segment with its parameters; a breakpoint belongs to the earlier segment."""
+        first = 0
+        for end, segment in zip(self.ends, self.segments, strict=True):
+            yield slice(first, self.row(end)), slice(None), self._change(segment).parameters
+            first = self.row(end)
 
 
 class LaneBlock:

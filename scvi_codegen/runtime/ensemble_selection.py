@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.arguments import checked_number, real_array
 from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
-from scvi_codegen.runtime.adaptive_ensemble_with_inputs import AdaptiveEnsembleWithInputs
 from scvi_codegen.runtime.ensemble import Ensemble
 from scvi_codegen.runtime.ensemble_states import (
     EnsembleParameters,
@@ -20,7 +19,6 @@ from scvi_codegen.runtime.ensemble_states import (
     momenta_of_each,
     parameters_of_each,
 )
-from scvi_codegen.runtime.ensemble_with_inputs import EnsembleWithInputs
 from scvi_codegen.runtime.inputs import Array, check_left_to_inputs
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.runs_with_inputs import Input, checked_inputs, final_time, first_inner_time, parameters_at
@@ -93,28 +91,28 @@ def _work_with_inputs(
     t: float,
     parameters: EnsembleParameters,
     **others: Any,
-) -> EnsembleWithInputs | AdaptiveEnsembleWithInputs:
+) -> Ensemble | AdaptiveEnsemble:
     """Return an ensemble with inputs; arguments as of :meth:`Stepper.integrate_ensemble`.
 
     Raises:
         StateError: as :func:`~scvi_codegen.runtime.runs_with_inputs.checked_inputs`, and if the stepper has a time
             transformation.
     """
-    make: partial[EnsembleWithInputs] | partial[AdaptiveEnsembleWithInputs]
+    make: partial[Ensemble] | partial[AdaptiveEnsemble]
     if h is not None:
         if tolerance is not None:
             raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
         if t_end is not None and np.ndim(t_end):
             raise StateError("with h all trajectories have one t_end: give one number, or omit h (adaptive step size)")
         towards = final_time(t, h, steps, None if t_end is None else checked_number(t_end, "t_end"))
-        make = partial(EnsembleWithInputs, h=h, t_end=towards)
+        make = partial(Ensemble, h=h, t_end=towards)
     elif t_end is None or steps is not None:
         raise StateError("give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)")
     else:
         towards = float(real_array(t_end, "t_end").flat[0])
-        make = partial(AdaptiveEnsembleWithInputs, t_end=t_end, tolerance=tolerance)
+        make = partial(AdaptiveEnsemble, t_end=t_end, tolerance=tolerance)
     data, p, start = _start_with_inputs(stepper, q, p, velocity, inputs, (t, towards), parameters)
-    return make(stepper, q, p, data, t=t, parameters=start, **others)
+    return make(stepper, q, p, inputs=data, t=t, parameters=start, **others)
 
 
 def _start_with_inputs(
