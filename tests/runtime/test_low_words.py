@@ -46,6 +46,14 @@ def hamiltonian() -> sc.HamiltonianSystem:
     )
 
 
+def coupled_hamiltonian() -> sc.HamiltonianSystem:
+    """Velocities depend on several momenta; their coupling does not move the centre of mass."""
+    text = "p**2/4 + r**2/2 + s**2 + (p/2 - r)**4/6 + (x - y)**2 + (y - z)**4/4 - cos(z - x + t)/3"
+    return sc.HamiltonianSystem.from_text(
+        name="coupled momenta", coordinates=COORDINATES, momenta=["p", "r", "s"], hamiltonian=text
+    )
+
+
 def rod() -> sc.LagrangianSystem:
     """Two bodies on a rod, and a third: the lengths along x alone are compared."""
     return sc.LagrangianSystem.from_text(
@@ -74,6 +82,7 @@ CASES: dict[str, tuple[Any, Any, str]] = {
     "gauss": (bodies, "gauss:3", "fixed-point"),
     "gauss of a Hamiltonian": (hamiltonian, "gauss:3", "fixed-point"),
     "composition": (bodies, {"method": "composition", "order": 8}, "auto"),
+    "composition of a Hamiltonian": (coupled_hamiltonian, {"method": "composition", "order": 8}, "auto"),
     "leapfrog": (bodies, "stoermer-verlet", "explicit"),
     "rattle": (rod, RATTLE, "auto"),
     "lobatto": (rod, {"method": "svi", "degree": 3, "quadrature": "gauss-lobatto:4"}, "auto"),
@@ -150,7 +159,7 @@ def test_sums_of_high_and_low_words_are_exact(name: str) -> None:
             saved = own.run.checkpoint()
             own.run = own.stepper.from_checkpoint(saved)
     assert own.time() == Fraction(1 / 3) + STEPS * Fraction(H)
-    assert worst[0] < 1e-17
+    assert worst[0] < (1e-16 if name == "composition of a Hamiltonian" else 1e-17)  # roundings of forces of 17 stages
     assert worst[1] < (1e-16 if "composition" in name else 1e-17)  # whose coefficients have 53 bits
 
 
@@ -273,7 +282,7 @@ def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
     ends = []
     for whole in (False, True):
         own = Begun(name)
-        long = [np.cos(np.arange(len(x))) / 1024 for x in (own.q, own.p)]
+        long = [np.cos(np.arange(len(x)) + k) / 1024 for k, x in enumerate((own.q, own.p))]  # of q others than of p
         q, p = (x + part if whole else x for x, part in zip((own.q, own.p), long, strict=True))
         extra = {"parameters": {"m": np.array(MASSES)}} if own.array else {}
         own.run = own.stepper.start(q, p, h=1 / 16, **extra)

@@ -1,0 +1,84 @@
+"""Files of NumPy arrays (.npz): every kind of result with all that describes it, where nothing is a default."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+
+PARAMETERS = {"m": 1.0, "k": 1.0}
+GIVEN: dict[str, Any] = {"h": 0.05, "steps": 12, "t": 0.7, "save_every": 3}
+Result = tuple[Any, dict[str, Any]]
+
+
+def pushed() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="pushed",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + u*x",
+        parameters=PARAMETERS,
+        inputs=["u"],
+    )
+
+
+def free() -> sc.LagrangianSystem:
+    return sc.LagrangianSystem.from_text(
+        name="free",
+        coordinates=["x", "y"],
+        lagrangian="m*(x_dot**2 + 2*y_dot**2)/2 - k*(x**2 + x*y**3)/2 + x*cos(t)",
+        parameters=PARAMETERS,
+    )
+
+
+def described(found: Any, *names: str) -> Result:
+    """Return the result, and its attributes and the description of its system by the names in a file."""
+    stepper = found.stepper
+    words = {"coordinates": ["x", "y"], "title": stepper.title, "parameter_names": [*PARAMETERS]}
+    if "iterations" in names:
+        interface = stepper.interface
+        words |= {"system": interface.system, "method": interface.method, "version": sc.__version__}
+    return found, words | {name: getattr(found, name) for name in names}
+
+
+def trajectory() -> Result:
+    stepper = sc.compile_stepper(free(), "svi:3")
+    found = stepper.integrate([0.3, 0.2], [0.1, -0.4], parameters={"m": 1.3, "k": 0.8}, **GIVEN)
+    return described(found, "t", "q", "p", "h", "iterations", "parameters")
+
+
+def ensemble() -> Result:
+    stepper = sc.compile_stepper(free(), "svi:3")
+    start = np.array([[0.3, 0.2], [0.1, 0.5]])
+    found = stepper.integrate_ensemble(start, start[::-1], parameters={"k": [0.8, 1.4], "m": 1.3}, **GIVEN)
+    return described(found, "t", "q", "p", "h", "status", "steps", "parameters")
+
+
+def ensemble_to_ends() -> Result:
+    stepper = sc.compile_stepper(free(), "svi:3")
+    start = np.array([[0.3, 0.2], [0.1, 0.5]])
+    found = stepper.integrate_ensemble(start, start[::-1], t=0.7, t_end=[2.0, 3.1], tolerance=1e-6)
+    return described(found, "t", "q", "p", "h", "status", "steps", "parameters", "times")
+
+
+def driven() -> Result:
+    stepper = sc.compile_stepper(pushed(), "svi:3")
+    table = (np.array([0.0, 1.0, 4.0]), np.array([0.5, -0.2, 0.1]))
+    given = GIVEN | {"inputs": {"u": table}, "parameters": {"m": 1.3, "k": 0.8}}
+    found = stepper.integrate([0.3, 0.2], [0.1, -0.4], **given)
+    return described(found, "t", "q", "p", "h", "iterations")
+
+
+@pytest.mark.parametrize("made", [trajectory, ensemble, ensemble_to_ends, driven], ids=lambda made: made.__name__)
+def test_files_contain_the_result_and_its_description(made: Callable[[], Result], tmp_path: Path) -> None:
+    result, expected = made()
+    result.save(tmp_path / "result.npz")
+    with np.load(tmp_path / "result.npz") as file:
+        for name, value in expected.items():
+            values = list(value.values()) if isinstance(value, dict) else value
+            assert np.array_equal(file[name], values, equal_nan=np.asarray(values).dtype.kind == "f"), name
+        assert {*file} - {*expected} <= {"parameters"}  # of a run with inputs the last values of the inputs, too

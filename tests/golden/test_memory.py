@@ -1,0 +1,49 @@
+"""Memory of generated C: every array has exactly the documented length, and the sanitizers report no error."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from golden_cells import CELLS, program
+from programs import needs
+
+SANITIZED = ("gcc", "-std=gnu99", "-O0", "-g", "-w", "-DSCVI_THREADS", "-pthread", "-fsanitize=address,undefined")
+QUICK = ("swings", "forms_adaptive", "ring_newton", "double_tangent")
+"""Constraints, several arrays of different sizes, the Fourier preconditioner, derivatives."""
+
+
+def with_exact_arrays(main: str) -> str:
+    """Return the program with an allocation of its own for every array of a run."""
+    work = re.search(r"run\.q = x \+ (\w+) \* n,", main)
+    if work is None:
+        return main
+    for pattern, new in (
+        (r"double \*x = .*;", f"double *x;\n  posix_memalign((void **)&x, 64, sizeof(double) * {work[1]} * n);"),
+        (r"memset\(x, 0, .*;", f"memset(x, 0, sizeof(double) * {work[1]} * n);"),
+        (r"run\.q = x .*;", " ".join(f"run.{name} = calloc(n, 8);" for name in ("q", "p", "carry_q", "carry_p"))),
+        (r"run\.inverse_mass = .*;", "run.inverse_mass = calloc(n, 8);"),
+    ):
+        main, count = re.subn(pattern, new, main)
+        assert count == 1, pattern
+    return main
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.full) for name in CELLS]
+)
+def test_runs_read_and_write_only_their_own_memory(name: str, tmp_path: Path) -> None:
+    needs(SANITIZED[0])
+    made = program(name)
+    for path, text in (made.files | {"main.c": with_exact_arrays(made.main)}).items():
+        (tmp_path / path).write_text(text)
+    command = [*SANITIZED, "-fno-sanitize-recover=all", f"{made.prefix}.c", "main.c", "-lm", "-o", "main"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if built.returncode:
+        pytest.skip(f"no sanitizers: {built.stderr[-200:]}")
+    options = os.environ | {"ASAN_OPTIONS": "detect_leaks=0"}
+    done = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=False, env=options)
+    assert done.returncode == 0, done.stderr[:1000]
