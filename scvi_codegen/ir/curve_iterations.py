@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationTable, PredictorTables, StoredValues
+from scvi_codegen.ir.iteration import FixedPointIteration, PredictorTables, StoredValues, printed
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
@@ -26,10 +26,10 @@ class NodeTables:
     """
 
     count: int
-    abscissae: tuple[Number, ...]
-    collocation: NumberTable
-    end: tuple[Number, ...]
-    mask: tuple[Number, ...]
+    abscissae: tuple[Number, ...] = field(metadata=printed("NODE_TIME"))
+    collocation: NumberTable = field(metadata=printed("COLLOCATION"))
+    end: tuple[Number, ...] = field(metadata=printed("NODE_END"))
+    mask: tuple[Number, ...] = field(metadata=printed("NODE_MASK"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,9 +42,9 @@ class PointTables:
         action: L_q and L_v at (q, v, t).
     """
 
-    abscissae: tuple[Number, ...]
-    position: NumberTable
-    velocity: NumberTable
+    abscissae: tuple[Number, ...] = field(metadata=printed("POINT_TIME"))
+    position: NumberTable = field(metadata=printed("POINT_POSITION"))
+    velocity: NumberTable = field(metadata=printed("POINT_VELOCITY"))
     action: Kernel
 
 
@@ -75,25 +75,6 @@ class CurveIteration(FixedPointIteration):
         return (self.kernel, self.points.action) if self.points else (self.kernel,)
 
     @property
-    def tables(self) -> Iterator[IterationTable]:
-        """Tables of nodes and points, further ones, and the predictor."""
-        yield IterationTable("NODE_TIME", self.nodes.abscissae)
-        yield IterationTable("COLLOCATION", self.nodes.collocation)
-        yield IterationTable("NODE_END", self.nodes.end)
-        yield IterationTable("NODE_MASK", self.nodes.mask)
-        if self.points:
-            yield IterationTable("POINT_TIME", self.points.abscissae)
-            yield IterationTable("POINT_POSITION", self.points.position)
-            yield IterationTable("POINT_VELOCITY", self.points.velocity)
-        yield from self.further_tables
-        yield from self.guess.tables
-
-    @property
-    def further_tables(self) -> tuple[IterationTable, ...]:
-        """Tables of one kind of iteration only."""
-        return ()
-
-    @property
     def facts(self) -> Mapping[str, int]:
         """Number of nodes, as a macro."""
         return {"NODES": self.nodes.count}
@@ -117,22 +98,11 @@ class ShootingIteration(CurveIteration):
         weights: (lanes,) w; consistency: (lanes,) l^T w.
     """
 
-    collocation_transposed: NumberTable
-    position_transposed: NumberTable
-    velocity_transposed: NumberTable
-    weights: tuple[Number, ...]
-    consistency: tuple[Number, ...]
-
-    @property
-    def further_tables(self) -> tuple[IterationTable, ...]:
-        """Adjoint tables."""
-        return (
-            IterationTable("COLLOCATION_T", self.collocation_transposed),
-            IterationTable("POINT_POSITION_T", self.position_transposed),
-            IterationTable("POINT_VELOCITY_T", self.velocity_transposed),
-            IterationTable("POINT_WEIGHT", self.weights),
-            IterationTable("NODE_CONSISTENCY", self.consistency),
-        )
+    collocation_transposed: NumberTable = field(metadata=printed("COLLOCATION_T"))
+    position_transposed: NumberTable = field(metadata=printed("POINT_POSITION_T"))
+    velocity_transposed: NumberTable = field(metadata=printed("POINT_VELOCITY_T"))
+    weights: tuple[Number, ...] = field(metadata=printed("POINT_WEIGHT"))
+    consistency: tuple[Number, ...] = field(metadata=printed("NODE_CONSISTENCY"))
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -155,10 +125,10 @@ class PrintedEnds:
         end_force, end_momentum: w (l_0 + l_s) and w (l_0' + l_s').
     """
 
-    start_force: tuple[Number, ...]
-    start_momentum: tuple[Number, ...]
-    end_force: tuple[Number, ...]
-    end_momentum: tuple[Number, ...]
+    start_force: tuple[Number, ...] = field(metadata=printed("START_FORCE"))
+    start_momentum: tuple[Number, ...] = field(metadata=printed("START_MOMENTUM"))
+    end_force: tuple[Number, ...] = field(metadata=printed("END_FORCE"))
+    end_momentum: tuple[Number, ...] = field(metadata=printed("END_MOMENTUM"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,18 +148,6 @@ class CollocationIteration(CurveIteration):
 
     ends: PrintedEnds | None
     hamiltonian: bool
-
-    @property
-    def further_tables(self) -> tuple[IterationTable, ...]:
-        """Contributions of the points to the momenta at the ends."""
-        if not self.ends:
-            return ()
-        return (
-            IterationTable("START_FORCE", self.ends.start_force),
-            IterationTable("START_MOMENTUM", self.ends.start_momentum),
-            IterationTable("END_FORCE", self.ends.end_force),
-            IterationTable("END_MOMENTUM", self.ends.end_momentum),
-        )
 
     @property
     def facts(self) -> Mapping[str, int]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum, auto
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
-__all__ = ["FixedPointIteration", "IterationTable", "PredictorTables", "StoredValues", "transposed"]
+__all__ = ["FixedPointIteration", "IterationTable", "PredictorTables", "StoredValues", "printed", "transposed"]
 
 
 class StoredValues(Enum):
@@ -36,6 +36,11 @@ class IterationTable:
         return isinstance(self.numbers[0], tuple)
 
 
+def printed(name: str, *, in_two_parts: bool = False) -> Mapping[str, Any]:
+    """Return the metadata of a field that is printed as a table of this name in C."""
+    return {"name": name, "in_two_parts": in_two_parts}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictorTables:
     """(lanes, lanes) predictor tables for values at the points: ``last_alone``, or ``last`` and ``before``.
@@ -50,16 +55,9 @@ class PredictorTables:
     degree: int
     highest: tuple[Number, ...]
     next: tuple[Number, ...]
-    last_alone: NumberTable
-    last: NumberTable
-    before: NumberTable
-
-    @property
-    def tables(self) -> Iterator[IterationTable]:
-        """Tables by their names in C."""
-        yield IterationTable("LAST_ALONE", self.last_alone)
-        yield IterationTable("LAST", self.last)
-        yield IterationTable("BEFORE", self.before)
+    last_alone: NumberTable = field(metadata=printed("LAST_ALONE"))
+    last: NumberTable = field(metadata=printed("LAST"))
+    before: NumberTable = field(metadata=printed("BEFORE"))
 
 
 class FixedPointIteration(ABC):
@@ -89,9 +87,10 @@ class FixedPointIteration(ABC):
         """Kernels that are evaluated on SIMD lanes."""
 
     @property
-    @abstractmethod
     def tables(self) -> Iterator[IterationTable]:
-        """All tables, in the order in which they are printed."""
+        """All tables, in the order in which they are printed: those of the predictor last."""
+        yield from _tables(self)
+        yield from _tables(self.guess)
 
     @property
     @abstractmethod
@@ -167,3 +166,13 @@ def transposed(table: NumberTable, points: int) -> NumberTable:
     padding = (0,) * (len(table) - points)
     columns = tuple(zip(*table[:points], strict=True))[:points]
     return (*((*column, *padding) for column in columns), *((0,) * len(table) for _ in padding))
+
+
+def _tables(data: Any) -> Iterator[IterationTable]:
+    """Yield the nonempty tables among the fields of data, and of groups of tables in them."""
+    for each in fields(data):
+        value = getattr(data, each.name)
+        if each.metadata and value:
+            yield IterationTable(numbers=value, **each.metadata)
+        elif is_dataclass(value) and each.name != "guess":
+            yield from _tables(value)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationTable, PredictorTables, StoredValues, transposed
+from scvi_codegen.ir.iteration import (
+    FixedPointIteration,
+    IterationTable,
+    PredictorTables,
+    StoredValues,
+    printed,
+    transposed,
+)
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 
@@ -42,15 +49,15 @@ class SeparableIteration(FixedPointIteration):
 
     points: int
     lanes: int
-    abscissae: tuple[Number, ...]
-    drift: tuple[Number, ...]
-    product: NumberTable
-    end_position: tuple[Number, ...]
-    end_momentum: tuple[Number, ...]
+    abscissae: tuple[Number, ...] = field(metadata=printed("ABSCISSA"))
+    drift: tuple[Number, ...] = field(metadata=printed("DRIFT", in_two_parts=True))
+    product: NumberTable = field(metadata=printed("PRODUCT", in_two_parts=True))
+    end_position: tuple[Number, ...] = field(metadata=printed("POINT_END_POSITION", in_two_parts=True))
+    end_momentum: tuple[Number, ...] = field(metadata=printed("POINT_END_MOMENTUM", in_two_parts=True))
     guess: PredictorTables
     force: Kernel
     mass: Kernel
-    velocity: NumberTable = ()
+    velocity: NumberTable = field(default=(), metadata=printed("VELOCITY"))
 
     mass_entries: tuple[tuple[int, int], ...] = ()
 
@@ -62,18 +69,6 @@ class SeparableIteration(FixedPointIteration):
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels that are evaluated on SIMD lanes."""
         return (self.force,)
-
-    @property
-    def tables(self) -> Iterator[IterationTable]:
-        """Tables, most of them double-double."""
-        yield IterationTable("ABSCISSA", self.abscissae)
-        yield IterationTable("DRIFT", self.drift, in_two_parts=True)
-        yield IterationTable("PRODUCT", self.product, in_two_parts=True)
-        yield IterationTable("POINT_END_POSITION", self.end_position, in_two_parts=True)
-        yield IterationTable("POINT_END_MOMENTUM", self.end_momentum, in_two_parts=True)
-        if self.velocity:
-            yield IterationTable("VELOCITY", self.velocity)
-        yield from self.guess.tables
 
     @property
     def derivatives_part(self) -> str:
@@ -135,13 +130,13 @@ class PointIteration(FixedPointIteration):
 
     points: int
     lanes: int
-    abscissae: tuple[Number, ...]
-    position: NumberTable
-    position_weights: tuple[Number, ...]
-    momentum: NumberTable
-    momentum_weights: tuple[Number, ...]
-    end_position: tuple[Number, ...]
-    end_momentum: tuple[Number, ...]
+    abscissae: tuple[Number, ...] = field(metadata=printed("ABSCISSA"))
+    position: NumberTable = field(metadata=printed("POSITION"))
+    position_weights: tuple[Number, ...] = field(metadata=printed("POSITION_WEIGHT"))
+    momentum: NumberTable = field(metadata=printed("MOMENTUM"))
+    momentum_weights: tuple[Number, ...] = field(metadata=printed("MOMENTUM_WEIGHT"))
+    end_position: tuple[Number, ...] = field(metadata=printed("POINT_END_POSITION"))
+    end_momentum: tuple[Number, ...] = field(metadata=printed("POINT_END_MOMENTUM"))
     guess: PredictorTables
     kernel: Kernel
     force: Kernel
@@ -153,24 +148,6 @@ class PointIteration(FixedPointIteration):
     def kernels(self) -> tuple[Kernel, ...]:
         """Kernels that are evaluated on SIMD lanes."""
         return (self.kernel, self.force, *((self.integrands,) if self.integrands else ()))
-
-    @property
-    def tables(self) -> Iterator[IterationTable]:
-        """Tables of positions and momenta, further ones, and the predictor."""
-        yield IterationTable("ABSCISSA", self.abscissae)
-        yield IterationTable("POSITION", self.position)
-        yield IterationTable("POSITION_WEIGHT", self.position_weights)
-        yield IterationTable("MOMENTUM", self.momentum)
-        yield IterationTable("MOMENTUM_WEIGHT", self.momentum_weights)
-        yield IterationTable("POINT_END_POSITION", self.end_position)
-        yield IterationTable("POINT_END_MOMENTUM", self.end_momentum)
-        yield from self.further_tables
-        yield from self.guess.tables
-
-    @property
-    def further_tables(self) -> tuple[IterationTable, ...]:
-        """Tables of one kind of iteration only."""
-        return ()
 
     @property
     def uses_time(self) -> bool:
@@ -199,8 +176,8 @@ class CoupledIteration(PointIteration):
     """
 
     blocks: int
-    velocity: NumberTable
-    projection: NumberTable
+    velocity: NumberTable = field(metadata=printed("VELOCITY"))
+    projection: NumberTable = field(metadata=printed("PROJECTION"))
     mass_entries: tuple[tuple[int, int], ...]
     followed: bool = False
     damping: Kernel | None = None
@@ -225,12 +202,6 @@ class CoupledIteration(PointIteration):
     def projected(self) -> bool:
         """True if the unknowns are not the velocities at the points."""
         return bool(self.velocity)
-
-    @property
-    def further_tables(self) -> tuple[IterationTable, ...]:
-        """Tables between the unknowns and the velocities at the points, if they differ."""
-        tables = (IterationTable("VELOCITY", self.velocity), IterationTable("PROJECTION", self.projection))
-        return tables if self.projected else ()
 
     @property
     def facts(self) -> Mapping[str, int]:
