@@ -339,13 +339,13 @@ def test_last_step_of_an_event_run_is_not_changed(galaxy):
     ids=["fixed", "adaptive", "coarse", "sparse", "ended by an event"],
 )
 def test_megno_is_the_trapezoidal_sum_over_steps_of_any_size(galaxy, given):
-    """The sums are formed from the lengths at all steps and their times, from t = 2.5."""
+    """The sums are formed from the logarithms of norms after all steps and their times, from t = 2.5."""
     run = galaxy.integrate(*CHAOTIC, t=2.5, **given)
     found = run.chaos_indicators(2)
     assert_array_equal(found.t, run.t)
     whole = galaxy.integrate(*CHAOTIC, t=2.5, **(given | {"save_every": 1})).chaos_indicators(2)
     times = whole.t[:, np.newaxis] - 2.5
-    moments = np.cumsum((times[1:] + times[:-1]) / 2 * np.diff(whole.lengths, axis=0), axis=0)
+    moments = np.cumsum((times[1:] + times[:-1]) / 2 * np.diff(whole.log_norms, axis=0), axis=0)
     rates = np.concatenate([np.zeros((1, 2)), 2 * moments / times[1:]])
     means = np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times, axis=0), axis=0) / times[1:]
     here = np.searchsorted(whole.t, found.t[1:])
