@@ -92,7 +92,7 @@ _HOMES = {
     "models.fmu": ("generate_fmu",),
     "models.model": ("Model",),
     "models.indexed_model": ("IndexedModel",),
-    "models.model_file": ("load_indexed_model", "load_model", "save_model"),
+    "models.model_file": ("load_model", "save_model"),
     "advice.solve_ivp": ("OdeResult", "solve_ivp"),
     "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),
     "models.package": ("generate_package", "load_package"),
@@ -124,7 +124,6 @@ _HOMES = {
     "mechanics.lagrangian": ("LagrangianSystem",),
     "runtime.trajectory": ("Trajectory",),
     "verification": ("Certificate", "verify"),
-    "verification.indexed": ("verify_indexed",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -78,7 +78,6 @@ from scvi_codegen.methods import as_method as as_method
 from scvi_codegen.models.fmu import generate_fmu as generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel as IndexedModel
 from scvi_codegen.models.model import Model as Model
-from scvi_codegen.models.model_file import load_indexed_model as load_indexed_model
 from scvi_codegen.models.model_file import load_model as load_model
 from scvi_codegen.models.model_file import save_model as save_model
 from scvi_codegen.models.package import generate_package as generate_package
@@ -132,5 +131,4 @@ from scvi_codegen.tables.spaces import Splines as Splines
 from scvi_codegen.tables.spaces import Trigonometric as Trigonometric
 from scvi_codegen.verification import Certificate as Certificate
 from scvi_codegen.verification import verify as verify
-from scvi_codegen.verification.indexed import verify_indexed as verify_indexed
 from scvi_codegen.version import __version__ as __version__

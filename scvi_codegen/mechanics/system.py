@@ -93,7 +93,7 @@ class MechanicalSystem(ABC):
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
     damping: Expr = sympy.S.Zero
-    arrays: tuple[Array, ...] = ()
+    arrays: tuple[Array, ...] = field(default=(), compare=False)
 
     @property
     @abstractmethod

@@ -50,7 +50,8 @@ the names ``p_q``; with constraints the model is that of its Lagrangian.
 ``[system]`` may also be ``catalogue = "kepler"`` alone; then ``[parameters]`` changes default values, and missing
 entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are complete.
 
-Coordinates that are arrays, ``coordinates = ["q[N]"]``, make it a model of an indexed system: see
+Arrays whose sizes are numbers, ``coordinates = ["x", "q[3]"]``, have values by entry or by name,
+``q = { x = 0.0, q = [1, 2, 3] }`` and ``"m[3]" = [1, 1, 2]``. Arrays whose sizes are names, ``["q[N]"]``, are those of
 :mod:`scvi_codegen.models.indexed_file`.
 
 Further sections, such as command-line options, can be merged over those of a file: they add and replace entries.
@@ -63,11 +64,12 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, cast
 
 from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
+from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
@@ -103,14 +105,11 @@ if TYPE_CHECKING:
 __all__ = [
     "catalogue_model",
     "dump_model",
-    "load_indexed_model",
     "load_model",
     "parse_model",
     "read_model_file",
     "save_model",
 ]
-
-Kind = TypeVar("Kind")
 
 FORMULAS = ("lagrangian", "hamiltonian", "dissipation", "damping", "constraints")
 SYSTEM_KEYS = ("name", "coordinates", "momenta", *FORMULAS, "inputs", "catalogue", "time_transformation")
@@ -127,22 +126,12 @@ NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_d
 def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
     """Read a model file, with the sections ``given`` merged over its own.
 
-    Raises:
-        ModelFileError: beginning with the path and naming the key at fault.
-    """
-    return _of_kind(path, read_model_file(path, given), Model, "load_indexed_model")
-
-
-@checks_arguments(path=PATH)
-def load_indexed_model(path: str | os.PathLike[str], given: Document | None = None) -> IndexedModel:
-    """Read the model file of an indexed system (:mod:`scvi_codegen.models.indexed_file`); see :func:`load_model`.
+    A system with arrays whose sizes are names, ``coordinates = ["q[N]"]``, makes it an :class:`IndexedModel`.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
     """
-    from scvi_codegen.models.indexed_model import IndexedModel
-
-    return _of_kind(path, read_model_file(path, given), IndexedModel, "load_model")
+    return cast(Model, read_model_file(path, given))
 
 
 def read_model_file(path: str | os.PathLike[str], given: Document | None = None) -> Model | IndexedModel:
@@ -157,15 +146,6 @@ def read_model_file(path: str | os.PathLike[str], given: Document | None = None)
         return _parsed(text, given, folder=Path(path).parent)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
-
-
-def _of_kind(path: str | os.PathLike[str], model: object, kind: type[Kind], other: str) -> Kind:
-    if not isinstance(model, kind):
-        raise ModelFileError(
-            f"{path}: use {other} for this file (models of indexed systems, whose coordinates are arrays, "
-            "and other models have different readers)"
-        )
-    return model
 
 
 @checks_arguments(model=of("a Model", Model), path=PATH)
@@ -192,7 +172,7 @@ def parse_model(text: str, given: Document | None = None, *, folder: str | os.Pa
         given: sections merged over it.
         folder: base of relative paths.
     """
-    return _of_kind("the text", _parsed(text, given, folder), Model, "load_indexed_model")
+    return cast(Model, _parsed(text, given, folder))
 
 
 def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -> Model | IndexedModel:
@@ -207,16 +187,18 @@ def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -
         return read_indexed(document, given or {}, folder)
     for name in ARRAY_SECTIONS:
         if name in document:
-            raise ModelFileError(f'[{name}] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
+            raise ModelFileError(f'[{name}] belongs to arrays whose sizes are names, coordinates = ["q[N]"]')
     for name, known in KEYS.items():
         check_keys(document.get(name, {}), known, "key", f"[{name}]")
     return _read_model(document, given or {}, folder)
 
 
 def _has_arrays(document: Document) -> bool:
-    """Return whether coordinates are arrays, ``q[N]``."""
+    """Return whether coordinates are arrays whose sizes are names, ``q[N]``."""
     coordinates = document.get("system", {}).get("coordinates", ())
-    return isinstance(coordinates, list) and any(isinstance(name, str) and "[" in name for name in coordinates)
+    return isinstance(coordinates, list) and any(
+        isinstance(name, str) and re.search(r"\[.*[A-Za-z_]", name) for name in coordinates
+    )
 
 
 def dump_model(model: Model) -> str:
@@ -251,7 +233,7 @@ def _read_model(document: Document, given: Document, folder: str | os.PathLike[s
         _check_used(document, given.get("parameters", {}))
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
-        plain = _read_system(document, entry)
+        plain = _with_arrays(_read_system(document, entry), document.get("parameters", {}))
     system, g = _read_time_transformation(plain, document)
     warn_of_mistakes(system, () if g is None else (time_rescaling_function(system, g, in_time=True),))
     state = _read_state(document["initial"], system)
@@ -315,7 +297,9 @@ def _read_catalogue(section: Section) -> Problem | None:
 
 def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     section, forces = document["system"], document.get("forces", {})
-    values = {key: real(value, f"[parameters] {key}") for key, value in document.get("parameters", {}).items()}
+    section_values = document.get("parameters", {})
+    firsts = {key: (_flat(value) or [value])[0] if "[" in key else value for key, value in section_values.items()}
+    values = {key: real(value, f"[parameters] {key}") for key, value in firsts.items()}
     if entry is not None:
         if forces:
             raise ModelFileError(
@@ -348,6 +332,23 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     return in_section("[system]", lambda: LagrangianSystem.from_text(**common))
 
 
+def _with_arrays(system: MechanicalSystem, parameters: Section) -> MechanicalSystem:
+    """Return the system with the entries of arrays of parameters that are lists, ``"m[3]" = [1, 2, 3]``."""
+    arrays = {array.name: array for array in system.arrays}
+    values: dict[str, float] = {}
+    for key, value in parameters.items():
+        if isinstance(value, list):
+            entries, given = arrays[key.partition("[")[0]].elements, _flat(value)
+            check_length(given, entries, f"[parameters] {key}")
+            values |= {name: real(each, f"[parameters] {key}") for name, each in zip(entries, given, strict=True)}
+    return system.with_parameters(**values) if values else system
+
+
+def _flat(value: Any) -> list[Any]:
+    """Return the entries of nested lists in order."""
+    return [entry for each in value for entry in _flat(each)] if isinstance(value, list) else [value]
+
+
 def _read_time_transformation(system: MechanicalSystem, document: Document) -> tuple[MechanicalSystem, Any]:
     g, controller = document["system"].get("time_transformation"), document["run"].get("controller")
     return in_section("[system] time_transformation", lambda: with_time_transformation(system, g, controller))
@@ -357,13 +358,21 @@ def _read_state(section: Section, system: MechanicalSystem) -> dict[str, Any]:
     check_one(section, "initial", "p", "q_dot")
     names = [coordinate.name for coordinate in system.coordinates]
     keys = {"q": "q", "p": "p", "q_dot": "velocity"}
-    vectors = {field: _read_vector(section[key], names, key) for key, field in keys.items() if key in section}
+    arrays = [array for array in system.arrays if set(array.elements) <= set(names)]
+    vectors = {field: _read_vector(section[key], names, key, arrays) for key, field in keys.items() if key in section}
     return {**vectors, "t": real(section.get("t", 0.0), "[initial] t")}
 
 
-def _read_vector(value: Any, names: Sequence[str], key: str) -> tuple[float, ...]:
+def _read_vector(value: Any, names: Sequence[str], key: str, arrays: Sequence[Array]) -> tuple[float, ...]:
     where = f"[initial] {key}"
     if isinstance(value, dict):
+        for array in arrays:
+            if array.name in value and array.axes:
+                entries = _flat(value[array.name])
+                entries = entries * len(array.elements) if len(entries) == 1 else entries
+                check_length(entries, array.elements, f"{where}, {array.name}")
+                others = {name: each for name, each in value.items() if name != array.name}
+                value = others | dict(zip(array.elements, entries, strict=True))
         check_keys(value, names, "coordinate", where)
         value = [required(value, name, where) for name in names]
     if not isinstance(value, list):

@@ -12,22 +12,25 @@ States and parameters are perturbed slightly, so that no symmetry and no mass of
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.errors import StateError, StepFailedError
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.errors import MethodError, StateError, StepFailedError
+from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.system import SYSTEM_OR_ARRAYS, MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.inputs import checked_vector
 from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.validation.argument_types import TEXT, TEXTS, checks_arguments, of
+from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
 from scvi_codegen.verification.convergence import convergence_checks
 from scvi_codegen.verification.derivatives import derivative_checks
@@ -50,20 +53,30 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 """Largest step tried, number of halvings, and the largest change of the state per step relative to its size."""
 
 
-@checks_arguments(system=SYSTEM, stepper=of("a stepper", Stepper), solver=TEXT, flags=TEXTS)
+@checks_arguments(
+    system=SYSTEM_OR_ARRAYS,
+    stepper=of("a stepper", Stepper, IndexedStepper),
+    solver=TEXT,
+    flags=TEXTS,
+    parameters=MAPPING,
+    tables=MAPPING,
+)
 @without_accuracy_warnings()
 def verify(
-    system: MechanicalSystem,
+    system: MechanicalSystem | ArraySystem,
     method: Method | str,
-    q: ArrayLike | None = None,
-    p: ArrayLike | None = None,
+    q: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    p: ArrayLike | Mapping[str, ArrayLike] | None = None,
     *,
     h: float | None = None,
     t: float = 0.0,
-    stepper: Stepper | None = None,
+    stepper: Stepper | IndexedStepper | None = None,
     tolerance: float | None = None,
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
+    velocity: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
+    tables: Mapping[str, ArrayLike] | None = None,
 ) -> Certificate:
     """Measure the guaranteed properties of the integrator of ``system`` by ``method`` and return a certificate.
 
@@ -79,6 +92,9 @@ def verify(
             time-rescaling function (:func:`~scvi_codegen.compile_stepper`) its adaptive steps are measured, too.
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
         solver, flags: as for ``compile_stepper``.
+        velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h, as of
+            :meth:`IndexedStepper.integrate`: properties are measured on a few indices of the arrays first, then at full
+            size; the state of the certificate is that of the few indices.
 
     Returns:
         The certificate. The properties follow from the method (order, symmetry, symplecticity) and the system (momentum
@@ -89,6 +105,15 @@ def verify(
         MethodError: if the method does not apply to the system, or has no such solver.
         StateError: if only one of q and p is passed, or no state is found.
     """
+    own: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
+    if isinstance(system, ArraySystem):
+        return _of_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **own)
+    for name, value in own.items():
+        if value is not None:
+            raise StateError(
+                f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
+            )
+    assert not isinstance(stepper, IndexedStepper)
     began = time.perf_counter()
     method = as_method(method, system)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
@@ -129,6 +154,21 @@ def verify(
     )
 
 
+def _of_arrays(
+    system: ArraySystem, method: Method | str, q: Any, p: Any, *, h: Any, tolerance: float | None, **others: Any
+) -> Certificate:
+    from scvi_codegen.verification.indexed import verify_arrays  # imported here: it imports modules of this package
+
+    if tolerance is not None:
+        raise MethodError(
+            f"tolerance is not available for arrays of '{system.name}', whose sizes are known at run time only: verify "
+            "unroll_sums(system, sizes)"
+        )
+    if q is None or h is None:
+        raise StateError(f"verify requires q and h for arrays of '{system.name}': their shapes determine the sizes")
+    return verify_arrays(system, method, q, p, h=h, **others)
+
+
 def _in_transformed_time(system: MechanicalSystem) -> MechanicalSystem:
     if system.clock is None:
         return system
@@ -148,7 +188,7 @@ def _newton(
 
 
 def _given(
-    system: MechanicalSystem, stepper: Stepper, q: ArrayLike | None, p: ArrayLike | None, h: float | None, t: float
+    system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float
 ) -> State:
     if (q is None) != (p is None):
         raise StateError("only one of q and p was passed: give both, or neither")

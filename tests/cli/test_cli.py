@@ -29,7 +29,7 @@ from scvi_codegen.cli.model_options import ModelOptions, read_model
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import METHODS, SCVI, SVI, CollocationRK, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import load_indexed_model, load_model, parse_model, save_model
+from scvi_codegen.models.model_file import load_model, parse_model, save_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
 pytestmark = pytest.mark.long
@@ -313,7 +313,7 @@ class TestRun:
         path = Path(__file__).parents[2] / "examples/fput_ring.toml"
         text = output_of("run", str(path), *words, "-o", "r.npz")
         assert "4 steps of 0.3 from t = 0 to t = 1; 4 states saved" in text
-        model = load_indexed_model(path, {"run": {"step": 0.3, "span": 1.0}})
+        model = load_model(path, {"run": {"step": 0.3, "span": 1.0}})
         whole = model.stepper().integrate(model.q, velocity=model.velocity, h=0.3, t_end=1.0)
         with np.load("r.npz") as saved:
             assert saved["q_q"][-1] == pytest.approx(whole.q["q"][-1], abs=1e-15)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from scvi_codegen import SVI, load_indexed_model
+from scvi_codegen import SVI, load_model
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.models.indexed_package import load_sums
@@ -190,7 +190,7 @@ def test_newton_for_an_array_system(ring: str) -> None:
     assert (iterated["final"], iterated["iterations"]) == (iterations["final"], iterations["iterations"])
     assert by_model["iterations"] != iterated["iterations"]
     assert invoke("generate", ring, "-o", "ring_newton", *NEWTON, "--degree", "2").exit_code == 0
-    model = load_indexed_model("ring_newton/model.toml")
+    model = load_model("ring_newton/model.toml")
     assert (model.solver, model.method.name) == ("newton", SVI(2).name)
     run = model.start(load_sums("ring_newton", model))
     assert run.interface.solver == "newton"

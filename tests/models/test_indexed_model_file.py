@@ -60,7 +60,7 @@ def net(tmp_path: Path) -> Path:
 
 def test_model_file_is_read_completely(net: Path) -> None:
     """Formulas at every place, a table from a file, and the run by hand."""
-    model = sc.load_indexed_model(net, {"parameters": {"k": 3.0}, "run": {"span": 0.2}})
+    model = sc.load_model(net, {"parameters": {"k": 3.0}, "run": {"span": 0.2}})
     angle = 2 * np.pi * np.arange(3) / 3
     assert model.q["r"] == pytest.approx(np.stack([np.cos(angle), np.sin(angle)], axis=-1), abs=1e-15)
     assert model.parameters["m"] == pytest.approx([1, 4 / 3, 5 / 3])
@@ -77,20 +77,18 @@ def test_model_file_is_read_completely(net: Path) -> None:
 def test_solver_is_read_from_the_file(net: Path) -> None:
     """The run equals Newton's iteration bitwise; the solver is retained if the method changes."""
     net.write_text(net.read_text().replace('"svi:2"', '"svi:2"\nsolver = "newton"'))
-    model = sc.load_indexed_model(net)
+    model = sc.load_model(net)
     run = {"h": 0.1, "steps": 4, "tables": model.tables, "parameters": model.parameters}
     newton, iterations = (
         sc.compile_stepper(model.system, "svi:2", solver=solver).integrate(model.q, **run)
         for solver in ("newton", "fixed-point")
     )
-    own, other = (
-        sc.load_indexed_model(net, {"method": given}).integrate() for given in ({}, {"solver": "fixed-point"})
-    )
+    own, other = (sc.load_model(net, {"method": given}).integrate() for given in ({}, {"solver": "fixed-point"}))
     assert np.array_equal(own.q["r"], newton.q["r"])
     assert np.array_equal(other.q["r"], iterations.q["r"])
     assert (own.iterations, other.iterations) == (newton.iterations, iterations.iterations)
     assert own.iterations != other.iterations
-    assert sc.load_indexed_model(net, {"method": {"method": "gauss:2"}}).solver == "newton"
+    assert sc.load_model(net, {"method": {"method": "gauss:2"}}).solver == "newton"
 
 
 @pytest.mark.parametrize(
@@ -103,7 +101,7 @@ def test_solver_is_read_from_the_file(net: Path) -> None:
 def test_unsupported_newton_is_rejected(net: Path, old: str, new: str) -> None:
     """The error equals that of a system without a file."""
     net.write_text(net.read_text().replace(old, new, 1))
-    model = sc.load_indexed_model(net, {"method": {"solver": "newton"}})
+    model = sc.load_model(net, {"method": {"solver": "newton"}})
     with pytest.raises(sc.MethodError, match="leave out solver='newton'"):
         model.start()
 
@@ -171,20 +169,47 @@ def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str)
     assert str(caught.value).startswith(str(net))
 
 
-def test_each_kind_of_file_has_its_loader(net: Path, tmp_path: Path) -> None:
-    """An error names the other."""
-    with pytest.raises(sc.ModelFileError, match="load_indexed_model"):
-        sc.load_model(net)
+def test_one_loader_reads_both_kinds_of_files(net: Path, tmp_path: Path) -> None:
+    assert isinstance(sc.load_model(net), sc.IndexedModel)
     sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
-    with pytest.raises(sc.ModelFileError, match="use load_model"):
-        sc.load_indexed_model(tmp_path / "kepler.toml")
+    assert isinstance(sc.load_model(tmp_path / "kepler.toml"), sc.Model)
+
+
+RING = """
+[system]
+name = "ring"
+coordinates = ["x", "q[3]"]
+lagrangian = "M*x_dot**2/2 + sum(i in 3, m[i]*q_dot[i]**2/2) - sum(i in 3 periodic, (q[i+1] - q[i] - x)**2/2)"
+[parameters]
+M = 2
+"m[3]" = [1, 2, 3]
+[initial]
+q = { x = 0.5, q = [0, 1, 2] }
+q_dot = { x = 0, q = 0 }
+[run]
+step = 0.1
+span = 1.0
+"""
+
+
+def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
+    path = tmp_path / "ring.toml"
+    path.write_text(RING)
+    model = sc.load_model(path)
+    assert (model.q, model.velocity) == ((0.5, 0.0, 1.0, 2.0), (0.0, 0.0, 0.0, 0.0))
+    assert model.parameters == {"M": 2.0, "m_0": 1.0, "m_1": 2.0, "m_2": 3.0}
+    sc.save_model(model, tmp_path / "again.toml")
+    assert sc.load_model(tmp_path / "again.toml") == model
+    path.write_text(RING.replace("[0, 1, 2]", "[0, 1]"))
+    with pytest.raises(sc.ModelFileError, match="q"):
+        sc.load_model(path)
 
 
 def test_tolerance_selects_adaptive_steps(net: Path) -> None:
     """A tolerance, or a missing step, selects adaptive steps; an overriding step replaces it."""
     given = {"tolerance": 1e-6, "span": -3.0}
     net.write_text(net.read_text().replace("step = 0.1\nsteps = 4", "tolerance = 1e-6\nspan = -3.0"))
-    model = sc.load_indexed_model(net)
+    model = sc.load_model(net)
     assert (model.h, model.tolerance, model.covered) == (None, 1e-6, -3.0)
     own = model.integrate()
     assert own.t[-1] == model.start().plan.t_end == -3.0
@@ -194,7 +219,7 @@ def test_tolerance_selects_adaptive_steps(net: Path) -> None:
     assert np.array_equal(own.q["r"], other.q["r"])
     with pytest.raises(sc.ModelFileError, match="give a step"):
         model.step_count  # noqa: B018
-    assert sc.load_indexed_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
+    assert sc.load_model(net, {"run": {"step": 0.1, "span": 1.0}}).step_count == 10
 
 
 def test_generated_example_frees_memory_and_rejects_indices_out_of_range(

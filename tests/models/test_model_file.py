@@ -227,7 +227,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("[system]", "system = 3\n[zzz]", "unknown section 'zzz'"),
         ("[system]", '[system]\ncatalogue = "kepler"', "unknown key 'name' in [system] beside catalogue"),
         ("[run]", "[run", "this is not TOML"),
-        ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to coordinates that are arrays"),
+        ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to arrays whose sizes are names"),
         ('"svi"', '"svi:4"', "[method] method = 'svi:4' and degree = 3 contradict each other"),
         ('["q"]', '["q"]\nmomenta = ["p"]', "[system] has momenta and a lagrangian"),
         (

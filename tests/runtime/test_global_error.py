@@ -655,7 +655,7 @@ class TestCommandLine:
         path.write_text(self.ARRAYS.format(span=8.0, q=[0.2, 0.1, 0.0]))
         words = (["run", str(path), "-o", str(output), "--json"], ["run", str(path), "--error", "1e-8", "--json"])
         found = [json.loads(CliRunner().invoke(main, each).stdout)["global_error"] for each in words]
-        model = sc.load_indexed_model(path)
+        model = sc.load_model(path)
         run = model.integrate()
         assert found[0] == found[1]
         assert found[0]["confirmed"]

@@ -231,7 +231,7 @@ steps = 20
 
 def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
-    model = sc.load_indexed_model(tmp_path / "chain.toml")
+    model = sc.load_model(tmp_path / "chain.toml")
     run = model.integrate()
     folder = generate_sums(model, tmp_path / "chain_c")
     made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
@@ -240,7 +240,7 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     assert np.abs(end[:12] - run.q["r"][-1].ravel()).max() < 1e-12
     assert "lambda*(2*r[i+1, 0] - 2*r[i, 0])" in derive_sums(model.system, model.method)
     with pytest.raises(MethodError, match="unroll_sums"):
-        sc.verify_indexed(model.system, model.method, model.q, h=0.01)
+        sc.verify(model.system, model.method, model.q, h=0.01)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def certificate(name: str, method: str) -> sc.Certificate:
     """Return the certificate of one of the systems."""
     given, start = SYSTEMS[name]
     system = either_system(name=name, **given)
-    return sc.verify_indexed(system, method, **start, flags=QUICK_FLAGS)
+    return sc.verify(system, method, **start, flags=QUICK_FLAGS)
 
 
 @pytest.mark.full

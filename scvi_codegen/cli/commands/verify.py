@@ -21,7 +21,6 @@ from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.verification import Certificate
-from scvi_codegen.verification.indexed import verify_indexed
 
 __all__ = ["verify"]
 
@@ -104,7 +103,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
 
 
 def _indexed_certificate(model: IndexedModel, stepper: IndexedStepper) -> Certificate:
-    return verify_indexed(
+    return verification.verify(
         model.system,
         model.method,
         model.q,

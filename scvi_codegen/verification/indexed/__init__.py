@@ -36,7 +36,7 @@ from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest
 
-__all__ = ["verify_indexed"]
+__all__ = ["verify_arrays"]
 
 SMALL_STEPS = 40
 ROUNDINGS = 16.0 * SMALL_STEPS
@@ -45,7 +45,7 @@ ROUNDINGS = 16.0 * SMALL_STEPS
 
 @checks_arguments(system=ARRAYS, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
 @without_accuracy_warnings()
-def verify_indexed(
+def verify_arrays(
     system: ArraySystem,
     method: Method | str,
     q: ArrayLike | Mapping[str, ArrayLike],
@@ -59,7 +59,7 @@ def verify_indexed(
     stepper: IndexedStepper | None = None,
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
-    """Measure the guaranteed properties of the integrator of an indexed system and return a certificate.
+    """Measure the guaranteed properties of the integrator of arrays of run-time sizes and return a certificate.
 
     Properties are measured on a few indices of the arrays first, then at full size.
 
@@ -80,8 +80,8 @@ def verify_indexed(
     chosen = as_method(method, one_coordinate(system))
     if system.constraints:
         raise MethodError(
-            "indexed systems with constraints have no certificate: verify a small unrolled system (unroll_sums) by "
-            "SVI(1, 'gauss-lobatto:2')"
+            "certificates are not available for arrays of run-time sizes with constraints: verify "
+            "unroll_sums(system, sizes) by SVI(1, 'gauss-lobatto:2')"
         )
     stepper = stepper or compile_stepper(system, chosen, flags=tuple(flags))
     run = stepper.start(q, p, velocity=velocity, h=h, t=t, parameters=parameters, tables=tables)
