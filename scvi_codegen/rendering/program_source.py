@@ -125,11 +125,6 @@ class EventSearch:
     coefficients: tuple[tuple[float, ...], ...]
     doubts: tuple[float, float]
 
-    @property
-    def velocity(self) -> str:
-        """Support header that provides v."""
-        return "event_velocity_in_tau" if self.transformed else "event_velocity"
-
 
 def render(program: Program, control: Control | None = None, *, fallback: Fallback | None = None) -> Source:
     """Return header and source of a program; with control, with adaptive steps. Equal programs give equal bytes.

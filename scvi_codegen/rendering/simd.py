@@ -136,7 +136,7 @@ def iteration_source(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "convergence", "inverse_sizes", meaning.memory, *fixed_point.parts, *solver),
+        support=(*meaning.before, "convergence", meaning.memory, *fixed_point.parts, *solver),
         error_defines=_kept(fixed_point),
         highest=_groups("HIGHEST", fixed_point.guess.highest),
         next=_groups("NEXT", fixed_point.guess.next),

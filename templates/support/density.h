@@ -1,3 +1,20 @@
+#ifdef HAMILTONIAN_SYSTEM
+/* Arguments of the step density: positions and momenta. Requires: step.h. */
+static int density_arguments(const step_data *step, real *u)
+{
+  memcpy(u, step->q0, sizeof(real) * M);
+  memcpy(u + M, step->p0, sizeof(real) * M);
+  return OK;
+}
+#else
+/* Arguments of the step density: positions and velocities. Requires: legendre.h. */
+static int density_arguments(const step_data *step, real *u)
+{
+  memcpy(u, step->q0, sizeof(real) * M);
+  return NAME(velocity)(step->t, step->q0, step->p0, step->parameters, u + M, step->scratch);
+}
+#endif
+
 /* Fixed steps tau in a transformed time dt = g dtau, h = tau / rho. The step density rho = 1/g is integrated by its own
  * equation drho/dtau = -d(log g)/dt from the middle of one step to that of the next, so that the step sequence is
  * time-reversible if the method is (integrating controller; Hairer & Soederlind, SIAM J. Sci. Comput. 26, 2005). A step

@@ -190,3 +190,236 @@ FMI_EXPORT fmi3Status FMI(Reset)(fmi3Instance instance)
   set_start(&one->now);
   return fmi3OK;
 }
+
+/* Variables of an FMU by value reference. Requires: fmu.h, INPUTS, INPUT_PARTS, INPUT_INDEX. */
+
+/* Returns true if the model description has the reference; the internal parts of an input other than its value are
+ * hidden. */
+static bool is_known(fmi3ValueReference reference)
+{
+  const int64_t place = (int64_t)reference - FIRST_PARAMETER;
+  for (int i = 0; i < INPUTS; i++)
+    if (place > INPUT_INDEX[i] && place < INPUT_INDEX[i] + INPUT_PARTS)
+      return false;
+  return reference < REFERENCES;
+}
+
+static bool is_among(fmi3ValueReference reference, fmi3ValueReference first)
+{
+  return reference >= first && reference < first + M;
+}
+
+/* Parameters and inputs can be set at any time, the state before the first step. */
+static bool is_settable(fmi3ValueReference reference, fmu_mode mode)
+{
+  if (reference >= FIRST_PARAMETER)
+    return mode != TERMINATED;
+  return mode < STEP_MODE && (is_among(reference, POSITIONS) || is_among(reference, MOVING));
+}
+
+static fmi3Status checked(const fmu *one, const fmi3ValueReference *references, size_t count, size_t size)
+{
+  if (count != size)
+    return failed(one, fmi3Error, "%lu values for %lu variables", (unsigned long)size, (unsigned long)count);
+  for (size_t k = 0; k < count; k++)
+    if (!is_known(references[k]))
+      return failed(one, fmi3Error, "unknown value reference %lu", (unsigned long)references[k]);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(GetFloat64)(fmi3Instance instance, const fmi3ValueReference *references, size_t count,
+    fmi3Float64 *values, size_t size)
+{
+  fmu *one = instance;
+  fmi3Status status = checked(one, references, count, size);
+  for (size_t k = 0; status == fmi3OK && k < count; k++) {
+    if (references[k] >= VELOCITIES && references[k] <= ENERGY)
+      status = follow(one, fmi3Discard);
+    values[k] = one->now.values[references[k]];
+  }
+  return status;
+}
+
+FMI_EXPORT fmi3Status FMI(SetFloat64)(fmi3Instance instance, const fmi3ValueReference *references, size_t count,
+    const fmi3Float64 *values, size_t size)
+{
+  fmu *one = instance;
+  const fmi3Status status = checked(one, references, count, size);
+  if (status != fmi3OK)
+    return status;
+  for (size_t k = 0; k < count; k++)
+    if (!is_settable(references[k], one->now.mode))
+      return failed(one, fmi3Error, "value reference %lu cannot be set in this mode", (unsigned long)references[k]);
+  for (size_t k = 0; k < count; k++)
+    one->now.values[references[k]] = values[k];
+  one->now.behind = true;
+  return fmi3OK;
+}
+
+/* Integration from one communication point to the next. Requires: fmu.h, and PROJECT, the projection onto
+ * constraints. */
+
+#define NO_STEP 1e-9 /* relative to a step: remaining time that needs no step, e.g. with tabulated inputs */
+#define TIME_ROUNDING (4 * DBL_EPSILON) /* relative to a time: error of a sum of steps */
+#define MISTAKEN 1e3 /* relative to the slack of a time: a larger difference is a wrong start time, not rounding */
+#define FAR_OFF 1e-2 /* violation of the constraints, relative to the positions, that is an error of the initial
+                      * state */
+
+/* PROJECT of a system without constraints. */
+static inline int no_constraints(double t, const double *q0, const double *p0, const double *parameters, double *q1,
+    double *p1, double *workspace)
+{
+  (void)t, (void)parameters, (void)workspace;
+  memcpy(q1, q0, sizeof(double) * M);
+  memcpy(p1, p0, sizeof(double) * M);
+  return STATUS(OK);
+}
+
+/* Projects the initial state onto the constraints; from then on the momenta are the independent values. */
+static fmi3Status put_on_constraints(fmu *one)
+{
+  double *x = one->now.values, q[M], p[M], size = 0, moved = 0;
+  const int status = PROJECT(x[TIME], x + POSITIONS, x + MOMENTA, x + FIRST_PARAMETER, q, p, one->workspace);
+  if (status != STATUS(OK))
+    return failed(one, fmi3Error, "projecting the initial state onto the constraints failed: %s", reason(status));
+  for (int i = 0; i < M; i++) {
+    size = fmax(size, fabs(q[i]));
+    moved = fmax(moved, fabs(q[i] - x[POSITIONS + i]));
+  }
+  if (moved > FAR_OFF * size)
+    return failed(one, fmi3Error, "the initial positions violate the constraints by %.1e (relative)", moved / size);
+  memcpy(x + POSITIONS, q, sizeof q);
+  memcpy(x + MOMENTA, p, sizeof p);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(ExitInitializationMode)(fmi3Instance instance)
+{
+  fmu *one = instance;
+  double *x = one->now.values;
+  fmi3Status status;
+  if (one->now.mode != INITIALIZATION_MODE)
+    return not_now(one, "fmi3ExitInitializationMode");
+  status = follow(one, fmi3Error);
+  if (status == fmi3OK)
+    status = put_on_constraints(one);
+  if (status != fmi3OK)
+    return status;
+  NAME(start)(&one->now.run, x[TIME], STEP, x + POSITIONS, x + MOMENTA);
+  one->now.behind = CONSTRAINTS > 0;
+  one->now.mode = STEP_MODE;
+  return fmi3OK;
+}
+
+/* Admissible error of a communication point. */
+static double slack_at(double t)
+{
+  return NO_STEP * STEP + TIME_ROUNDING * fabs(t);
+}
+
+/* Number of steps to the next communication point, and their size: STEP if it fits, else that of the previous steps if
+ * it fits, else an equal part of the interval. */
+static long long plan(NAME(run) * run, double end)
+{
+  const double left = end - run->t, slack = slack_at(end), count = fmax(1, ceil((left - slack) / STEP));
+  double length = left / count;
+  if (fabs(count * STEP - left) <= slack)
+    length = STEP;
+  else if (fabs(count * run->h - left) <= slack)
+    length = run->h;
+  run->guess = run->h == length ? run->guess : 0;
+  run->h = length;
+  return (long long)count;
+}
+
+FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size, fmi3Boolean no_return,
+    fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last)
+{
+  fmu *one = instance;
+  run_memory *run = &one->now.run;
+  NAME(report)
+  report;
+  double *x = one->now.values, t, q[M], p[M];
+  int status, iterations;
+  (void)no_return;
+  if (one->now.mode != STEP_MODE)
+    return not_now(one, "fmi3DoStep");
+  if (!(fabs(point - run->t) <= MISTAKEN * slack_at(point)))
+    return failed(one, fmi3Error, "the communication point is t = %.17g, but the FMU is at t = %.17g", point, run->t);
+  if (!(size > 0 && size / STEP < 1 / DBL_EPSILON))
+    return failed(one, fmi3Error, "the communication step size %g must be positive, and less than 2^52 steps", size);
+  one->before = *run;
+  status = NAME(advance)(run, plan(run, point + size), LLONG_MAX, x + FIRST_PARAMETER, NULL, &t, q, p, &iterations,
+      &report, one->workspace);
+  if (status != STATUS(OK)) {
+    *run = one->before;
+    *last = run->t;
+    return failed(one, fmi3Discard, "the step at t = %g: %s", report.t, reason(status));
+  }
+  x[TIME] = *last = run->t;
+  memcpy(x + POSITIONS, run->q, sizeof run->q);
+  memcpy(x + MOMENTA, run->p, sizeof run->p);
+  one->now.behind = true;
+  *event = *terminate = *early = false;
+  return fmi3OK;
+}
+
+/* States of an FMU: get, set, serialise. Requires: fmu.h. */
+
+/* Copies the state to the importer's memory, which is allocated if there is none. */
+static fmi3Status copy_state_to(const fmu *one, const void *state, fmi3FMUState *kept)
+{
+  *kept = *kept ? *kept : malloc(sizeof(fmu_state));
+  if (!*kept)
+    return failed(one, fmi3Error, "there is not enough memory for a state");
+  memcpy(*kept, state, sizeof(fmu_state));
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(GetFMUState)(fmi3Instance instance, fmi3FMUState *state)
+{
+  const fmu *one = instance;
+  return copy_state_to(one, &one->now, state);
+}
+
+FMI_EXPORT fmi3Status FMI(SetFMUState)(fmi3Instance instance, fmi3FMUState state)
+{
+  fmu *one = instance;
+  if (!state)
+    return failed(one, fmi3Error, "the state to set is NULL");
+  memcpy(&one->now, state, sizeof one->now);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(FreeFMUState)(fmi3Instance instance, fmi3FMUState *state)
+{
+  (void)instance;
+  if (state) {
+    free(*state);
+    *state = NULL;
+  }
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(SerializedFMUStateSize)(fmi3Instance instance, fmi3FMUState state, size_t *size)
+{
+  (void)instance, (void)state;
+  *size = sizeof(fmu_state);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(SerializeFMUState)(fmi3Instance instance, fmi3FMUState state, fmi3Byte *bytes, size_t size)
+{
+  if (!state || size != sizeof(fmu_state))
+    return failed(instance, fmi3Error, "the buffer of a state must have %lu bytes", (unsigned long)sizeof(fmu_state));
+  memcpy(bytes, state, size);
+  return fmi3OK;
+}
+
+FMI_EXPORT fmi3Status FMI(DeserializeFMUState)(fmi3Instance instance, const fmi3Byte *bytes, size_t size,
+    fmi3FMUState *state)
+{
+  if (size != sizeof(fmu_state) || memcmp(bytes, TOKEN, sizeof TOKEN) != 0)
+    return failed(instance, fmi3Error, "these bytes are not a serialized state of this FMU");
+  return copy_state_to(instance, bytes, state);
+}

@@ -1,5 +1,5 @@
-/* Comparison of a step of an indexed system with two steps of half its size, as in halves.h. The half steps are solved
- * in place, so that F of the step is lost; forces of former steps are preserved. Requires: comparison.h,
+/* Comparison of a step of an indexed system with two steps of half its size, as in observed_error.h. The half steps are solved
+ * in place, so that F of the step is lost; forces of former steps are preserved. Requires: sizes.h,
  * HALVES_VECTORS, solve and continue_steps of a solver. */
 
 /* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half;
@@ -115,7 +115,7 @@ static double difference(const run_memory *run, const numbers *x, long long n)
   return most > ROUNDING_OF_HALVES ? most : 0.0;
 }
 
-/* Computes the error of the solved step as in halves.h, of momenta too if requested; state and time are restored. */
+/* Computes the error of the solved step as in observed_error.h, of momenta too if requested; state and time are restored. */
 static SELDOM int compare_with_halves(run_memory *run, const problem *given, long long n, int momenta,
     const solver_options *options, double *error)
 {

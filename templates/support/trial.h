@@ -1,4 +1,4 @@
-/* Trial of an adaptive step of a system with few coordinates. Requires: step_size_levels.h, halves.h; attempt of a
+/* Trial of an adaptive step of a system with few coordinates. Requires: step_size_levels.h, observed_error.h; attempt of a
  * solver, which tries a step. */
 #define DOUBTS SHORT_STEPS_FAIL
 
