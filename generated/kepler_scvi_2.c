@@ -9,6 +9,7 @@
 
 #define NAME(word) kepler_scvi_2_##word /* prefix of every exported name */
 #define STATUS(word) KEPLER_SCVI_2_##word
+#define MOMENTUM_MAPS
 #define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
@@ -28,7 +29,6 @@ enum {
   SCRATCH = 64 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/double.h"
 #include "support/numbers.h"
 #include "support/status_codes.h"
 #include "support/step.h"
@@ -230,9 +230,7 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 
 #include "support/band.h"
 #include "support/legendre.h"
-#include "support/lagrangian.h"
 #include "support/energies.h"
-#include "support/momentum_maps.h"
 #include "support/gather.h"
 #include "support/stages.h"
 
@@ -315,8 +313,8 @@ static const double STAGE_CURVATURE[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
 #include "support/stage_error.h"
+#define SPURIOUS_TESTED
 #include "support/newton_from_line.h"
-#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 2
@@ -325,8 +323,8 @@ static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 #define FINAL_ITERATIONS 0
 #define NODES 2
 
+#define INVERSE_ROOTS
 #include "support/vectors.h"
-#include "support/inverse_roots.h"
 #include "support/points.h"
 
 LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
@@ -390,12 +388,9 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 }
 
 #include "support/convergence.h"
-#include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/diagonal_mass.h"
-#include "support/unknown_velocity.h"
 #include "support/curve.h"
-#include "support/curve_points.h"
 #include "support/shooting_iteration.h"
 #include "support/newton_fallback.h"
 #include "support/iteration_solver.h"
@@ -411,10 +406,8 @@ static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
 #include "support/curve_error.h"
-#include "support/iteration_or_stage_error.h"
+#include "support/largest_error.h"
 #include "support/sizes.h"
-#include "support/comparison.h"
-#include "support/halves.h"
 #include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
@@ -424,18 +417,16 @@ static const double EXTRAPOLATION[5][5] = {
     {0.0, 0.0, 0.0, 1.0, 0.0},
     {0.0, 0.0, 0.0, 0.0, 1.0}};
 
+#define NEWTON_ALONE
 #include "support/newton_solver.h"
-#include "support/newton_error.h"
+#include "support/largest_error.h"
 
 #define ERROR_POWER STAGE_POWER
 #include "support/sizes.h"
-#include "support/comparison.h"
-#include "support/halves.h"
 #include "support/observed_error.h"
 #endif
 
 #include "support/time.h"
-#include "support/even_time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
@@ -462,4 +453,5 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
+#define DISCRETE_LAGRANGIAN
 #include "support/discrete_legendre.h"

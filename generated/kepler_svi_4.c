@@ -8,6 +8,7 @@
 
 #define NAME(word) kepler_svi_4_##word /* prefix of every exported name */
 #define STATUS(word) KEPLER_SVI_4_##word
+#define MOMENTUM_MAPS
 #define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
@@ -27,7 +28,6 @@ enum {
   SCRATCH = 56 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/double.h"
 #include "support/numbers.h"
 #include "support/status_codes.h"
 #include "support/step.h"
@@ -141,9 +141,7 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 
 #include "support/band.h"
 #include "support/legendre.h"
-#include "support/lagrangian.h"
 #include "support/energies.h"
-#include "support/momentum_maps.h"
 #include "support/gather.h"
 #include "support/stages.h"
 
@@ -190,16 +188,16 @@ static const double STAGE_CURVATURE[4] = {-1.0, 0.0, 0.0, 1.0};
 static const double STAGE_OTHER_CURVATURE[4] = {-1.0, 0.0, 1.0, 0.0};
 
 #include "support/stage_error.h"
+#define SPURIOUS_TESTED
 #include "support/newton_from_line.h"
-#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 4
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 1
 
+#define INVERSE_ROOTS
 #include "support/vectors.h"
-#include "support/inverse_roots.h"
 #include "support/points.h"
 
 LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
@@ -261,7 +259,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 }
 
 #include "support/convergence.h"
-#include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/separable_iteration.h"
 #include "support/newton_fallback.h"
@@ -278,10 +275,8 @@ static const lanes HIGHEST[GROUPS] = {-0.37102700340194733, 0.939772470377753, -
 static const lanes NEXT[GROUPS] = {0.5325080420189116, -0.5325080420189116, -0.5325080420189116, 0.5325080420189116};
 
 #include "support/curve_error.h"
-#include "support/iteration_or_stage_error.h"
+#include "support/largest_error.h"
 #include "support/sizes.h"
-#include "support/comparison.h"
-#include "support/halves.h"
 #include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[4][4] = {
@@ -290,18 +285,16 @@ static const double EXTRAPOLATION[4][4] = {
     {-1.929896390297009, -9.46401244076669, -29.80681363156252, -55.9889724574008},
     {2.191699902136537, 6.173927437193185, 15.914967984193565, 27.864733549197386}};
 
+#define NEWTON_ALONE
 #include "support/newton_solver.h"
-#include "support/newton_error.h"
+#include "support/largest_error.h"
 
 #define ERROR_POWER STAGE_POWER
 #include "support/sizes.h"
-#include "support/comparison.h"
-#include "support/halves.h"
 #include "support/observed_error.h"
 #endif
 
 #include "support/time.h"
-#include "support/even_time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
@@ -328,4 +321,5 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
+#define DISCRETE_LAGRANGIAN
 #include "support/discrete_legendre.h"

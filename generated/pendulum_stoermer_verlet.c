@@ -8,6 +8,7 @@
 
 #define NAME(word) pendulum_stoermer_verlet_##word /* prefix of every exported name */
 #define STATUS(word) PENDULUM_STOERMER_VERLET_##word
+#define NO_FALLBACK
 #define TOLERANCE 2.220446049250313e-16 /* default */
 
 enum {
@@ -19,7 +20,6 @@ enum {
   SCRATCH = 2 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/double.h"
 #include "support/numbers.h"
 #include "support/status_codes.h"
 #include "support/step.h"
@@ -50,7 +50,6 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 
 #include "support/band.h"
 #include "support/legendre.h"
-#include "support/lagrangian.h"
 #include "support/energies.h"
 
 enum { LEAPS = 2 };
@@ -72,11 +71,11 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
-#include "support/drift_by_masses.h"
+#define BY_MASSES
 #include "support/splitting.h"
 
 #include "support/no_error.h"
 #include "support/time.h"
-#include "support/even_time.h"
 #include "support/run.h"
-#include "support/explicit_legendre.h"
+#define EXPLICIT_STEPS
+#include "support/discrete_legendre.h"

@@ -27,7 +27,6 @@ enum {
   SCRATCH = 12 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/double.h"
 #include "support/numbers.h"
 #include "support/status_codes.h"
 #include "support/step.h"
@@ -87,7 +86,6 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 
 #include "support/band.h"
 #include "support/legendre.h"
-#include "support/lagrangian.h"
 #include "support/energies.h"
 #include "support/gather.h"
 #include "support/entry.h"
@@ -135,16 +133,16 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 }
 
 #include "support/newton.h"
+#define SPURIOUS_TESTED
 #include "support/newton_from_line.h"
-#include "support/spurious_solutions.h"
 
 #ifdef __GNUC__
 #define POINTS 2
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 1
 
+#define VECTOR_LIBRARY
 #include "support/vectors.h"
-#include "support/vector_library.h"
 #include "support/points.h"
 
 LANES_LIBRARY_FUNCTION(sin);
@@ -187,7 +185,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 }
 
 #include "support/convergence.h"
-#include "support/inverse_sizes.h"
 #include "support/one_trajectory.h"
 #include "support/separable_iteration.h"
 #include "support/newton_fallback.h"
@@ -204,20 +201,18 @@ static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 static const lanes NEXT[GROUPS] = {0.0, 0.0};
 
 #include "support/curve_error.h"
-#include "support/iteration_error.h"
+#include "support/largest_error.h"
 #include "support/sizes.h"
-#include "support/comparison.h"
-#include "support/halves.h"
 #include "support/observed_error.h"
 #else
 static const double EXTRAPOLATION[1][1] = {{1.0}};
 
+#define NEWTON_ALONE
 #include "support/newton_solver.h"
 #include "support/no_error.h"
 #endif
 
 #include "support/time.h"
-#include "support/even_time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
@@ -242,4 +237,5 @@ static void sums_along(const step_data *step, const double *z, double *sum)
   add_quadrature_sums(step, z, sum);
 }
 
+#define DISCRETE_LAGRANGIAN
 #include "support/discrete_legendre.h"

@@ -65,3 +65,17 @@ static inline long long steps_to_continue(long long steps, double first_change)
 {
   return steps > 0 && first_change < GOOD_GUESS ? 2 : 1;
 }
+
+#ifndef ARRAYS
+/* Inverse sizes, in units of which changes are measured. Requires: points.h or trajectories.h. */
+
+/* 1 / (size + a little of the largest), so that a coordinate at 0 has a size, too; or `absolute`, which converts to
+ * changes of q. An infinite size gives NaN. */
+static inline void invert_sizes(const solver_options *options, double absolute, number *size)
+{
+  const number largest = largest_number(size);
+  for (int i = 0; i < M; i++)
+    size[i] =
+        (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
+}
+#endif

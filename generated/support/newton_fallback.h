@@ -1,4 +1,4 @@
-/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, spurious_solutions.h. */
+/* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, newton_from_line.h. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
     solver_report *report, double *workspace)

@@ -1,3 +1,47 @@
+#ifdef BY_MASSES
+/* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
+typedef struct {
+  real inverse_mass[M];
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  mass(NULL, step->t, step->parameters, data->inverse_mass);
+  for (int i = 0; i < M; i++)
+    data->inverse_mass[i] = 1 / data->inverse_mass[i];
+}
+
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
+static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+{
+  for (int i = 0; i < M; i++)
+    dq[i] += step->h * part * data->inverse_mass[i] * (step->p0[i] + (step->carry_p[i] + dp[i]));
+}
+#else
+/* Drift of splitting methods with velocities v(p, t): dq += h part v. Requires: step.h, the kernel drift_velocity. */
+typedef struct {
+  int unused;
+} solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  (void)step;
+  data->unused = 0;
+}
+
+/* Advances the positions by a part of the step with the momenta p0 + dp. */
+static inline void drift(const step_data *step, const solver_data *data, real part, const real *dp, real *dq)
+{
+  real p[M], v[M];
+  (void)data;
+  for (int i = 0; i < M; i++)
+    p[i] = step->p0[i] + (step->carry_p[i] + dp[i]);
+  drift_velocity(p, step->t, step->parameters, v);
+  for (int i = 0; i < M; i++)
+    dq[i] += step->h * part * v[i];
+}
+#endif
+
 /* Splitting step: kicks h KICK[n] L_q, each followed by a drift h DRIFT[n] v. Requires: a drift, LEAPS, the tables,
  * KICK_ABSCISSA, and the kernel force. */
 

@@ -107,7 +107,7 @@ class ShootingIteration(CurveIteration):
     @property
     def parts(self) -> tuple[str, ...]:
         """Support headers: mass, curve, points, iteration."""
-        return (self.mass_part, "unknown_velocity", "curve", "curve_points", "shooting_iteration")
+        return (self.mass_part, "curve", "shooting_iteration")
 
     def memory(self, dimension: int) -> int:
         """Return the length of z of the last two steps, v0 and m."""
@@ -157,10 +157,7 @@ class CollocationIteration(CurveIteration):
     @property
     def parts(self) -> tuple[str, ...]:
         """Support headers: mass, curve, ends, iteration."""
-        if not self.ends:
-            return (self.mass_part, "known_velocity", "curve", "ends_by_transform", "collocation_iteration")
-        ends = ("unknown_velocity", "curve", "curve_points", "ends_by_quadrature")
-        return (self.mass_part, *ends, "collocation_iteration")
+        return (self.mass_part, "curve", "collocation_iteration")
 
     def memory(self, dimension: int) -> int:
         """Return the length of z of the last two steps and v0."""

@@ -83,7 +83,7 @@ Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The
 UNROLLED_HEADERS = frozenset({"support/newton_solver.h", "support/shooting_iteration.h"})
 """Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
 
-THREADS_HEADER, THREADS = "support/indexed_threads.h", ("-DSCVI_THREADS", "-pthread")
+THREADS_HEADER, THREADS = "support/arrays.h", ("-DSCVI_THREADS", "-pthread")
 """Header of sources whose steps threads may share, and the flags for them."""
 
 COMPILE_SECONDS = 600

@@ -18,8 +18,8 @@ Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 
 HEADERS: dict[Fallback, tuple[str, ...]] = {
     "own": ("newton_fallback",),
-    "external": ("fallback", "external_fallback"),
-    "provided": ("fallback", "newton_fallback"),
+    "external": ("library_fallback",),
+    "provided": ("newton_fallback",),
     "none": ("no_fallback",),
 }
 """Support headers before the solver by fixed-point iteration, in order."""

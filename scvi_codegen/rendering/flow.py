@@ -30,8 +30,8 @@ def with_xla_flow(derivatives: Source, version: str, *, second: bool = False) ->
     """
     parts = (*XLA_PARTS, *([XLA_SECOND_ORDER] if second else ()))
     handlers = "".join(f"void *{derivatives.prefix}_xla_{part}(void *frame);\n" for part in parts)
-    headers = ("flow", "xla_flow", *(("flow_second", "xla_second") if second else ()))
-    return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers)
+    headers = ("flow", "xla_flow")
+    return _behind(derivatives, f"\n/* For jaxlib {version}. */\n", headers, handlers, second=second)
 
 
 def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
@@ -50,8 +50,8 @@ def with_flow_of_rows(derivatives: Source, *, second: bool = False) -> Source:
     if second:
         declared += f"int {prefix}_hessian_rows({shape}, const double *x, "
         declared += f"const double *partials, const double *changes, {rest});\n"
-    headers = ("flow", "rows_flow", *(("flow_second", "rows_second") if second else ()))
-    return _behind(derivatives, "\n", headers, declared)
+    headers = ("flow", "rows_flow")
+    return _behind(derivatives, "\n", headers, declared, second=second)
 
 
 def casadi_name(prefix: str) -> str:
@@ -69,12 +69,18 @@ def with_casadi_flow(derivatives: Source, steps: int, save_every: int, *, second
     """
     name = casadi_name(derivatives.prefix)
     fixed = f"\nenum {{\n  FLOW_STEPS = {steps},\n  FLOW_EVERY = {save_every}\n}};\n\n"
-    headers = ("flow", "casadi_flow", *(("flow_second", "casadi_second") if second else ()))
-    return _behind(derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "")
+    headers = ("flow", "casadi_flow")
+    return _behind(
+        derivatives, f"{fixed}#define EXTERNAL(before, after) before##{name}##after\n\n", headers, "", second=second
+    )
 
 
-def _behind(source: Source, text: str, headers: Sequence[str], declarations: str) -> Source:
-    tail = text + "".join(f'#include "support/{header}.h"\n' for header in headers)
+def _behind(source: Source, text: str, headers: Sequence[str], declarations: str, *, second: bool) -> Source:
+    tail = (
+        text
+        + "#define SECOND_DERIVATIVES\n" * second
+        + "".join(f'#include "support/{header}.h"\n' for header in headers)
+    )
     support = tuple((name, support_text(name)) for name in included(tail))
     return replace(
         source,

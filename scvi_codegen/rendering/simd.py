@@ -175,8 +175,7 @@ def _solver(fixed_point: FixedPointIteration, fallback: Fallback) -> tuple[str, 
         return solver
     return (
         *solver,
-        fixed_point.integral_part,
-        f"integrals_after_{'iteration' if fallback == 'none' else 'fallback'}",
+        "integrals",
     )
 
 

@@ -54,7 +54,7 @@ static void last_of_block(const step_points *w, const measures *by_size, int mea
 {
   lanes of_all = lanes_of(0.0), of_each = lanes_of(0.0);
   for (long long i = here.first; i < here.end; i++) {
-    const drift of = find_drift(w, i);
+    const drift_words of = find_drift(w, i);
     lanes X[GROUPS];
     for (int g = 0; g < GROUPS; g++)
       X[g] = accurate_point(w, g, of, i);

@@ -36,7 +36,7 @@ static double first_of_block(const step_points *w, const struct predictor_tables
   const long long n = w->n;
   double largest = DBL_MIN;
   for (long long i = here.first; i < here.end; i++) {
-    const drift of = find_drift(w, i);
+    const drift_words of = find_drift(w, i);
     for (int g = 0; g < GROUPS; g++) {
       lanes curvature = lanes_of(0.0);
       if (guess == 1)

@@ -1,5 +1,5 @@
 /* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
- * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: increments.h, add_forces,
+ * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
  * evaluate_constraints, constraint_matrix.h, array_convergence.h, PARTS of a step, PART and their ends, PART_END. */
 
 #define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */

@@ -1,5 +1,5 @@
 /* Projection onto the constraints, their values, and their Lagrange multipliers. Requires: constrained_step.h,
- * indexed_run.h. */
+ * array_run.h. */
 
 #define REFINEMENTS 3
 #define REFINED 1e-6 /* reduction of the residual per refinement */

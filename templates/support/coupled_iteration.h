@@ -103,3 +103,24 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+
+#ifdef TIME_TRANSFORMATION
+/* Integrals along a step solved by fixed-point iteration. Requires: coupled_iteration.h, the kernel integrand_lanes. */
+
+/* Quadrature of the momenta at the converged velocities, which `memory` contains. */
+static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,
+    double *sum)
+{
+  lanes z[GROUPS][M], scaled[GROUPS][M], u[2 * M], value[INTEGRALS], part[INTEGRALS][GROUPS];
+  lanes_load(memory, z);
+  scale(data->position_weight, z, scaled);
+  for (int n = 0; n < GROUPS; n++) {
+    place(step, n, scaled, z, u);
+    integrand_lanes(u, step->t + step->h * ABSCISSA[n], step->parameters, value);
+    for (int k = 0; k < INTEGRALS; k++)
+      part[k][n] = POINT_END_MOMENTUM[n] * (data->momentum_weight[n] * value[k]);
+  }
+  for (int k = 0; k < INTEGRALS; k++)
+    sum[k] = points_total(part[k]);
+}
+#endif

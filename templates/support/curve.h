@@ -1,3 +1,26 @@
+#ifdef HAMILTONIAN
+/* Initial velocity of a curve from p0. Requires: HAMILTONIAN, 1 for Hamiltonian systems. */
+static int nearby_velocity(const step_data *step, double *v0)
+{
+  double u[2 * M];
+  int status;
+  if (HAMILTONIAN)
+    return NAME(velocity)(step->t, step->q0, step->p0, step->parameters, v0, step->scratch);
+  memcpy(u, step->q0, sizeof(double) * M);
+  memcpy(u + M, v0, sizeof(double) * M);
+  status = invert_from(step->t, u, step->p0, step->parameters, step->scratch);
+  memcpy(v0, u + M, sizeof(double) * M);
+  return status;
+}
+#else
+/* Initial velocity of a curve as an unknown; the end of the last curve is the initial guess. */
+static int nearby_velocity(const step_data *step, double *v0)
+{
+  (void)step, (void)v0;
+  return OK;
+}
+#endif
+
 /* Collocation curve of a step: initial velocity v0 and scaled accelerations z = h a at the nodes. Requires:
  * one_trajectory.h, a mass, the tables COLLOCATION, NODE_END, NODE_MASK, whose column j multiplies node j. */
 typedef struct {
@@ -64,3 +87,33 @@ static inline void end_increment(const step_data *step, const curve_data *curve,
   for (int i = 0; i < M; i++)
     dq[i] = lanes_total(NODE_MASK * NODE_END * (step->h * (curve->v0[i] + apply_to(COLLOCATION, curve->z[0][i]))));
 }
+
+#ifdef NODES
+/* Quadrature points on a collocation curve. Requires: curve.h, NODES, the tables POINT_POSITION, POINT_VELOCITY. */
+
+/* Positions and velocities at the quadrature points. */
+static inline void place_points(const step_data *step, const curve_data *curve, lanes *u)
+{
+  for (int i = 0; i < M; i++) {
+    const lanes V = curve->v0[i] + apply_to(COLLOCATION, curve->z[0][i]);
+    u[i] = step->q0[i] + (step->carry_q[i] + apply_to(POINT_POSITION, step->h * V));
+    u[M + i] = apply_to(POINT_VELOCITY, V);
+  }
+}
+
+/* v0 -= mass^-1 misfit, averaged over the nodes; returns the squared relative change. */
+static inline double correct_velocity(const lanes *mass, const double *misfit, const double *inverse_size, double *v0)
+{
+  lanes r[M];
+  double total = 0.0;
+  for (int i = 0; i < M; i++)
+    r[i] = lanes_of(misfit[i]);
+  solve_mass(mass, r);
+  for (int i = 0; i < M; i++) {
+    const double correction = lanes_total(NODE_MASK * r[i]) / NODES, moved = correction * inverse_size[i];
+    total += moved * moved;
+    v0[i] -= correction;
+  }
+  return total;
+}
+#endif

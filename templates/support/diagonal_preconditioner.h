@@ -1,4 +1,4 @@
-/* Preconditioner for Newton-GMRES from the diagonal of F'. Requires: linear_vectors.h. */
+/* Preconditioner for Newton-GMRES from the diagonal of F'. Requires: array_newton.h. */
 
 enum { SPARE_VECTORS = 0 }; /* of work */
 

@@ -8,7 +8,7 @@ static real largest_error(const run_memory *run, const step_data *step, const so
 }
 #elif defined(LIBRARY_FALLBACK)
 /* Largest error estimate of steps by fixed-point iteration, or by the fallback library where it failed. Requires:
- * curve_error.h, external_fallback.h, whose error is converted to the same power. */
+ * curve_error.h, library_fallback.h, whose error is converted to the same power. */
 static SELDOM double fallback_error(const run_memory *run, const double *workspace)
 {
   return larger(run->error, pow(*workspace, 1 / ERROR_POWER));

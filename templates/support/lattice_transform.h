@@ -1,6 +1,6 @@
 /* Fast Fourier transforms along the axes of lattices, at all points of a step, with one pass per factor of the size,
  * each from one array into another (Stockham autosort; C. Van Loan, Computational Frameworks for the Fast Fourier
- * Transform, 1992, section 1.7). Requires: indexed_newton.h. */
+ * Transform, 1992, section 1.7). Requires: array_newton.h. */
 
 enum { LARGEST_FACTOR = 499 }; /* of a size that is transformed: a pass costs as many products per element */
 

@@ -1,3 +1,19 @@
+#ifndef VECTORS_BY_ITERATION
+/* Tangent and adjoint vectors over steps that are each solved by Newton's method. Requires: vectors_by_newton.h. */
+enum {
+  STEPS_AT_ONCE = 1
+};
+
+/* Propagates the vectors over step `first`. */
+static int propagate_steps(propagation *over, long long first, long long end)
+{
+  const int status = vectors_by_newton(over, first, 0);
+  (void)end;
+  over->report->steps += status == OK;
+  return status;
+}
+#endif
+
 /* Tangent or adjoint vectors over a sequence of steps, forward or backward. On failure report->t is the time of the
  * failed step. Requires: propagate_steps, which propagates them over at most STEPS_AT_ONCE steps. */
 int NAME(linearise)(long long steps, const real *t, const real *h, const real *q, const real *p,

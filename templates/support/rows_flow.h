@@ -9,3 +9,14 @@ int NAME(flow_rows)(int part, long long steps, long long every, int count, long 
   flow_call way = {.steps = steps, .every = every, .count = count};
   return flow_rows((flow_part)part, &way, rows, x, given, found, report);
 }
+
+#ifdef SECOND_DERIVATIVES
+/* Derivatives of gradients, (rows, count, STEP_INPUTS), for callers with arrays. Requires: flow.h. */
+
+int NAME(hessian_rows)(long long steps, long long every, int count, long long rows, const real *x, const real *partials,
+    const real *changes, real *found, solver_report *report)
+{
+  flow_call way = {.steps = steps, .every = every, .count = count};
+  return hessian_rows(&way, rows, x, partials, changes, found, report);
+}
+#endif

@@ -37,7 +37,7 @@ typedef struct {
 /* h v of a coordinate. */
 typedef struct {
   number high, low;
-} drift;
+} drift_words;
 
 /* Arguments and arrays of a step: the points X and the forces F there. */
 typedef struct {
@@ -51,7 +51,7 @@ typedef struct {
   const lanes *last, *before; /* forces in the last step and in the one before */
   double scale; /* of coordinates */
 #else
-  drift *drifts;
+  drift_words *drifts;
   lanes *base, *rests; /* points of the straight line; low words of the iteration, with the first forces */
   number *inverse_size;
 #endif
@@ -67,12 +67,12 @@ static void prepare_step_size(double h, iteration_data *data)
   }
 }
 
-PASS drift find_drift(const step_points *w, long long i)
+PASS drift_words find_drift(const step_points *w, long long i)
 {
   const double h = w->step->h;
   const number inverse = w->data->inverse_mass[i], v = inverse * w->step->p0[i];
   const number v_low = fused_numbers(inverse, w->step->p0[i], -v);
-  drift of;
+  drift_words of;
   of.high = h * v;
   of.low = fused_numbers(number_of(h), v, -of.high) + h * (v_low + inverse * w->step->carry_p[i]);
   return of;
@@ -104,13 +104,13 @@ PASS number unit_of(const step_points *w, long long i)
 }
 
 /* Size of a coordinate in the step: |q| + |h v| + |h^2 F / m|. */
-PASS number size_of(const step_points *w, drift of, long long i)
+PASS number size_of(const step_points *w, drift_words of, long long i)
 {
   return magnitude(w->step->q0[i]) + magnitude(of.high) + magnitude(unit_of(w, i) * at_first(&w->F[i]));
 }
 
 /* Low words of a point without forces. */
-PASS lanes low_words(const step_points *w, int g, drift of, long long i)
+PASS lanes low_words(const step_points *w, int g, drift_words of, long long i)
 {
   return w->step->carry_q[i] + DRIFT[g] * of.low + DRIFT_LOW[g] * of.high;
 }
@@ -123,7 +123,7 @@ static inline lanes sum_of_three(lanes x, lanes y, lanes rest)
 }
 
 /* A point with double-double coefficients. */
-PASS lanes accurate_point(const step_points *w, int g, drift of, long long i)
+PASS lanes accurate_point(const step_points *w, int g, drift_words of, long long i)
 {
   const iteration_data *data = w->data;
   const lanes sum = SUM_OF_FORCES(PRODUCT, w, g, i), low = SUM_OF_FORCES(PRODUCT_LOW, w, g, i);
@@ -141,7 +141,7 @@ PASS end_increments increments_of(const step_points *w, long long i)
 {
   const iteration_data *data = w->data;
   const lanes *F = &w->F[i];
-  const drift of = DRIFT_OF(w, i);
+  const drift_words of = DRIFT_OF(w, i);
   const number sum = weigh_apart_twice(POINT_END_POSITION, POINT_END_POSITION_LOW, F, EXTENT(w->n));
   const number kick = data->inverse_mass[i] * (data->square * sum), q = of.high + kick, part = q - of.high;
   end_increments end;
@@ -170,7 +170,7 @@ PASS lanes improve_points(const step_points *w, section here, number *size)
   lanes change = lanes_of(0.0);
   number sizes = number_of(0.0);
   for (long long i = here.first; i < here.end; i++) {
-    const drift of = DRIFT_OF(w, i);
+    const drift_words of = DRIFT_OF(w, i);
     const number unit = unit_of(w, i);
     for (int g = 0; g < GROUPS; g++) {
       lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
@@ -240,7 +240,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 {
   const section all = {0, M};
   coordinates X[GROUPS], base[GROUPS], rests[GROUPS], own[GROUPS], *F = kept(past, own);
-  drift drifts[M];
+  drift_words drifts[M];
   number inverse_size[M];
   const step_points w = {step, data, X[0], F[0], M, drifts, base[0], rests[0], inverse_size};
   progress now = before_iterations();

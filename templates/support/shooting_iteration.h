@@ -1,5 +1,5 @@
 /* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
- * stationary form, with multipliers of the collocation equations). Requires: curve_points.h, the tables, the kernels
+ * stationary form, with multipliers of the collocation equations). Requires: curve.h, the tables, the kernels
  * node_lanes and action_lanes. */
 #define ROUNDING_MARGIN 0.25 /* after one converged iteration, variations are rounding errors and do not decrease */
 

@@ -1,5 +1,5 @@
 /* Splitting step of an indexed system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
- * increments.h, add_forces, LEAPS, CHUNK, the tables. */
+ * arrays.h, add_forces, LEAPS, CHUNK, the tables. */
 
 /* Parts of work: positions of the next kick, forces at the end of a step, increments of positions and momenta. */
 typedef struct {

@@ -1,6 +1,6 @@
-/* Comparison of a step of an indexed system with two steps of half its size, as in observed_error.h. The half steps are solved
- * in place, so that F of the step is lost; forces of former steps are preserved. Requires: sizes.h,
- * HALVES_VECTORS, solve and continue_steps of a solver. */
+/* Comparison of a step of arrays with two steps of half its size, as in observed_error.h. The half steps are solved in
+ * place, so that F of the step is lost; forces of former steps are preserved. Requires: sizes.h, HALVES_VECTORS, solve
+ * and continue_steps of a solver. */
 
 /* Last parts of work: the state at the start of a step; increments of positions by the step, and by its first half;
  * increments of momenta by the step. */
@@ -115,7 +115,8 @@ static double difference(const run_memory *run, const numbers *x, long long n)
   return most > ROUNDING_OF_HALVES ? most : 0.0;
 }
 
-/* Computes the error of the solved step as in observed_error.h, of momenta too if requested; state and time are restored. */
+/* Computes the error of the solved step as in observed_error.h, of momenta too if requested; state and time are
+ * restored. */
 static SELDOM int compare_with_halves(run_memory *run, const problem *given, long long n, int momenta,
     const solver_options *options, double *error)
 {
@@ -150,5 +151,88 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
   copy_state(&kept, &now, own);
   run->h = whole;
   run->uneven = uneven;
+  return status;
+}
+
+/* Step of an indexed system with a solver: error estimate, comparison with half steps, update of the state. Requires:
+ * solve, continue_steps; tables LAST_ALONE, LAST, BEFORE; curve_error.h, sizes.h, array_step.h. */
+
+/* Largest coordinate and largest momentum. */
+static void find_size(const run_memory *run, long long n, double *q, double *p)
+{
+  sums all;
+  begin_sums(&all, run, n);
+  while (next_block(&all)) {
+    double of_q = 0.0, of_p = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      of_q = larger(of_q, fabs(run->q[i]));
+      of_p = larger(of_p, fabs(run->p[i]));
+    }
+    add_block(&all, of_q, of_p);
+  }
+  wait_at_barrier(run);
+  *q = largest_of(&all, 0);
+  *p = largest_of(&all, 1);
+}
+
+/* Advances the state to the end of the step; records its error and the number of steps for the next predictor. */
+static void accept(run_memory *run, long long n, double error, long long guess)
+{
+  const int sized = is_sized(run), worse = is_worse(run, error);
+  double start, start_p, q, p;
+  if (sized || worse)
+    find_size(run, n, &start, &start_p);
+  continue_steps(run, n);
+  if (sized || worse) {
+    find_size(run, n, &q, &p);
+    q = larger(start, q);
+    p = larger(start_p, p);
+  }
+  if (sized)
+    note_size(run, start, q, p);
+  if (worse)
+    note_error(run, run->t, error, q, p);
+  run->guess = guess;
+  run->turn = (run->turn + 1) % 3;
+}
+
+/* Returns 1 if a step is compared with its half steps: the first of a run, one of COMPARED later, and those whose error
+ * estimate is clearly the largest so far. */
+static inline int is_compared(const run_memory *run, double error)
+{
+  return ERROR_POWER > 0.0 && (run->step % COMPARED == 0 || error > DOUBTFUL * run->error);
+}
+
+/* Replaces the error estimate by the difference from the half steps if that is larger. If the half steps have no
+ * solution, the step fails unless its estimate is at round-off level. */
+static SELDOM int compare(run_memory *run, const problem *given, long long n, const solver_options *options,
+    double *error)
+{
+  double apart;
+  const int status = compare_with_halves(run, given, n, 0, options, &apart);
+  if (status == OK)
+    *error = larger(*error, pow(apart, 1 / ERROR_POWER));
+  return status != OK && pow(*error, ERROR_POWER) < ROUNDOFF_LEVEL ? OK : status;
+}
+
+/* Performs a step of the same size as the previous one. */
+static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+    solver_report *report)
+{
+  const struct predictor_tables_of tables = {LAST_ALONE, LAST, BEFORE};
+  const double decay = now_and_then(run);
+  long long guess = run->guess;
+  double error, again;
+  int status = solve(run, given, n, &tables, &guess, decay, &error, options, report);
+  if (status == OK && is_compared(run, error)) {
+    solver_report unread = {0};
+    status = compare(run, given, n, options, &error);
+    guess = run->guess;
+    if (status == OK)
+      status = solve(run, given, n, &tables, &guess, decay, &again, options, &unread);
+    run->guess = status == OK ? run->guess : 0;
+  }
+  if (status == OK)
+    accept(run, n, error, guess);
   return status;
 }

@@ -1,5 +1,5 @@
 /* Worker threads. They are started by a call and joined at its end, so that none exists when a process forks. Requires:
- * indexed_threads.h, MOST_THREADS, is_worth_sharing. */
+ * arrays.h, MOST_THREADS, is_worth_sharing. */
 #ifdef SCVI_THREADS
 #include <pthread.h>
 #endif
@@ -64,3 +64,44 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
   return way->go(run, way, report);
 }
 #endif
+
+/* Runs of indexed systems in arrays of the caller. Requires: array_run.h, take_step of a solver,
+ * ERROR_POWER. */
+
+solver_options NAME(default_options)(void)
+{
+  const solver_options options = {TOLERANCE, MAX_ITERATIONS, 0};
+  return options;
+}
+
+static int take_steps(run_memory *run, const job *way, solver_report *report)
+{
+  const long long n = NAME(coordinates)(way->given);
+  while (report->steps < way->steps) {
+    int status;
+    report->t = run->t;
+    status = take_step(run, way->given, n, way->options, report);
+    if (status != OK)
+      return status;
+    add_compensated(&run->t, &run->t_low, run->h, 0.0);
+    run->step++;
+    report->steps++;
+  }
+  return OK;
+}
+
+int NAME(advance)(run_memory *run, const problem *given, long long steps, const solver_options *options,
+    solver_report *report)
+{
+  const solver_options standard = NAME(default_options)();
+  const job way = {.go = take_steps, .given = given, .options = options ? options : &standard, .steps = steps};
+  solver_report unread;
+  report = report ? report : &unread;
+  memset(report, 0, sizeof *report);
+  return run_workers(run, &way, report);
+}
+
+double NAME(step_error)(const run_memory *run)
+{
+  return pow(run->error, ERROR_POWER);
+}

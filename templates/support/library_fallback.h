@@ -1,0 +1,60 @@
+/* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
+
+/* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,
+ * otherwise NaN. */
+typedef struct {
+  int (*step)(const step_data *step, double *dq, double *dp, const solver_options *options, solver_report *report,
+      double *error);
+} fallback;
+
+#ifdef LIBRARY_FALLBACK
+/* Fallback to the Newton solver of another library, which is loaded on demand. Until it is set, a step whose
+ * fixed-point iteration fails returns FALLBACK_REQUIRED, is not performed, and has to be repeated. Requires:
+ * library_fallback.h. */
+static const fallback *library_fallback; /* set once, before the calls that need it are repeated */
+
+void NAME(set_fallback)(const void *shared_fallback)
+{
+  library_fallback = shared_fallback;
+}
+
+/* Solves the step by the fallback library, which leaves its error estimate in the workspace. */
+static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *workspace)
+{
+  (void)status;
+  if (!library_fallback)
+    return STATUS(FALLBACK_REQUIRED);
+  return library_fallback->step(step, dq, dp, options, report, workspace);
+}
+#else
+/* Newton solver for a library without it (see library_fallback.h). Requires: newton_fallback.h, FALLBACK_WORKSPACE. */
+#include <stdlib.h>
+
+static SELDOM int provided_step(const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *error)
+{
+  double *workspace = malloc(sizeof(double) * STATUS(FALLBACK_WORKSPACE));
+  step_data own = *step;
+  int status;
+  if (workspace == NULL)
+    return STATUS(FALLBACK_REQUIRED);
+  own.scratch = workspace;
+  own.first = 1;
+  own.tables = NULL;
+  status = fall_back(NOT_CONVERGED, &own, dq, dp, options, report, workspace + SCRATCH);
+  *error = NAN;
+#ifdef STAGE_POWER
+  if (status == OK)
+    *error = pow(stage_error(&own, newton_in(workspace + SCRATCH).z, dq, ALL, DECAY, 0.0), STAGE_POWER);
+#endif
+  free(workspace);
+  return status;
+}
+
+const void *NAME(provided_fallback)(void)
+{
+  static const fallback shared_fallback = {provided_step};
+  return &shared_fallback;
+}
+#endif
