@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 from pumped_leapfrog import EVERY, ROWS, STEP_INPUTS, STEPS, hessian, partials, states, stepper, weights
 
@@ -14,6 +15,7 @@ from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native import building
 from scvi_codegen.rendering.flow import casadi_name, with_casadi_flow, with_xla_flow
 
+EVERY_STEP, NOT_FINITE_STATUS = 1, 3
 SAVED, SIZE = STEPS // EVERY + 1, len(STEP_INPUTS)
 compiled = cache(stepper)
 WAYS = {"rtol": 0, "atol": 2e-12}
@@ -47,6 +49,36 @@ def test_forward_and_adjoint_derivatives_of_batches():
     assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
 
 
+OVERFLOWS = np.array([[1e300, 0.0, 1e300, 0.0, 1.0, -30.0, 0.0, 1.0, 0.5, 0.4]])
+"""A state that grows by a factor in each step, until it is infinite."""
+
+
+def first_failure():
+    """The number of steps whose ends are finite, by a leapfrog of :data:`OVERFLOWS`."""
+    (q, _, p, _, m, k, *_, h), n = OVERFLOWS[0], 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        while True:
+            p = p - h / 2 * (k * q)
+            q = q + h * p / m
+            p = p - h / 2 * (k * q)
+            if not np.isfinite([q, p]).all():
+                return n
+            n += 1
+
+
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_failed_steps_are_reported_with_their_number_and_time(part):
+    """The states fail after a saved one; derivatives as the states do."""
+    failing, library = first_failure(), flow().library
+    assert EVERY_STEP < failing < STEPS
+    found = np.zeros((1, SIZE, STEPS + 1, SIZE))
+    given = np.ones((1, SIZE, STEPS + 1, 4))
+    report, pointers = library.new("report *"), [library.pointer(each) for each in (OVERFLOWS, given, found)]
+    assert library.function("flow_rows")(part, STEPS, EVERY_STEP, 1, 1, *pointers, report) == NOT_FINITE_STATUS
+    assert report.steps == failing
+    assert report.t == pytest.approx(OVERFLOWS[0, 8] + failing * OVERFLOWS[0, 9])
+
+
 def test_second_derivatives_of_batches():
     same, changes = np.tile(weights(), (2, SIZE, 1, 1)), np.tile(np.eye(SIZE), (2, 1, 1))
     found = called(
@@ -59,11 +91,26 @@ def test_second_derivatives_of_batches():
 def test_external_functions_of_casadi_are_exported():
     source, name = with_casadi_flow(compiled().derivatives, STEPS, EVERY), casadi_name(compiled().source.prefix)
     arguments = "(const double **arg, double **res, long long *iw, double *w, int mem);\n"
-    shapes = f"const long long *{name}_sparsity_out(long long i);\n"
+    shapes = "".join(
+        f"const long long *{prefix}{name}_sparsity_{way}(long long i);\nlong long {prefix}{name}_n_{way}(void);\n"
+        for prefix in ("", "jac_", "adj1_")
+        for way in ("in", "out")
+    )
     functions = "".join(f"int {prefix}{name}{arguments}" for prefix in ("", "jac_", "adj1_"))
     source = replace(source, declarations=source.declarations + functions + shapes)
     lib, ffi, _ = building.load(source, flags=compiled().flags)
-    assert list(ffi.unpack(getattr(lib, f"{name}_sparsity_out")(0), 3)) == [4, SAVED, 1]
+    given, saved, none = [SIZE, 1, 1], [4, SAVED, 1], [4, SAVED, 0]
+    wanted = {
+        "": ([given], [saved]),
+        "jac_": ([given, none], [[4 * SAVED, SIZE, 1]]),
+        "adj1_": ([given, none, saved], [given]),
+    }
+    for prefix, expected in wanted.items():
+        for way, each in zip(("in", "out"), expected, strict=True):
+            shape = getattr(lib, f"{prefix}{name}_sparsity_{way}")
+            assert getattr(lib, f"{prefix}{name}_n_{way}")() == len(each)
+            assert [list(ffi.unpack(shape(k), 3)) for k in range(len(each))] == each
+            assert shape(len(each)) == ffi.NULL
 
     def external(prefix, arrays, shape):
         found, saved = np.zeros(shape), [np.ascontiguousarray(array, dtype=float) for array in arrays]
@@ -120,7 +167,13 @@ def test_handlers_of_xla_are_exported(tmp_path):
     source = with_xla_flow(compiled().derivatives, "stub")
     source = replace(source, declarations=source.declarations + FRAME)
     lib, ffi, _ = building.load(source, flags=(*compiled().flags, f"-I{tmp_path}"))
-    failed = ffi.callback("void *(void *)", lambda error: error)
+    messages = []
+
+    @ffi.callback("void *(void *)")
+    def failed(error):
+        messages.append(ffi.string(ffi.cast("char **", error)[2]).decode())  # after the size and a pointer
+        return error
+
     api = ffi.new("void *[1]", [ffi.cast("void *", failed)])
 
     def handled(part, arrays, shape):
@@ -134,7 +187,8 @@ def test_handlers_of_xla_are_exported(tmp_path):
         scalars = [ffi.new("scalar *", (ffi.cast("void *", count),)) for count in counts]
         args, rets = ffi.new("buffer *[]", buffers[:-1]), ffi.new("buffer *[]", buffers[-1:])
         frame = ffi.new("call_frame *", (ffi.NULL, api, args, rets, ffi.new("scalar *[]", scalars)))
-        assert getattr(lib, f"{source.prefix}_xla_{part}")(frame) == ffi.NULL
+        error = getattr(lib, f"{source.prefix}_xla_{part}")(frame)
+        assert (error == ffi.NULL) == (not messages)
         return alive[-1]
 
     assert_allclose(handled("states", [ROWS], (2, SAVED, 4)), [states(row) for row in ROWS], **WAYS)
@@ -143,3 +197,7 @@ def test_handlers_of_xla_are_exported(tmp_path):
     assert_allclose(np.moveaxis(pushed, 1, -1), exact, rtol=1e-11, atol=1e-11)
     pulled = handled("vjp", [ROWS, np.tile(weights(), (2, 1, 1, 1))], (2, 1, SIZE))
     assert_allclose(pulled[:, 0], np.tensordot(exact, weights(), ((1, 2), (0, 1))), rtol=1e-11, atol=1e-11)
+    handled("states", [OVERFLOWS], (1, SAVED, 4))
+    (message,) = messages
+    assert message.startswith(f"step {first_failure()} at t = ")
+    assert message.endswith(" failed: a value is infinite or NaN")

@@ -129,8 +129,11 @@ def test_communication_steps_of_any_length_are_divided_equally(fmu):
     p = stepper.momentum([0.3], [0.5], 0.5)
     run = stepper.integrate([0.3], p, h=0.25 / 3, steps=3, t=0.5, parameters={"w_0": 0.0, "u_0": 0.0})
     assert [*one.get("t"), *one.get("q")] == [run.t[-1], *run.q[-1]]
-    assert one.step(0.75, 1e-3) == OK
-    assert_allclose(one.get("t"), 0.751, rtol=1e-15)
+    assert one.step(0.75, 0.25) == OK
+    run = stepper.integrate([0.3], p, h=0.25 / 3, steps=6, t=0.5, parameters={"w_0": 0.0, "u_0": 0.0})
+    assert [*one.get("t"), *one.get("q")] == [run.t[-1], *run.q[-1]]  # the steps before are continued
+    assert one.step(1.0, 1e-3) == OK
+    assert_allclose(one.get("t"), 1.001, rtol=1e-15)
 
 
 def test_million_rounded_communication_points_are_reached(fmu):
@@ -208,6 +211,45 @@ def test_forbidden_calls_are_errors_with_a_reason(fmu):
         assert f"fmi3{name}" in one.log[-1][2]
     assert one.call("GetBoolean", None, c_size_t(0), None, c_size_t(0)) == OK
     one.call("FreeInstance")
+
+
+def test_all_unsupported_functions_are_errors_with_their_name(fmu):
+    one = Slave(fmu)
+    [library] = (fmu.folder / "binaries").glob("*/*")
+    exported = {name.decode()[4:] for name in re.findall(rb"fmi3[A-Z]\w+", library.read_bytes())}
+    text = next(
+        text for name, text in fmu_module._texts(pushed(), "push", "auto")[1].items() if "absent" in name
+    ).decode()
+    absent = set(re.findall(r"^(?:ABSENT|NO_MODE)\((\w+)", text, re.MULTILINE))
+    assert absent < exported
+    assert len(absent) > 30
+    for name in absent:
+        assert one.call(name, *[c_void_p()] * 8) == ERROR
+        assert one.log[-1][2] == f"this FMU does not support fmi3{name}"
+    kinds = re.findall(r"^NO_VARIABLES\((\w+)", text, re.MULTILINE)
+    assert len(kinds) == 11
+    for kind in kinds:
+        for way in ("Get", "Set"):
+            assert one.call(f"{way}{kind}", None, c_size_t(0), None, c_size_t(0)) == OK
+            assert one.call(f"{way}{kind}", (c_uint32 * 1)(1), c_size_t(1), None, c_size_t(1)) == ERROR
+            assert one.log[-1][2] == f"this FMU has no variables of type {kind}"
+    for kind in ("ModelExchange", "ScheduledExecution"):
+        function = getattr(fmu.library, f"fmi3Instantiate{kind}")
+        function.restype = c_void_p
+        flags, environment = [c_bool(False)] * 2, c_void_p()
+        callbacks = [one._log, *[c_void_p()] * (0 if kind == "ModelExchange" else 3)]
+        before = len(one.log)
+        assert function(b"one", fmu.token, None, *flags, environment, *callbacks) is None
+        assert one.log[before:] == [(ERROR, b"logStatusError", "this FMU supports only co-simulation")]
+
+
+def test_version_and_start_time(fmu):
+    fmu.library.fmi3GetVersion.restype = c_char_p
+    assert fmu.library.fmi3GetVersion() == b"3.0"
+    for start in (float("inf"), float("nan")):
+        one = Slave(fmu)
+        assert one.start(start) == ERROR
+        assert one.log[-1][2] == "the start time must be finite"
 
 
 def test_failed_instantiation_returns_null(fmu):
