@@ -27,7 +27,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import overload
 
 from numpy.typing import ArrayLike
@@ -72,6 +72,7 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
+from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.indexed_stepper import IndexedStepper
 from scvi_codegen.runtime.stepper import Stepper
@@ -170,21 +171,15 @@ def compile_stepper(
     if isinstance(system, ArraySystem):
         _check_sizes_not_needed(system, symmetries=symmetries, events=events, time_transformation=time_transformation)
         array_sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
-        return IndexedStepper(
-            array_sources.plain, array_sources.interface, controlled=lambda: array_sources.controlled, flags=flags
-        )
+        variants = Variants(make=lambda name: array_sources.controlled if name == "controlled" else None)
+        return IndexedStepper(array_sources.plain, array_sources.interface, variants=variants, flags=flags)
     sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, time_transformation)
     own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
     source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
     return Stepper(
         source,
         interface,
-        ensemble=sources.remembered("ensemble", lambda: render_ensemble(sources.program())),
-        controlled=sources.remembered("controlled", sources.controlled),
-        fallback=sources.remembered("fallback", sources.fallback),
-        tangent=sources.remembered("tangent", sources.tangent),
-        curvature=sources.remembered("curvature", partial(sources.tangent, second=True)),
-        changes=lambda count: sources.remembered(f"changes {count}", partial(sources.changes, count))(),
+        variants=Variants(make=sources.variant),
         flags=flags,
         events=as_events(events),
     )
@@ -283,15 +278,19 @@ class _Sources:
     def _rendered(self, control: Control | None = None) -> Source:
         return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
 
-    def remembered(self, name: str, make: Callable[[], Source | None]) -> Callable[[], Source | None]:
-        """Return a function that makes a source or loads it from the cache."""
-
-        @cache
-        def source() -> Source | None:
-            text = cached_source((*self.key, name), lambda: _json_of(make()))
-            return Source.from_json(text) if text else None
-
-        return source
+    def variant(self, name: str) -> Source | None:
+        """Return the source of a variant (:class:`Variants`) from the cache, or derive it."""
+        kind, _, count = name.partition(" ")
+        made: dict[str, Callable[[], Source | None]] = {
+            "ensemble": lambda: render_ensemble(self.program()),
+            "controlled": self.controlled,
+            "fallback": self.fallback,
+            "derivatives": self.tangent,
+            "second_derivatives": lambda: self.tangent(second=True),
+            "changes": lambda: self.changes(int(count)),
+        }
+        text = cached_source((*self.key, name), lambda: _json_of(made[kind]()))
+        return Source.from_json(text) if text else None
 
 
 def _json_of(source: Source | None) -> str:

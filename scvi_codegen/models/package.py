@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
 from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.rendering.source import PREFIX, Interface, Source, check_interface, included
+from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
 
@@ -109,7 +110,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
     except ValueError as error:
         raise _damaged(target, error) from error
     controlled = source if ADVANCE_TO in source.declarations else None
-    return Stepper(source, interface, controlled=lambda: controlled)
+    return Stepper(source, interface, variants=Variants({"controlled": controlled}))
 
 
 def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:

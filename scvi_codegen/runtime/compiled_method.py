@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -18,15 +18,39 @@ from scvi_codegen.runtime.inputs import (
     Array,
 )
 
-__all__ = ["CompiledMethod", "no_source"]
+__all__ = ["CompiledMethod", "Variants"]
 
 
 MOST_EVENT_SETS = 16
 """Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
 
 
-def no_source(*_: int) -> None:
-    """Return ``None``: the default for source variants that a method does not have."""
+class Variants:
+    """C sources of the variants of a method by name, derived on first use.
+
+    The names are ``"ensemble"``, ``"controlled"`` (adaptive steps), ``"fallback"`` (Newton's iteration),
+    ``"derivatives"`` and ``"second_derivatives"`` of steps, and ``"changes K"`` (ensembles with K tangent vectors).
+
+    Args:
+        made: sources by name; ``None`` for a variant that the method lacks.
+        make: derives a source that is not among them.
+    """
+
+    def __init__(
+        self, made: Mapping[str, Source | None] | None = None, make: Callable[[str], Source | None] = lambda _: None
+    ) -> None:
+        self._made, self._make = dict(made or {}), make
+
+    def __getitem__(self, name: str) -> Source | None:
+        if name not in self._made:
+            self._made[name] = self._make(name)
+        return self._made[name]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # second derivatives and tangent-vector variants are slow to derive: included only if already made
+        for name in ("ensemble", "controlled", "fallback", "derivatives"):
+            _ = self[name]
+        return (Variants, (self._made,))
 
 
 class CompiledMethod:
@@ -48,20 +72,12 @@ class CompiledMethod:
         source: Source,
         interface: Interface,
         *,
-        ensemble: Callable[[], Source | None] = no_source,
-        controlled: Callable[[], Source | None] = no_source,
-        fallback: Callable[[], Source | None] = no_source,
-        tangent: Callable[[], Source | None] = no_source,
-        curvature: Callable[[], Source | None] = no_source,
-        changes: Callable[[int], Source | None] = no_source,
+        variants: Variants | None = None,
         flags: tuple[str, ...] = building.TUNED_FLAGS,
         events: tuple[Event, ...] = (),
     ) -> None:
         self.interface, self.flags, self.events = interface, flags, events
-        self._ensemble, self._controlled, self._fallback, self._tangent = ensemble, controlled, fallback, tangent
-        self._changes, self._with_changes = changes, dict[int, Source | None]()
-        self._curvature = curvature
-        self._second: Source | None = None
+        self._variants = Variants() if variants is None else variants
         self._with_tangent: Binding | None = None
         self._with_curvature: Binding | None = None
         self._with_control: Self | None = None
@@ -91,32 +107,29 @@ class CompiledMethod:
     @property
     def ensemble(self) -> Source | None:
         """C source of the ensemble variant, derived on first use; ``None`` if the method has none."""
-        return self._ensemble()
+        return self._variants["ensemble"]
 
     @property
     def fallback(self) -> Source | None:
         """C source of the fallback library with Newton's iteration, derived on first use; ``None`` if not needed."""
-        return self._fallback()
+        return self._variants["fallback"]
 
     @property
     def derivatives(self) -> Source | None:
         """C source with the derivatives of steps, derived on first use."""
-        return self._tangent()
+        return self._variants["derivatives"]
 
     @property
     def second_derivatives(self) -> Source | None:
         """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
-        self._second = self._curvature()
-        return self._second
+        return self._variants["second_derivatives"]
 
     def _variational_source(self, count: int) -> Source | None:
         """Return the C source of ensembles with ``count`` tangent vectors per trajectory, derived on first use.
 
         ``None`` if tangent vectors can only be propagated by the derivatives of steps.
         """
-        if count not in self._with_changes:
-            self._with_changes[count] = self._changes(count)
-        return self._with_changes[count]
+        return self._variants[f"changes {count}"]
 
     def prepare(
         self,
@@ -140,10 +153,10 @@ class CompiledMethod:
         """
         for each in (self,) if events is None else (self, self.with_events(events)):
             each.binding.set_fallback()
-            if adaptive and each._controlled() is not None:
+            if adaptive and each._variants["controlled"] is not None:
                 each._adaptive().binding.set_fallback()
-        wanted = ((tangent, self._tangent), (second, self._curvature), (ensemble, self._ensemble))
-        for source in [text() for is_wanted, text in wanted if is_wanted]:
+        wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
+        for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
             if source is not None:
                 building.load(source, flags=self.flags)
 
@@ -241,12 +254,7 @@ class CompiledMethod:
         return type(self)(
             self._plain,
             self.interface,
-            ensemble=self._ensemble,
-            controlled=self._controlled,
-            fallback=self._fallback,
-            tangent=self._tangent,
-            curvature=self._curvature,
-            changes=self._variational_source,
+            variants=self._variants,
             flags=self.flags,
             events=wanted,
         )
@@ -258,7 +266,7 @@ class CompiledMethod:
         return self._with_control
 
     def _loaded_with_control(self) -> Self:
-        source = self._controlled()
+        source = self._variants["controlled"]
         if source is None:
             raise MethodError(
                 f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
@@ -270,12 +278,7 @@ class CompiledMethod:
         return type(self)(
             source,
             self.interface,
-            ensemble=self._ensemble,
-            controlled=self._controlled,
-            fallback=self._fallback,
-            tangent=self._tangent,
-            curvature=self._curvature,
-            changes=self._variational_source,
+            variants=self._variants,
             flags=self.flags,
             events=self.events,
         )

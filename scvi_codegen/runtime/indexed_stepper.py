@@ -18,7 +18,7 @@ from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.thread_partition import MOST_THREADS
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.accuracy import FIXED_STEP_REMEDY, GROSS_ERROR, warn_of_energies, warn_of_large_steps
-from scvi_codegen.runtime.compiled_method import no_source
+from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import EventLike, as_events
 from scvi_codegen.runtime.global_error import checked_error, confirmed_run
@@ -49,7 +49,7 @@ class IndexedStepper:
     """Compiled integrator of an indexed system, for any number of coordinates.
 
     Args:
-        controlled: function that returns the source with adaptive steps, or ``None``.
+        variants: source with adaptive steps, ``"controlled"``.
 
     Attributes:
         source: the C source.
@@ -62,13 +62,14 @@ class IndexedStepper:
         source: Source,
         interface: Interface,
         *,
-        controlled: Callable[[], Source | None] = no_source,
+        variants: Variants | None = None,
         flags: tuple[str, ...] = TUNED_FLAGS,
     ) -> None:
-        self.source, self.interface, self.flags, self._controlled_text = source, interface, flags, controlled
+        self.source, self.interface, self.flags = source, interface, flags
+        self._variants = Variants() if variants is None else variants
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_rebuild, (self.source, self.interface, self._controlled_text(), self.flags))
+        return (_rebuild, (self.source, self.interface, self._variants, self.flags))
 
     def __repr__(self) -> str:
         return clipped(f"IndexedStepper({self.interface.title})", LONGEST)
@@ -85,7 +86,7 @@ class IndexedStepper:
     @cached_property
     def _controlled(self) -> Binding:
         """Binding of the library with adaptive steps."""
-        source = self._controlled_text()
+        source = self._variants["controlled"]
         if source is None:
             raise MethodError(
                 f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
@@ -96,7 +97,7 @@ class IndexedStepper:
 
     def prepare(self, *, adaptive: bool = True) -> None:
         """Compile now what the first run would compile; with ``adaptive`` also the variant that ``t_end=`` needs."""
-        variants = (self.source, self._controlled_text() if adaptive else None)
+        variants = (self.source, self._variants["controlled"] if adaptive else None)
         for source in filter(None, variants):
             load(source, flags=self.flags)
 
@@ -359,5 +360,5 @@ def _warn_of_energy_error(found: IndexedTrajectory) -> None:
         warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 
-def _rebuild(source: Source, interface: Interface, controlled: Source | None, flags: tuple[str, ...]) -> IndexedStepper:
-    return IndexedStepper(source, interface, controlled=lambda: controlled, flags=flags)
+def _rebuild(source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...]) -> IndexedStepper:
+    return IndexedStepper(source, interface, variants=variants, flags=flags)

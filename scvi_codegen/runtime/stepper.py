@@ -18,6 +18,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_large_steps
+from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.constraints import consistent
 from scvi_codegen.runtime.dense_output import times_of_run
 from scvi_codegen.runtime.ensembles import Ensembles
@@ -68,9 +69,7 @@ class Stepper(Ensembles):
     """Compiled integrator of one system: :class:`Integrator` with integrations, runs and ensembles."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # second derivatives and tangent-vector variants are slow to derive: included only if already made
-        texts = (self.ensemble, self._controlled(), self.fallback, self.derivatives, self._second)
-        return (_rebuild, (self._plain, self.interface, texts, self.flags, self.events, self._with_changes))
+        return (_rebuild, (self._plain, self.interface, self._variants, self.flags, self.events))
 
     @overload
     def integrate(
@@ -314,26 +313,6 @@ def _end_of(run: Run, steps: int | None) -> float:
 
 
 def _rebuild(
-    source: Source,
-    interface: Interface,
-    texts: tuple[Source | None, ...],
-    flags: tuple[str, ...],
-    events: tuple[Event, ...],
-    with_changes: Mapping[int, Source | None],
+    source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...], events: tuple[Event, ...]
 ) -> Stepper:
-    ensemble, controlled, fallback, tangent, curvature = (*texts, None, None)[:5]
-    stepper = Stepper(
-        source,
-        interface,
-        ensemble=lambda: ensemble,
-        controlled=lambda: controlled,
-        fallback=lambda: fallback,
-        tangent=lambda: tangent,
-        curvature=lambda: curvature,
-        changes=with_changes.get,
-        flags=flags,
-        events=events,
-    )
-    stepper._second = curvature
-    stepper._with_changes.update(with_changes)
-    return stepper
+    return Stepper(source, interface, variants=variants, flags=flags, events=events)

@@ -18,6 +18,7 @@ from scvi_codegen.native.fingerprint import fingerprint
 from scvi_codegen.native.flags import check_flags
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source, check_interface
+from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.step_plan import StepPlan
@@ -97,14 +98,8 @@ class Manifest:
 
     def stepper(self) -> Stepper:
         """Return the integrator, compiled or loaded from the cache."""
-        controlled = self.source if self.plan else None
-        return Stepper(
-            self.source,
-            self.interface,
-            controlled=lambda: controlled,
-            fallback=lambda: self.fallback,
-            flags=self.flags,
-        )
+        variants = Variants({"controlled": self.source if self.plan else None, "fallback": self.fallback})
+        return Stepper(self.source, self.interface, variants=variants, flags=self.flags)
 
     def reached(self, run: Run) -> bool:
         """Return whether a run has reached its end."""
