@@ -3,13 +3,13 @@
     python tests/faults/reach.py reach.json
     python tests/faults/mutate.py --count 150 --seed 1 --reach reach.json --results results.jsonl
 
-A fault is put into a copy of the checkout, in a folder of its own. ``verify`` is asked first, of systems by methods
-whose code the faulty file is part of, then the test files that reach the line (``reach.py``), one after the other; the
-first that notices ends it. Faults that do not compile or import are not counted. A fault on which more than
-``--seconds`` of processor time were spent without a notice counts as one that survives, and its line says so. The
-results, a line a fault, say where to go on: those that stand there are not tried again, survivors are with ``--again``.
-The faults that were drawn stand in ``results.plan``, each with the text around it, so that they are found again in
-files that changed.
+A fault is put into a copy of the checkout, in a folder of its own. Headers of C are tried in the golden programs first
+(``golden.py``). Then ``verify`` is asked, of systems by methods whose code the faulty file is part of, then the test
+files that reach the line (``reach.py``), one after the other; the first that notices ends it. Faults that do not
+compile or import are not counted. A fault on which more than ``--seconds`` of processor time were spent without a
+notice counts as one that survives, and its line says so. The results, a line a fault, say where to go on: those that
+stand there are not tried again, survivors are with ``--again``. The faults that were drawn stand in ``results.plan``,
+each with the text around it, so that they are found again in files that changed.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from functools import partial
 from pathlib import Path
 
 from checkout import ROOT, copied, run
+from golden import changed_program
 from operators import Place, places
 from reach import Reach
 
@@ -110,6 +111,8 @@ def noticed(copy: Path, place: Place, reach: Reach, unfit: list[str], seconds: f
     end = _spent() + seconds
     path = copy / place.path
     text = path.read_text()
+    if place.path.startswith("templates/support") and (cell := changed_program(text, place.applied(text))):
+        return "golden", cell
     cases = [case for case in CERTIFIED if certifies(copy, case, place.path)][:MOST_CASES]
     path.write_text(place.applied(text))
     try:
@@ -195,7 +198,8 @@ def main() -> None:
                 results.write(json.dumps({"fault": fault, "caught by": by, "words": words[:MOST_WORDS]}) + "\n")
             print(f"{by or 'SURVIVES':30} {fault}", flush=True)
     counts = Counter(
-        "survive" if not by else by if by in ("stillborn", "certificate") else "tests" for by in known.values()
+        "survive" if not by else by if by in ("stillborn", "certificate", "golden") else "tests"
+        for by in known.values()
     )
     print(dict(counts), *(f"fails without a fault, too: {test}" for test in unfit), sep="\n")
 
