@@ -6,11 +6,10 @@ both (``templates/support``), and so are the kernels except for the variables th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
 
-from scvi_codegen.ir.iteration import FixedPointIteration, IterationTable, StoredValues
+from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.rendering.fallback import HEADERS, Fallback
@@ -24,8 +23,6 @@ LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
 
 OF_TWO = ("pow", "atan2")
-
-Values: TypeAlias = tuple[Number, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +135,8 @@ def iteration_source(
         damping=damping,
         support=(*meaning.before, "convergence", meaning.memory, *fixed_point.parts, *solver),
         error_defines=_kept(fixed_point),
-        highest=_groups("HIGHEST", fixed_point.guess.highest),
-        next=_groups("NEXT", fixed_point.guess.next),
+        highest=_table("HIGHEST", fixed_point.guess.highest),
+        next=_table("NEXT", fixed_point.guess.next),
     )
 
 
@@ -180,55 +177,22 @@ def _solver(fixed_point: FixedPointIteration, fallback: Fallback) -> tuple[str, 
 
 
 def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:
-    points = len(fixed_point.guess.abscissae)
-    vector, matrix = _printers(meaning, points) if fixed_point.in_groups else (_vector, _columns)
+    one_each = fixed_point.in_groups and not meaning.are_points
+    points = len(fixed_point.guess.abscissae) if one_each else 0
     for each in (*fixed_point.tables, *(fixed_point.derivatives_tables if changes else ())):
-        print_table: Callable[[str, Any], str] = matrix if each.is_matrix else vector
-        yield print_table(each.name, each.numbers)
+        yield _table(each.name, each.numbers, points, groups=fixed_point.in_groups)
         if each.in_two_parts:
-            yield print_table(f"{each.name}_LOW", _rests(each))
+            low = tuple(tuple(map(DOUBLE.rest, x)) if each.is_matrix else DOUBLE.rest(x) for x in each.numbers)
+            yield _table(f"{each.name}_LOW", low, points, groups=fixed_point.in_groups)
 
 
-def _rests(each: IterationTable) -> Values | NumberTable:
-    """Return the low words of a table: the rounding errors of its numbers."""
-    if each.is_matrix:
-        return tuple(tuple(map(DOUBLE.rest, row)) for row in each.numbers)
-    return tuple(map(DOUBLE.rest, each.numbers))
-
-
-PrintVector: TypeAlias = Callable[[str, Values], str]
-PrintMatrix: TypeAlias = Callable[[str, NumberTable], str]
-
-
-def _printers(meaning: Lanes, points: int) -> tuple[PrintVector, PrintMatrix]:
-    """Return the functions that print vectors and matrices over points: all points in a vector, or one number each."""
-    if meaning.are_points:
-        return _groups, _columns
-    size = f"[{points}]"
-
-    def vector(name: str, values: Values) -> str:
-        return table(f"static const double {name}{size}", _numbers(values[:points]))
-
-    def matrix(name: str, rows: NumberTable) -> str:
-        return table(f"static const double {name}{size}{size}", [_numbers(row[:points]) for row in rows[:points]])
-
-    return vector, matrix
-
-
-def _numbers(values: Sequence[Number]) -> list[str]:
-    return [print_number(value) for value in values]
-
-
-def _groups(name: str, values: Values) -> str:
-    """Return a table with a number for each point."""
-    return table(f"static const lanes {name}[GROUPS]", _numbers(values))
-
-
-def _columns(name: str, rows: NumberTable) -> str:
-    """Return a table by columns: the contributions of point j to all points."""
-    columns = zip(*rows, strict=True)
-    return table(f"static const lanes {name}[POINTS * GROUPS]", [_numbers(column) for column in columns], braces=False)
-
-
-def _vector(name: str, values: Values) -> str:
-    return table(f"static const lanes {name}", _numbers(values))
+def _table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0, *, groups: bool = True) -> str:
+    """Return a table over points: one number for each of ``points``; if 0, vectors, those of a matrix by columns."""
+    kind, is_matrix = "double" if points else "lanes", isinstance(numbers[0], tuple)
+    if not is_matrix:
+        size = f"[{points}]" if points else "[GROUPS]" if groups else ""
+        return table(f"static const {kind} {name}{size}", [print_number(x) for x in numbers[: points or None]])
+    rows = [row[:points] for row in numbers[:points]] if points else [*zip(*numbers, strict=True)]
+    size = f"[{points}][{points}]" if points else "[POINTS * GROUPS]"
+    lines = [[print_number(x) for x in row] for row in rows]
+    return table(f"static const {kind} {name}{size}", lines, braces=bool(points))
