@@ -187,9 +187,7 @@ def _newton(
     return compile_stepper(system, method, solver="newton", flags=flags)
 
 
-def _given(
-    system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float
-) -> State:
+def _given(system: MechanicalSystem, stepper: Stepper, q: Any, p: Any, h: float | None, t: float) -> State:
     if (q is None) != (p is None):
         raise StateError("only one of q and p was passed: give both, or neither")
     if q is None or p is None:

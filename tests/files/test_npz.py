@@ -66,14 +66,24 @@ def ensemble_to_ends() -> Result:
 
 
 def driven() -> Result:
+    return with_input((np.array([0.0, 1.0, 4.0]), np.array([0.5, -0.2, 0.1])))
+
+
+def driven_without_breakpoints() -> Result:
+    return with_input((np.array([0.0, 4.0]), np.array([0.5, -0.2])))
+
+
+def with_input(table: Any) -> Result:
     stepper = sc.compile_stepper(pushed(), "svi:3")
-    table = (np.array([0.0, 1.0, 4.0]), np.array([0.5, -0.2, 0.1]))
     given = GIVEN | {"inputs": {"u": table}, "parameters": {"m": 1.3, "k": 0.8}}
     found = stepper.integrate([0.3, 0.2], [0.1, -0.4], **given)
     return described(found, "t", "q", "p", "h", "iterations")
 
 
-@pytest.mark.parametrize("made", [trajectory, ensemble, ensemble_to_ends, driven], ids=lambda made: made.__name__)
+KINDS = [trajectory, ensemble, ensemble_to_ends, driven, driven_without_breakpoints]
+
+
+@pytest.mark.parametrize("made", KINDS, ids=lambda made: made.__name__)
 def test_files_contain_the_result_and_its_description(made: Callable[[], Result], tmp_path: Path) -> None:
     result, expected = made()
     result.save(tmp_path / "result.npz")

@@ -1,0 +1,30 @@
+"""Relative error of the conserved energy after a run to a tolerance, compared with its definition."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+import scvi_codegen as sc
+from scvi_codegen.advice.tolerance_check import _lost_energy
+
+
+@pytest.mark.parametrize(("mass", "offset"), [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1e3, 7e4)])
+def test_energy_error_is_relative_to_energy_and_twice_the_kinetic_energy(mass, offset):
+    """A coarse run of an anharmonic oscillator; the size does not vanish where the energy does."""
+    system = sc.LagrangianSystem.from_text(
+        name="oscillator",
+        coordinates=["x"],
+        lagrangian="m*x_dot**2/2 - m*(x**2/2 + x**4/4) - offset",
+        parameters={"m": mass, "offset": offset},
+    )
+    run = sc.compile_stepper(system, "svi:1").integrate([1.0], velocity=[0.3], h=0.2, steps=50, t=0.4)
+    x, p = run.q[:, 0], run.p[:, 0]
+    energy = p**2 / (2 * mass) + mass * (x**2 / 2 + x**4 / 4) + offset
+    expected = np.abs(energy - energy[0]).max() / (np.abs(energy).max() + (p**2 / mass).max())
+    found = re.search(r"relative error of (\S+)$", _lost_energy(system, run, 1e-9))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(expected, rel=0.05)
+    assert _lost_energy(system, run, expected) == ""
