@@ -231,7 +231,6 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 #include "support/band.h"
 #include "support/legendre.h"
 #include "support/energies.h"
-#include "support/gather.h"
 #include "support/stages.h"
 
 /* Quadrature points: adds their part of the rows, and of the Jacobian unless it is NULL. */
@@ -392,7 +391,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 #include "support/diagonal_mass.h"
 #include "support/curve.h"
 #include "support/shooting_iteration.h"
-#include "support/newton_fallback.h"
+#include "support/fallback.h"
 #include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -426,7 +425,6 @@ static const double EXTRAPOLATION[5][5] = {
 #include "support/observed_error.h"
 #endif
 
-#include "support/time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */

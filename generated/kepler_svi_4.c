@@ -142,7 +142,6 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
 #include "support/band.h"
 #include "support/legendre.h"
 #include "support/energies.h"
-#include "support/gather.h"
 #include "support/stages.h"
 
 /* Quadrature points: adds their part of the rows, and of the Jacobian unless it is NULL. */
@@ -261,7 +260,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/convergence.h"
 #include "support/one_trajectory.h"
 #include "support/separable_iteration.h"
-#include "support/newton_fallback.h"
+#include "support/fallback.h"
 #include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -294,7 +293,6 @@ static const double EXTRAPOLATION[4][4] = {
 #include "support/observed_error.h"
 #endif
 
-#include "support/time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */

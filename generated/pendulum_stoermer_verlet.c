@@ -75,7 +75,6 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/splitting.h"
 
 #include "support/no_error.h"
-#include "support/time.h"
 #include "support/run.h"
 #define EXPLICIT_STEPS
 #include "support/discrete_legendre.h"

@@ -87,8 +87,8 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
 #include "support/band.h"
 #include "support/legendre.h"
 #include "support/energies.h"
-#include "support/gather.h"
-#include "support/entry.h"
+#define UNROLLED_EQUATIONS
+#include "support/stages.h"
 
 /* Quadrature points, 2: u = (q, v) at each. */
 static void quadrature_points(const step_data *step, const double *z, double *u)
@@ -187,7 +187,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #include "support/convergence.h"
 #include "support/one_trajectory.h"
 #include "support/separable_iteration.h"
-#include "support/newton_fallback.h"
+#include "support/fallback.h"
 #include "support/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
@@ -212,7 +212,6 @@ static const double EXTRAPOLATION[1][1] = {{1.0}};
 #include "support/no_error.h"
 #endif
 
-#include "support/time.h"
 #include "support/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */

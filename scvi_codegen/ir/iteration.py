@@ -131,11 +131,6 @@ class FixedPointIteration(ABC):
         return None
 
     @property
-    def integral_part(self) -> str:
-        """Support header of integrals along the curve; ``""`` if nothing is integrated."""
-        return ""
-
-    @property
     def predictor_matrix(self) -> NumberTable:
         """Table between the stored values and the predicted ones; empty if they are the same."""
         return ()

@@ -231,11 +231,6 @@ class CoupledIteration(PointIteration):
         return (*(IterationTable(name, table) for name, table in tables.items()), *back)
 
     @property
-    def integral_part(self) -> str:
-        """Support header of integrals, by the velocities."""
-        return "coupled_integrals" if self.integrands else ""
-
-    @property
     def serves_many(self) -> bool:
         """True if lanes may be trajectories: unless unknowns are projected."""
         return not self.projected
@@ -254,11 +249,6 @@ class HamiltonianIteration(PointIteration):
     def parts(self) -> tuple[str, ...]:
         """Support headers: weights, iteration."""
         return ("point_weights", "hamiltonian_iteration")
-
-    @property
-    def integral_part(self) -> str:
-        """Support header of integrals, by positions and momenta."""
-        return "hamiltonian_integrals" if self.integrands else ""
 
     def memory(self, dimension: int) -> int:
         """Return the number of velocities and forces of the last two steps."""

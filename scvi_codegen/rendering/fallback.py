@@ -17,9 +17,9 @@ Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
 
 HEADERS: dict[Fallback, tuple[str, ...]] = {
-    "own": ("newton_fallback",),
+    "own": ("fallback",),
     "external": ("library_fallback",),
-    "provided": ("newton_fallback",),
-    "none": ("no_fallback",),
+    "provided": ("fallback",),
+    "none": ("fallback",),
 }
 """Support headers before the solver by fixed-point iteration, in order."""

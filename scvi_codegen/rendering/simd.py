@@ -119,7 +119,7 @@ def iteration_source(
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    solver = _solver(fixed_point, fallback) if meaning.are_points else ()
+    solver = (*HEADERS[fallback], "iteration_solver") if meaning.are_points else ()
     return IterationSource(
         lanes=fixed_point.lanes,
         whole=meaning.are_points and not fixed_point.in_groups,
@@ -163,17 +163,6 @@ def _function(name: str) -> str:
         powers = " * ".join(["square"] * (k // 2) + ["y"])
         return f"LANES_INVERSE_ROOT({k}, ({powers}), ({' * '.join(['inverse'] * ((k + 1) // 2))}))"
     return f"LANES_{'LIBRARY_' * (name in LIBRARY)}FUNCTION{'_OF_TWO' * (name in OF_TWO)}({name})"
-
-
-def _solver(fixed_point: FixedPointIteration, fallback: Fallback) -> tuple[str, ...]:
-    """Return the headers of the solver around an iteration whose lanes are points, in order."""
-    solver = (*HEADERS[fallback], "iteration_solver")
-    if not fixed_point.integral_part:
-        return solver
-    return (
-        *solver,
-        "integrals",
-    )
 
 
 def _tables(fixed_point: FixedPointIteration, meaning: Lanes, *, changes: bool) -> Iterator[str]:

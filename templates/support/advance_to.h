@@ -5,6 +5,12 @@
  * Requires a controller: trial, begin_trials, find_step, confirm_step, and take_step, which adds the increments to the
  * state. */
 
+/* A run is at t_end only if no low word is left: beyond 2^53 step sizes t alone is t_end some steps too early. */
+static inline int has_arrived(real t, real t_low, real t_end)
+{
+  return t == t_end && t_low == 0;
+}
+
 int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long steps, long long every,
     const real *parameters, const solver_options *options, real *t, real *q, real *p, int *iterations,
     solver_report *report, real *workspace)

@@ -1,5 +1,5 @@
 /* Sparsity pattern of G M^-1 G^T below its diagonal, by rows: which constraints act on the same coordinates. Requires:
- * constraint_output.h, list_coordinates. */
+ * arrays.h, list_coordinates. */
 
 /* For each constraint its first entry; for each entry its coordinate (place) and constraint (owner); for each
  * coordinate its first entry (at) in `list`, ordered by constraint; for each row its first pair, for each pair its

@@ -87,13 +87,13 @@ static int confirm_step(run_memory *run, trial *now, const solver_options *optio
 /* Adds the increments to the state. */
 static void take_step(run_memory *run, trial *now)
 {
-  add_compensated(now->at.q, now->at.carry_q, now->dq);
-  add_compensated(now->at.p, now->at.carry_p, now->dp);
+  add_increments(now->at.q, now->at.carry_q, now->dq);
+  add_increments(now->at.p, now->at.carry_p, now->dp);
   if (now->last) {
     now->at.t = now->t_end;
     now->at.t_low = 0;
   } else {
-    add_to_time(&now->at.t, &now->at.t_low, now->step.h);
+    add_compensated(&now->at.t, &now->at.t_low, now->step.h, 0);
   }
   run->density = now->density;
   run->part = now->part;

@@ -1,4 +1,4 @@
-/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, time.h, and
+/* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, numbers.h, and
  * prepare_iteration and iteration of a solver, which compute the increments of a step. */
 
 void NAME(start)(block_memory *block, double t, double h)
@@ -44,7 +44,7 @@ static void save_state(const state *now, block_memory *block)
 }
 
 /* x + carry += increment with its low word, in double-double arithmetic, in active lanes. */
-static void add_compensated(lanes *x, lanes *carry, const lanes *increment, const double *active)
+static void add_increments(lanes *x, lanes *carry, const lanes *increment, const double *active)
 {
   for (int i = 0; i < M; i++) {
     const lane_view old = {x[i]}, old_carry = {carry[i]};
@@ -102,10 +102,10 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
     step.t = block->t;
     fixed_point(&step, &data, past, &block->guess, dq, dp, options ? options : &standard, &report);
     drop_infinite(&now, dq, dp, block->active);
-    add_compensated(now.q, now.carry_q, dq, block->active);
-    add_compensated(now.p, now.carry_p, dp, block->active);
+    add_increments(now.q, now.carry_q, dq, block->active);
+    add_increments(now.p, now.carry_p, dp, block->active);
     block->step++;
-    add_to_time(&block->t, &block->t_low, block->h);
+    add_compensated(&block->t, &block->t_low, block->h, 0.0);
     for (int j = 0; j < count; j++)
       if (block->active[j] > 0.0)
         block->last_step[j] = block->step;

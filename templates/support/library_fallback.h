@@ -28,7 +28,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   return library_fallback->step(step, dq, dp, options, report, workspace);
 }
 #else
-/* Newton solver for a library without it (see library_fallback.h). Requires: newton_fallback.h, FALLBACK_WORKSPACE. */
+/* Newton solver for a library without it (see library_fallback.h). Requires: fallback.h, FALLBACK_WORKSPACE. */
 #include <stdlib.h>
 
 static SELDOM int provided_step(const step_data *step, double *dq, double *dp, const solver_options *options,

@@ -1,5 +1,33 @@
+/* Interpolation from the unknowns z to values at points. Requires: real, B, POINTS. Unknown b of site i is z[i B +
+ * b]. */
+
+/* u[n * across + i * along] = scale sum_b table[b][n] z_b for sites i from z on and every point n. */
+static inline void gather(const real *table, int points, real scale, const real *z, int sites, real *u, int across,
+    int along)
+{
+  for (int i = 0; i < sites; i++) {
+    real sum[POINTS] = {0};
+    for (int b = 0; b < B; b++)
+      for (int n = 0; n < points; n++)
+        sum[n] += table[b * points + n] * z[i * B + b];
+    for (int n = 0; n < points; n++)
+      u[n * across + i * along] = scale * sum[n];
+  }
+}
+
+#ifdef UNROLLED_EQUATIONS
+/* Entry of the Jacobian of the stage equations. Requires: real, SITES, POSITION_IN_MATRIX, band.h. */
+
+/* Address of the entry in row (i, r), column (j, b): sites i, j, blocks r, b. */
+static inline real *entry(real *jacobian, const band *shape, int i, int r, int j, int b)
+{
+  const int blocks = shape->rows / SITES;
+  return jacobian + shape->first + (POSITION_IN_MATRIX[j] * blocks + b) * shape->stride +
+      POSITION_IN_MATRIX[i] * blocks + r;
+}
+#else
 /* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, POSITION_IN_MATRIX,
- * band.h, step.h, gather.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
+ * band.h, step.h, stages.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
  * coordinates. */
 
 /* u = q0 + u at every point, including the compensation of q0. */
@@ -70,3 +98,4 @@ static inline void begin_rows(const step_data *step, const real *z, real *rows, 
   if (jacobian)
     memset(jacobian, 0, sizeof(real) * band_size(shape));
 }
+#endif

@@ -2,8 +2,7 @@
  * step_size_levels.h, sizes.h; the type trial with at.t, at.t_low, t_end, limits, change, error, guess, last
  * and apart; try_step, which sets error, guess and last; compare_trial, which compares a trial with its half steps,
  * in momenta too if requested; changes_little, 1 if the momenta change by a small part of the largest one;
- * SHORT_STEPS_FAIL, 1 if rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. Include
- * before the code that accepts the step. */
+ * SHORT_STEPS_FAIL, 1 if rounding alone may make a step fail; DOUBTS, 1 if momenta may be compared; HOT. */
 
 #define ALLOWED_TO_HALVES 100 /* admissible difference of the half steps, relative to the admissible error estimate */
 #define SPURIOUS REAL(1e-8) /* relative to the state: spurious solutions of the equations differ by more */
@@ -150,25 +149,22 @@ static void begin_trials(run_memory *run, trial *now, real tolerance, solver_opt
     run->guess = 0;
 }
 
-#ifdef ARRAYS
-/* Adaptive integration of indexed systems to a given time. Requires: trials.h. */
-
-static void take_trial(run_memory *run, trial *now)
+/* Records the accepted step of size h, and chooses the size of the next one. */
+static inline void finish_trial(run_memory *run, trial *now, real h)
 {
-  accept(run, now->n, larger(now->error, now->apart), now->guess);
   if (now->last) {
     now->at.t = now->t_end;
-    now->at.t_low = 0.0;
+    now->at.t_low = 0;
     run->guess = 0;
   } else {
-    add_compensated(&now->at.t, &now->at.t_low, run->h, 0.0);
+    add_compensated(&now->at.t, &now->at.t_low, h, 0);
     choose_size(run, now);
   }
-  run->t = now->at.t;
-  run->t_low = now->at.t_low;
   run->step++;
 }
 
+#ifdef ARRAYS
+/* Adaptive integration of arrays to a given time. */
 static int take_trials(run_memory *run, const job *way, solver_report *report)
 {
   solver_options standard = NAME(default_options)();
@@ -183,7 +179,10 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
       status = confirm_step(run, &now, options, report);
     if (status != OK)
       return status;
-    take_trial(run, &now);
+    accept(run, now.n, larger(now.error, now.apart), now.guess);
+    finish_trial(run, &now, run->h);
+    run->t = now.at.t;
+    run->t_low = now.at.t_low;
     report->steps++;
   }
   return OK;
@@ -199,25 +198,15 @@ int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double
   return run_workers(run, &way, report);
 }
 #else
-/* Acceptance of adaptive steps of systems with few coordinates. Requires: trials.h. Include before advance_to.h. */
-
 /* Adds the increments of the accepted step to the state. */
 static inline void take_step(run_memory *run, trial *now)
 {
-  add_compensated(now->at.q, now->at.carry_q, now->dq);
-  add_compensated(now->at.p, now->at.carry_p, now->dp);
+  add_increments(now->at.q, now->at.carry_q, now->dq);
+  add_increments(now->at.p, now->at.carry_p, now->dp);
   if (larger(now->error, now->apart) > run->error) {
     run->error = larger(now->error, now->apart);
     run->error_t = now->at.t;
   }
-  if (now->last) {
-    now->at.t = now->t_end;
-    now->at.t_low = 0;
-    run->guess = 0;
-  } else {
-    add_to_time(&now->at.t, &now->at.t_low, now->step.h);
-    choose_size(run, now);
-  }
-  run->step++;
+  finish_trial(run, now, now->step.h);
 }
 #endif

@@ -28,7 +28,6 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.program_source import render_ensemble
 from scvi_codegen.rendering.source import Source
 
 __all__ = ["CELLS", "FLAGS", "RECORDED", "TIMED", "Program", "build", "output", "program", "recorded"]
@@ -84,19 +83,19 @@ def single(
     sources = sources_of(found, method, name, solver, time_transformation)
     parameters = found.defaults
     if kind == "ensemble":
-        source = sources.remembered("ensemble", lambda: render_ensemble(sources.program()))()
+        source = sources.variant("ensemble")
         return of_source(source, ensemble_driver(f"{name}_ensemble", q, p, parameters, h, steps))
     if kind in ("tangent", "second"):
         second = kind == "second"
-        source = sources.remembered(kind, partial(sources.tangent, second=second))()
+        source = sources.variant("second_derivatives" if second else "derivatives")
         return of_source(source, tangent_driver(source.prefix, q, p, parameters, h, 4, second=second))
     if kind == "embedded":
         source = generate_source(found, as_method(method, found), prefix=name, embedded="double")[0]
         return of_source(source, run_driver(name, q, p, parameters, h, steps))
     if kind == "adaptive":
-        source = sources.remembered("controlled", sources.controlled)()
+        source = sources.variant("controlled")
         return of_source(source, run_driver(name, q, p, parameters, h, steps, t_end=t_end, tolerance=tolerance))
-    source = sources.remembered("fallback", sources.fallback)() or sources.remembered("plain", sources._rendered)()
+    source = sources.variant("fallback") or sources._rendered()
     return of_source(source, run_driver(name, q, p, parameters, h, steps))
 
 

@@ -1,3 +1,12 @@
+#ifdef NO_FALLBACK
+/* No fallback: if the fixed-point iteration fails, the step fails. */
+static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
+    solver_report *report, double *workspace)
+{
+  (void)step, (void)dq, (void)dp, (void)options, (void)report, (void)workspace;
+  return status;
+}
+#else
 /* Fallback to Newton's method when the fixed-point iteration fails. Requires: newton.h, newton_from_line.h. */
 
 static SELDOM int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,
@@ -14,3 +23,4 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
     return STATUS(SPURIOUS_SOLUTION);
   return status;
 }
+#endif

@@ -1,3 +1,4 @@
+#ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
  * describe_lattices; FARTHEST, the stencil radius on an axis, and COMPONENTS, the number of components of all
@@ -121,7 +122,7 @@ static double off_diagonal_ratio(const linear_system *of, const lattice *all, co
 
 /* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
  * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings are
- * uniform and boundaries few; otherwise the diagonal of F' is used. Requires: fourier_preconditioner.h. */
+ * uniform and boundaries few; otherwise the diagonal of F' is used. Requires: preconditioner.h. */
 
 enum { SPARE_VECTORS = 2 }; /* of work */
 #define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */
@@ -261,3 +262,23 @@ static void choose_preconditioner(linear_system *of, double left)
       find_inverses(of);
   }
 }
+#else
+/* Preconditioner for Newton-GMRES from the diagonal of F'. Requires: array_newton.h. */
+
+enum { SPARE_VECTORS = 0 }; /* of work */
+
+static void precondition(const linear_system *of, const lanes *x, lanes *y)
+{
+  apply_inverses(of, x, y, of->own);
+}
+
+static void find_inverses(linear_system *of)
+{
+  find_own_inverses(of);
+}
+
+static void choose_preconditioner(linear_system *of, double left)
+{
+  (void)of, (void)left; /* there is no alternative */
+}
+#endif
