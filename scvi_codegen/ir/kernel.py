@@ -131,15 +131,6 @@ class Kernel:
                 derivative = number >= self.values
                 yield "derivative" if derivative else "value", number - derivative * self.values, self.results[number]
 
-    def __str__(self) -> str:
-        """Return the kernel as readable text, one assignment per line."""
-        lines = [f"kernel {self.name}(u[{self.arguments}], t, parameters)"]
-        for kind, k, expression in self.statements():
-            target = f"w{k}" if kind == "w" else f"{kind}[{k}]"
-            lines.append(f"  {target} = {_text(expression)}")
-        lines += [f"  {each}" for each in self.sums]
-        return "\n".join([*lines, *(str(each.kernel) for each in self.sums)])
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopedKernel:
@@ -211,11 +202,6 @@ class LoopedKernel:
         """Number of rows of constant tables."""
         return self.loops[0].end.number
 
-    def __str__(self) -> str:
-        """Return the loop as one line."""
-        slots, targets = (", ".join(map(str, each)) for each in ((*self.slots, *self.given), self.targets))
-        return f"{targets} += {self.kernel.name}({slots}) for {', '.join(map(str, self.loops))}"
-
 
 def loads(expression: Expression) -> Iterator[Load]:
     """Yield the loads of an expression."""
@@ -243,11 +229,3 @@ def _count(expression: Expression, counts: dict[str, int]) -> None:
         counts[expression.operator] = counts.get(expression.operator, 0) + 1
         for operand in expression.operands:
             _count(operand, counts)
-
-
-def _text(expression: Expression) -> str:
-    if isinstance(expression, Constant):
-        return str(expression.value)
-    if isinstance(expression, Load):
-        return "t" if expression.source == "t" else f"{expression.source}{expression.index}"
-    return f"({expression.operator} {' '.join(_text(operand) for operand in expression.operands)})"

@@ -1,4 +1,4 @@
-"""The intermediate representation: a program consists of kernels, tables and loops. It prints itself.
+"""The intermediate representation: a program consists of kernels, tables and loops.
 
 A kernel is straight-line arithmetic over ``u[i]`` (its arguments), ``t`` and ``parameters[i]``: temporaries, each used
 more than once, then results. Operations are ``+ - * / neg sqrt``, ``inverse_root_k`` (x^(-k/2)) and calls of elementary
@@ -332,19 +332,3 @@ class Program:
         """Return the size of a matrix with ``blocks`` unknowns per site: its band with fill-in, or all of it."""
         rows, reach = sites * blocks, (self.equations.bandwidth + 1) * blocks - 1
         return rows * min(rows, 3 * reach + 1)
-
-    def __str__(self) -> str:
-        """Return readable text of the whole program."""
-        equations = self.equations
-        head = [
-            f"program {self.prefix}: {self.title}",
-            f"  {equations.blocks} blocks of {equations.sites} unknowns, bandwidth {equations.bandwidth}",
-        ]
-        for group in equations.stage_groups:
-            head.append(f"  stage group {group.name}: {group.points} points")
-            head += [
-                f"    gather  {loop.name}: {'q0 + ' * loop.from_state}h^{loop.power} sum_b {loop.name}[n][b] z[b]"
-                for loop in group.gathers
-            ]
-            head += [f"    scatter {loop.name}: w[n] h^{loop.power} {loop.name}[n][r]" for loop in group.scatters]
-        return "\n".join([*head, *(str(kernel) for kernel in self.kernels)])

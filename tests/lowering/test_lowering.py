@@ -229,7 +229,6 @@ def test_a_chain_of_256_masses_lowers_without_recursion():
         "chain", arguments=state, time=system.time, parameters=system.parameters, values=(system.lagrangian,)
     )
     assert max(map(depth, (*kernel.temporaries, *kernel.results))) <= DEEPEST_EXPRESSION + 1
-    assert str(kernel).count("\n") == len(kernel.temporaries) + 1
     assert sum(kernel.operation_counts().values()) < 256 * 16
 
 
@@ -256,7 +255,6 @@ def test_functions_without_a_c_counterpart_are_rejected():
 def test_lowering_is_reproducible():
     first, second = (lowered(double_pendulum(), SCVI(3)) for _ in range(2))
     assert first == second
-    assert str(first) == str(second)
 
 
 # The printer. Every expression of two levels over these leaves is compiled and compared bit for bit.
