@@ -57,7 +57,8 @@ class Memory(OneThread):
         self._memory = memory = binding.new("run *")
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
         self._parameters = stepper.defaults
-        self._parameters_pointer = binding.pointer(self._parameters)
+        self._arguments, self._options = (binding.pointer(self._parameters), binding.null), None
+        self._plan: StepPlan | None = None
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()
         self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
@@ -78,10 +79,10 @@ class Memory(OneThread):
     ) -> Self:
         """Construct at (q, p) and t before the first step, with fixed step size or a step plan."""
         run = cls(stepper)
-        run.start(q, p, h=h, t=t, parameters=parameters, options=options)
+        run._start(q, p, h=h, t=t, parameters=parameters, options=options)
         return run
 
-    def start(
+    def _start(
         self,
         q: ArrayLike,
         p: ArrayLike,
@@ -103,9 +104,9 @@ class Memory(OneThread):
     def _set(
         self, values: Array, options: SolverOptions | None, plan: StepPlan | None, unset_inputs: tuple[str, ...]
     ) -> None:
-        binding = self.stepper.binding
-        self._parameters[:], self._options, self.plan = values, options, plan
-        self._arguments = self._parameters_pointer, binding.options(options)
+        self._parameters[:], self.plan = values, plan
+        if options is not self._options:
+            self._arguments, self._options = (self._arguments[0], self.stepper.binding.options(options)), options
         self._unset_inputs, self.longest = unset_inputs, 0.0
         self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
 

@@ -32,7 +32,7 @@ class Run(Memory):
         return describe_run(short_title(interface), interface.solver, self, tau=tau, unset_inputs=self._unset_inputs)
 
     @classmethod
-    def reused(cls, stepper: Integrator) -> Self:
+    def _reused(cls, stepper: Integrator) -> Self:
         """Return a released run of the stepper, to be started, or a new one if all are in use."""
         try:
             found: Self = stepper._released_runs.pop()
@@ -41,8 +41,8 @@ class Run(Memory):
             pass
         return cls(stepper)
 
-    def release(self) -> None:
-        """Let :meth:`reused` return this run; the caller drops it. Large memory is freed instead."""
+    def _release(self) -> None:
+        """Let :meth:`_reused` return this run; the caller drops it. Large memory is freed instead."""
         if len(self._workspace) <= MOST_KEPT:
             self.stepper._released_runs.append(self)
 

@@ -109,7 +109,7 @@ class _Recorder:
     """
 
     def __init__(self, memory: Memory, save_every: int, steps: int | None) -> None:
-        self.memory, self.save_every, self.first, plan = memory, save_every, memory.steps, memory.plan
+        self.memory, self.save_every, self.first, plan = memory, save_every, memory.steps, memory._plan
         self.earlier: list[tuple[Array, Array, Array, NDArray[np.int32]]] = []
         if plan is None:
             assert steps is not None  # by the caller
@@ -130,7 +130,7 @@ class _Recorder:
     def advance(self, size: int) -> int:
         """Take ``size`` steps, fewer if the target time is reached; return their number."""
         memory, save_every = self.memory, self.save_every
-        plan, watch, rows = memory.plan, self.watch, size // save_every + 2
+        plan, watch, rows = memory._plan, self.watch, size // save_every + 2
         before = None if watch is None else memory.t
         if plan is not None and self.filled + rows > len(self.t):
             self.earlier.append(self._states())
@@ -193,7 +193,7 @@ def trajectory_of(
     tau: Array | None = None,
 ) -> Trajectory:
     """Return a trajectory of these states with the data of the run; by default each precedes a step of h."""
-    plan, h = memory.plan, memory.h
+    plan, h = memory._plan, memory.h
     step_error, worst_step_time = memory.step_error
     return Trajectory(
         t=t,

@@ -167,7 +167,7 @@ class Stepper(Ensembles):
             check = GrowthCheck(run, check_growth)
             found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
             check.warn(found)
-            run.release()
+            run._release()
             return found
         end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
         values = parameters_of(self, parameters, data)
@@ -177,7 +177,7 @@ class Stepper(Ensembles):
         save_every = checked_count(save_every, "save_every", least=1)
         driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
         check.warn(driven)
-        run.release()
+        run._release()
         return driven
 
     @property
@@ -220,8 +220,8 @@ class Stepper(Ensembles):
             q, p = consistent(self, q, p, t, parameters)
         plan = self._checked_plan(*step_plan)
         stepper = self._adaptive() if isinstance(plan, StepPlan) else self
-        run = Run.reused(stepper) if reuse else Run(stepper)
-        run.start(q, p, h=plan, t=t, parameters=parameters, options=options)
+        run = Run._reused(stepper) if reuse else Run(stepper)
+        run._start(q, p, h=plan, t=t, parameters=parameters, options=options)
         return run
 
     def _checked_plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan | float:
