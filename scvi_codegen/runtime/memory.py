@@ -57,7 +57,8 @@ class Memory(OneThread):
         self._memory = memory = binding.new("run *")
         self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
         self._parameters = stepper.defaults
-        self._arguments, self._options = (binding.pointer(self._parameters), binding.null), None
+        self._arguments = binding.pointer(self._parameters), binding.null
+        self._options: SolverOptions | None = None
         self._plan: StepPlan | None = None
         self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
         self._report, self._workspace = binding.new("report *"), binding.workspace()

@@ -12,20 +12,27 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypedDict, Unpack, overload
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
-from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_large_steps
+from scvi_codegen.runtime.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
+from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
+from scvi_codegen.runtime.chaos_indicators import ChaosIndicators
+from scvi_codegen.runtime.chaos_indicators_ensemble import ChaosIndicatorsEnsemble
 from scvi_codegen.runtime.compiled_method import Variants
-from scvi_codegen.runtime.constraints import consistent
+from scvi_codegen.runtime.constraints import consistent, constraint_values, multipliers, projected
 from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.ensembles import Ensembles
+from scvi_codegen.runtime.ensemble_selection import ensemble_work
+from scvi_codegen.runtime.ensemble_states import EnsembleParameters, momenta_of_each
+from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
 from scvi_codegen.runtime.error_growth import GrowthCheck
 from scvi_codegen.runtime.events import Event, EventLike
-from scvi_codegen.runtime.global_error import checked_error, confirmed_run
-from scvi_codegen.runtime.inputs import Parameters
+from scvi_codegen.runtime.global_error import checked_error, confirmed_run, warn_of_unconfirmed
+from scvi_codegen.runtime.inputs import Array, Parameters
+from scvi_codegen.runtime.integrator import Integrator
 from scvi_codegen.runtime.observation import Observation, observed_until
 from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.runs_with_inputs import (
@@ -65,8 +72,8 @@ class Settings(TypedDict, total=False):
     check_growth: bool | None
 
 
-class Stepper(Ensembles):
-    """Compiled integrator of one system: :class:`Integrator` with integrations, runs and ensembles."""
+class Stepper(Integrator):
+    """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_rebuild, (self._plain, self.interface, self._variants, self.flags, self.events))
@@ -264,6 +271,179 @@ class Stepper(Ensembles):
             return Run.restored(self, saved, parameters=parameters, options=options)
         plan = StepPlan.checked(t_end, tolerance)
         return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
+
+    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
+    def integrate_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: ArrayLike | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        t_eval: ArrayLike | None = None,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+        error: float | None = None,
+    ) -> EnsembleTrajectory:
+        """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
+
+        Args:
+            q, p: (k, m) initial positions and momenta.
+            inputs: of a system with inputs, as of :meth:`integrate`, common to all trajectories, or values of shape
+                (k, n), one row per trajectory. Fixed steps are common, end at all breakpoints and lead to one t_end.
+            velocity: (k, m) initial velocities, instead of p.
+            h, steps, save_every, t, options, progress: as in :meth:`integrate`.
+            t_end: final time; with h the last step is shorter unless h divides the time. Without h and steps: final
+                time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
+                trajectory are saved, with their times in ``times``, and ``progress`` is called with the number of
+                completed trajectories.
+            tolerance: relative error of an adaptive step; by default round-off.
+            t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
+            parameters: values by name, one number or k each; or an array (k, number of parameters).
+            threads: number of threads, by default one per core.
+            error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
+                tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
+
+        Returns:
+            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
+            fails has NaN after the failure and the reason in ``status``; the others are unaffected.
+
+        Raises:
+            StateError: if a shape, name or number is invalid.
+        """
+        if error is not None:
+            others = {"h": h, "steps": steps, "tolerance": tolerance}
+            tau = self.interface.energy_parameter or self.interface.time_transformation
+            error = checked_error(error, others, has_tau=bool(tau))
+        work = ensemble_work(
+            self,
+            q,
+            p,
+            inputs=inputs,
+            velocity=velocity,
+            h=h,
+            steps=steps,
+            t_end=t_end,
+            tolerance=tolerance,
+            t_eval=t_eval,
+            save_every=save_every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        if error is not None and isinstance(work, AdaptiveEnsemble):
+            work.confirm(self, error, threads=threads)
+        work.run(progress=progress, threads=threads)
+        found = work.result()
+        warn_of_unconfirmed(found.confirmations)
+        warn_of_energy_errors(found)
+        return found
+
+    @checks_arguments(StateError, progress=FUNCTION)
+    def chaos_indicators_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        h: float,
+        steps: int,
+        velocity: ArrayLike | None = None,
+        count: int | None = None,
+        directions: ArrayLike | None = None,
+        save_every: int | None = None,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+    ) -> ChaosIndicators:
+        """Return chaos indicators of K initial states over ``steps`` steps of size h.
+
+        For constant diagonal masses and forces of position and time, methods with a fixed-point iteration (SVI,
+        collocation) integrate eight trajectories at a time in SIMD lanes; otherwise the derivatives of single steps are
+        used, about ten times slower. Results agree to round-off.
+
+        Args:
+            q, p, velocity: (K, m) initial states, as of :meth:`integrate_ensemble`.
+            count, directions: tangent vectors, as of :meth:`Trajectory.chaos_indicators`; one suffices for MEGNO.
+            save_every: steps between saved values; by default only the last is saved.
+            t, parameters, options, threads: as of :meth:`integrate_ensemble`.
+            progress: called with the number of completed trajectories.
+
+        Returns:
+            :class:`ChaosIndicators` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has
+            NaN from at most a thousand steps before the failure on, and the reason in ``status``. An
+            :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
+
+        Raises:
+            MethodError: if time is transformed.
+            StateError: if a shape, name or number is invalid.
+        """
+        p = momenta_of_each(self, q, p, velocity, t, parameters)
+        work = ChaosIndicatorsEnsemble(
+            self,
+            q,
+            p,
+            h=h,
+            steps=steps,
+            count=count,
+            directions=directions,
+            save_every=save_every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        return work.run(progress=progress, threads=threads)
+
+    def project(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        velocity: ArrayLike | None = None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+    ) -> tuple[Array, Array]:
+        """Return the nearest state (q, p) on the constraint manifold, in the metric of the mass matrix.
+
+        Without p and velocity the initial velocity is 0.
+
+        Raises:
+            MethodError: if the system has no constraints.
+            StateError: if the iteration fails, or if the constraints are linearly dependent there.
+        """
+        momenta = self._initial_momenta(
+            q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
+        )
+        q1, p1, _ = projected(self, q, momenta, t, parameters)
+        return q1, p1
+
+    def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return the Lagrange multipliers lambda of the constraint forces G^T lambda at states: (c,), or (n, c).
+
+        They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
+        l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
+        """
+        found = multipliers(self, q, p, t, parameters)
+        return found[0] if np.ndim(q) == 1 else found
+
+    def constraint_values(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """Return the constraint residuals g and their rates g_q v + g_t: (c,) each, or (n, c).
+
+        For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
+        """
+        g, rate = constraint_values(self, q, p, t, parameters)
+        return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)
 
 
 def _recorded(
