@@ -321,6 +321,7 @@ static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 #define HOT static inline __attribute__((always_inline))
 #define FINAL_ITERATIONS 0
 #define NODES 2
+#define DIAGONAL_MASS 1
 
 #define INVERSE_ROOTS
 #include "support/vectors.h"
@@ -388,7 +389,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 
 #include "support/convergence.h"
 #include "support/one_trajectory.h"
-#include "support/diagonal_mass.h"
+#include "support/mass_matrix.h"
 #include "support/curve.h"
 #include "support/shooting_iteration.h"
 #include "support/fallback.h"

@@ -74,7 +74,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 #define BY_MASSES
 #include "support/splitting.h"
 
-#include "support/no_error.h"
+#define NO_ERROR_ESTIMATE
 #include "support/run.h"
 #define EXPLICIT_STEPS
 #include "support/discrete_legendre.h"

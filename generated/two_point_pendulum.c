@@ -209,7 +209,7 @@ static const double EXTRAPOLATION[1][1] = {{1.0}};
 
 #define NEWTON_ALONE
 #include "support/newton_solver.h"
-#include "support/no_error.h"
+#define NO_ERROR_ESTIMATE
 #endif
 
 #include "support/run.h"

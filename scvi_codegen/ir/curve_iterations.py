@@ -77,7 +77,7 @@ class CurveIteration(FixedPointIteration):
     @property
     def facts(self) -> Mapping[str, int]:
         """Number of nodes, as a macro."""
-        return {"NODES": self.nodes.count}
+        return {"NODES": self.nodes.count, **self.mass_facts}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +107,7 @@ class ShootingIteration(CurveIteration):
     @property
     def parts(self) -> tuple[str, ...]:
         """Support headers: mass, curve, points, iteration."""
-        return (self.mass_part, "curve", "shooting_iteration")
+        return ("mass_matrix", "curve", "shooting_iteration")
 
     def memory(self, dimension: int) -> int:
         """Return the length of z of the last two steps, v0 and m."""
@@ -152,12 +152,13 @@ class CollocationIteration(CurveIteration):
     @property
     def facts(self) -> Mapping[str, int]:
         """Number of nodes; without points, whether the system is Hamiltonian."""
-        return {"NODES": self.nodes.count} if self.points else {"HAMILTONIAN": int(self.hamiltonian)}
+        known = {"NODES": self.nodes.count} if self.points else {"HAMILTONIAN": int(self.hamiltonian)}
+        return {**known, **self.mass_facts}
 
     @property
     def parts(self) -> tuple[str, ...]:
         """Support headers: mass, curve, ends, iteration."""
-        return (self.mass_part, "curve", "collocation_iteration")
+        return ("mass_matrix", "curve", "collocation_iteration")
 
     def memory(self, dimension: int) -> int:
         """Return the length of z of the last two steps and v0."""

@@ -151,9 +151,9 @@ class FixedPointIteration(ABC):
         return all(i == j for i, j in self.mass_entries)
 
     @property
-    def mass_part(self) -> str:
-        """Support header of solves with the mass matrix."""
-        return "diagonal_mass" if self.diagonal else "full_mass"
+    def mass_facts(self) -> Mapping[str, int]:
+        """Macro DIAGONAL_MASS if the mass matrix is diagonal."""
+        return {"DIAGONAL_MASS": 1} if self.diagonal else {}
 
 
 def transposed(table: NumberTable, points: int) -> NumberTable:

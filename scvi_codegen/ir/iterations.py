@@ -205,15 +205,15 @@ class CoupledIteration(PointIteration):
 
     @property
     def facts(self) -> Mapping[str, int]:
-        """Macro PROJECTED if unknowns and velocities at the points differ."""
-        return {"PROJECTED": 1} if self.projected else {}
+        """Macros of what differs: unknowns from velocities at the points, the mass matrix, the corrections."""
+        known = {"PROJECTED": self.projected, "DIAGONAL_MASS": self.diagonal, "FOLLOWED": self.followed}
+        return {name: 1 for name, holds in known.items() if holds}
 
     @property
     def parts(self) -> tuple[str, ...]:
         """Support headers: damping, weights, mass, corrections, iteration."""
         damped = ("damped_points",) if self.damping else ()
-        corrections = "followed_corrections" if self.followed else "corrections"
-        return (*damped, "point_weights", self.mass_part, "point_arguments", corrections, "coupled_iteration")
+        return (*damped, "point_weights", "mass_matrix", "corrections", "coupled_iteration")
 
     @property
     def derivatives_part(self) -> str:

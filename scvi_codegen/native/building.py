@@ -225,7 +225,7 @@ def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> 
 def _compile(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], folder: Path) -> None:
     """Compile the parts concurrently, one process each; then link them, and write the binding."""
     source.write(folder)
-    is_divided = any("support/parts.h" in each.files for each in source.sources)
+    is_divided = any("#define DIVIDED_KERNELS" in each.code for each in source.sources)
     cut = DIVIDED_FLAGS if is_divided and _takes_flags(compiler, DIVIDED_FLAGS) else ()
     threads = THREADS if any(THREADS_HEADER in each.files for each in source.sources) else ()
     wanted = [*threads, *words_of(FLAGS_VARIABLE)]

@@ -53,7 +53,7 @@ DECLARATIONS = {
     "stepper": "parts/declarations.h.jinja",
     "ensemble": "parts/ensemble_declarations.h.jinja",
     "events": "parts/events_declarations.h.jinja",
-    "indexed": "parts/indexed_declarations.h.jinja",
+    "arrays": "parts/arrays_declarations.h.jinja",
 }
 """Inner part of a header by the name of its template."""
 
@@ -132,7 +132,7 @@ def render(program: Program, control: Control | None = None, *, fallback: Fallba
     If the fixed-point iteration fails, Newton's method is the fallback if the program has it, unless another is named.
     """
     if program.in_loops:
-        return _render(program.prefix, loop_context(program) | _control_context(program, control), "indexed")
+        return _render(program.prefix, loop_context(program) | _control_context(program, control), "arrays")
     return _render(program.prefix, _context(program, DOUBLE, control, fallback))
 
 
@@ -239,7 +239,7 @@ def render_array_example(prefix: str, **start: Any) -> dict[str, str]:
             moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
     """
     environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
-    templates = {"main.c": "indexed_main.c.jinja", "Makefile": "Makefile.jinja"}
+    templates = {"main.c": "arrays_main.c.jinja", "Makefile": "Makefile.jinja"}
     return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 

@@ -22,7 +22,7 @@ MOST_THREADS = 64
 
 
 class Sharing(Enum):
-    """Kinds of tasks (``window`` of templates/support/indexed_blocks.h)."""
+    """Kinds of tasks (``window`` of templates/support/arrays.h)."""
 
     ALONE = auto()
     IN_TURN = auto()

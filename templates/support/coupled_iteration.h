@@ -1,5 +1,5 @@
 /* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
- * require, point_weights.h, a mass, point_arguments.h, velocity corrections, the tables, the kernel point_lanes. */
+ * require, point_weights.h, a mass, corrections.h, velocity corrections, the tables, the kernel point_lanes. */
 
 /* Computes the increments of one step: the velocities z at the points are corrected by mass^-1 (P - L_v) until they
  * converge; the increments follow from the forces at the converged points. The velocities are stored for the predictor.

@@ -1,3 +1,22 @@
+#ifdef DIAGONAL_MASS
+/* Diagonal mass matrices. Requires: points.h or trajectories.h. */
+enum { DIAGONAL = 1,
+  MASS = M };
+
+/* Inverts the masses; the division overlaps with the evaluation of the forces. */
+static inline void factor_mass(lanes *mass)
+{
+  for (int i = 0; i < M; i++)
+    mass[i] = 1.0 / mass[i];
+}
+
+/* r = mass^-1 r in every lane, with the inverted masses. */
+static inline void solve_mass(const lanes *mass, lanes *r)
+{
+  for (int i = 0; i < M; i++)
+    r[i] *= mass[i];
+}
+#else
 /* Full mass matrices in every lane, in their lower triangles. Requires: points.h or trajectories.h. */
 enum { DIAGONAL = 0,
   MASS = M * M };
@@ -30,3 +49,4 @@ static inline void solve_mass(const lanes *mass, lanes *r)
     for (int i = 0; i < j; i++)
       r[i] -= mass[j * M + i] * r[j];
 }
+#endif
