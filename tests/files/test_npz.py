@@ -91,4 +91,5 @@ def test_files_contain_the_result_and_its_description(made: Callable[[], Result]
         for name, value in expected.items():
             values = list(value.values()) if isinstance(value, dict) else value
             assert np.array_equal(file[name], values, equal_nan=np.asarray(values).dtype.kind == "f"), name
+        assert {file[name].dtype for name in ("t", "q", "p")} == {np.dtype(float)}
         assert {*file} - {*expected} <= {"parameters"}  # of a run with inputs the last values of the inputs, too

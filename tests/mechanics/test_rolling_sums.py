@@ -78,6 +78,19 @@ def test_source_size_does_not_grow():
     assert len(sc.roll_sums(lattice(40)).system.terms) < 10  # some constants are 0, 1 or reduced
 
 
+def powers(count):
+    """Products and quotients of neighbours with exponents of their own, in names whose order is not that of places."""
+    q = [f"q{i}" for i in range(count)]
+    terms = [f" - {a}**2*{b}**3 - cos({a})*cos({b})**2 - {a}**2/({b}**2 + 2)" for a, b in pairwise(q)]
+    return lagrangian(q, " + ".join(f"{a}_dot**2/2" for a in q) + "".join(terms))
+
+
+def test_equal_terms_of_different_exponents_are_rolled_into_one_sum_each():
+    few, many = (sc.roll_sums(powers(count)).system for count in (5, 13))
+    assert str(few) == str(many)
+    assert len(many.terms) == 4
+
+
 def test_common_parameters_remain_scalar():
     found = sc.roll_sums(bodies(4))
     assert [str(name) for name in found.system.parameters] == ["G"]

@@ -13,7 +13,7 @@ START, H, STOP = 1.25, 0.125, 2.05
 PARAMETERS = {"stop": 1e9, "k": 1.0, "sign": 1.0}
 POTENTIAL = "k*{x}**2/2 + {x}*sqrt(sign*(stop - t))/8"
 SCALAR = {
-    "svi:3": "auto",
+    "svi:3": "fixed-point",
     "svi:4": "newton",
     "gauss:2": "newton",
     "stoermer-verlet": "auto",
@@ -57,3 +57,16 @@ def test_failed_step_reports_its_number_and_the_time_at_which_it_started(kind, m
     with pytest.raises(StepFailedError) as failed:
         made.integrate(q, p, h=sign * H, steps=100, save_every=4, **given)
     assert (failed.value.t, failed.value.step) == (START + sign * 6 * H, 6)
+
+
+@pytest.mark.parametrize(("h", "status", "words"), [(H, "not finite", ""), (4.0, "not converged", "last update")])
+@pytest.mark.parametrize("kind", ["scalar", "array"])
+def test_message_reports_the_last_update_of_an_iteration_that_did_not_converge(kind, h, status, words):
+    """Steps of 4 are too long for the fixed-point iteration of a unit oscillator."""
+    stop = START + 0.5 * H if words == "" else 1e9
+    run = stepper(kind, "svi:3").start([0.4], [0.2], h=h, t=START, parameters={"stop": stop, "k": 4.0})
+    with pytest.raises(StepFailedError) as failed:
+        run.advance(1)
+    assert failed.value.status == status
+    assert ("last update" in str(failed.value)) == bool(words)
+    assert f"last update {failed.value.residual:.3g}" in str(failed.value) or not words
