@@ -11,15 +11,7 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-__all__ = ["HEADERS", "Fallback"]
+__all__ = ["Fallback"]
 
 Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
 """Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
-
-HEADERS: dict[Fallback, tuple[str, ...]] = {
-    "own": ("fallback",),
-    "external": ("library_fallback",),
-    "provided": ("fallback",),
-    "none": ("fallback",),
-}
-"""Support headers before the solver by fixed-point iteration, in order."""

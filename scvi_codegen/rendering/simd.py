@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.rendering.fallback import HEADERS, Fallback
+from scvi_codegen.rendering.fallback import Fallback
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
@@ -119,7 +119,8 @@ def iteration_source(
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    solver = (*HEADERS[fallback], "iteration_solver") if meaning.are_points else ()
+    tried = "library_fallback" if fallback == "external" else "fallback"
+    solver = (tried, "iteration_solver") if meaning.are_points else ()
     return IterationSource(
         lanes=fixed_point.lanes,
         whole=meaning.are_points and not fixed_point.in_groups,
