@@ -35,6 +35,7 @@ from sympy import Expr
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.indices import SIZES_REQUIRED
 from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
@@ -49,10 +50,10 @@ from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.lowering.step_density import density_of
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.indexed.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
-from scvi_codegen.mechanics.system import SYSTEM, SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
 from scvi_codegen.mechanics.variational import with_tangent_vectors
 from scvi_codegen.methods import as_method
@@ -189,11 +190,7 @@ def _check_sizes_not_needed(system: ArraySystem, **arguments: object) -> None:
     """Raise an error for an argument that requires known sizes."""
     for name, value in arguments.items():
         if value:
-            sizes = ", ".join(f"'{size}': 8" for size in system.sizes)
-            raise MethodError(
-                f"{name} is not available for arrays of '{system.name}', whose sizes are known at run time only: omit "
-                f"it, or give sizes={{{sizes}}}"
-            )
+            raise MethodError(f"{name} of compile_stepper() is not available for '{system.name}': {SIZES_REQUIRED}")
 
 
 class _Sources:
@@ -314,7 +311,10 @@ class _ArraySources:
     def program(self) -> Program:
         """Lowered program with fixed step size."""
         with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-            return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
+            try:
+                return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
+            except MethodError as error:
+                raise MethodError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
 
     @cached_property
     def plain(self) -> Source:

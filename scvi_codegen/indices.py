@@ -18,7 +18,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
-__all__ = ["Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
+__all__ = ["SIZES_REQUIRED", "Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
+
+SIZES_REQUIRED = (
+    "the sizes of its arrays are known at run time only. Give them when compiling, "
+    "compile_stepper(system, method, sizes={'N': 8}), or use unroll_sums(system, {'N': 8})"
+)
+"""Reason why arrays of run-time sizes lack a feature, with the remedy."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,8 +55,11 @@ def reject_options(what: dict[str, object]) -> None:
     """
     for name, value in what.items():
         if value not in (None, False):
-            instead = ALTERNATIVES.get(name, "omit it, or unroll the sums (unroll_sums)")
-            raise click.UsageError(f"--{name.replace('_', '-')} is not available for indexed models: {instead}")
+            instead = ALTERNATIVES.get(name, "omit it, or write sizes as numbers, coordinates = ['q[8]']")
+            raise click.UsageError(
+                f"--{name.replace('_', '-')} is not available for arrays whose sizes are known at run time only: "
+                f"{instead}"
+            )
 
 
 def with_solver(solver: str, model: IndexedModel) -> IndexedModel:

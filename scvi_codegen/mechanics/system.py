@@ -36,7 +36,7 @@ from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, n
 from scvi_codegen.formulas.writing import format_expression
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.damping import check_damping
-from scvi_codegen.validation.argument_types import ArgumentType, of
+from scvi_codegen.validation.argument_types import of
 
 __all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "named_parameters"]
 
@@ -276,12 +276,5 @@ def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[st
     return given
 
 
-SYSTEM = ArgumentType(
-    "a LagrangianSystem or a HamiltonianSystem; of one with arrays the sizes must be known, as coordinates=['q[8]'] or "
-    "unroll_sums(system, {'N': 8})",
-    lambda value: MechanicalSystem in type(value).__mro__,  # systems of arrays of run-time sizes are registered only
-)
+SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
 """Type check of mechanical systems, for :func:`~scvi_codegen.validation.argument_types.takes`."""
-
-SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)
-"""Type check of systems, also of those with arrays of run-time sizes."""

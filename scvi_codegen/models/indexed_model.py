@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.lowering.arrays import SOLVERS, check_solver
@@ -96,6 +96,10 @@ class IndexedModel:
         if self.steps is not None:
             checked_count(self.steps, "steps", least=0, error=ModelFileError)
         checked_count(self.save_every, "save_every", least=1, error=ModelFileError)
+
+    REQUIRES_SIZES: ClassVar[str] = (
+        "the sizes of its arrays are known at run time only. Write sizes as numbers, coordinates = ['q[8]']"
+    )
 
     def __repr__(self) -> str:
         steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"

@@ -18,6 +18,7 @@ import keyword
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentT
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
+    from scvi_codegen.models.indexed_model import IndexedModel
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.program_source import Embedded, ExampleRun
 
@@ -46,12 +48,13 @@ OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"
 """Folder names that would collide with ``main.c`` or shadow imports of the package."""
 
 
-MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
+EITHER_MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
+MODEL = ArgumentType("a Model", lambda value: EITHER_MODEL.accepts(value) and not hasattr(value, "REQUIRES_SIZES"))
 
 
-@checks_arguments(model=MODEL, folder=PATH, solver=TEXT, force=SWITCH)
+@checks_arguments(model=EITHER_MODEL, folder=PATH, solver=TEXT, force=SWITCH)
 def generate_package(
-    model: Model,
+    model: Model | IndexedModel,
     folder: str | os.PathLike[str],
     *,
     solver: str = "auto",
@@ -64,7 +67,8 @@ def generate_package(
     Obsolete files of an older integrator, and the verification report of other code, are removed.
 
     Args:
-        model: system, method, and the initial state and step size of the example.
+        model: system, method, and the initial state and step size of the example. With arrays of run-time sizes the
+            folder has C code for any sizes and the initial state as text files, but no Python package.
         folder: target; its name becomes the prefix of the C names and the name of the Python package.
         solver: of the stage equations, as for ``compile_stepper``.
         force: overwrite files of the same names that were edited or not generated.
@@ -80,6 +84,15 @@ def generate_package(
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
+    from scvi_codegen.models.indexed_model import IndexedModel  # imported here: folders are loaded without SymPy
+
+    if isinstance(model, IndexedModel):
+        from scvi_codegen.models.indexed_package import generate_sums
+
+        if embedded or single_file:
+            option = "embedded" if embedded else "single_file"
+            raise MethodError(f"{option} of generate_package() is not available for this model: {model.REQUIRES_SIZES}")
+        return generate_sums(model if solver == "auto" else replace(model, solver=solver), folder, force=force)
     prefix = prefix_of(target)
     write_folder(target, _texts(model, prefix, solver, embedded, single_file=single_file), force=force)
     return target

@@ -28,7 +28,9 @@ from scvi_codegen.runtime.indexed_saving import (
 )
 from scvi_codegen.runtime.inputs import missing_input
 from scvi_codegen.runtime.one_thread import OneThread, alone
+from scvi_codegen.runtime.run import Run
 from scvi_codegen.runtime.run_loop import drive
+from scvi_codegen.runtime.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.step_plan import StepPlan
 from scvi_codegen.validation.counts import checked_count
 
@@ -55,7 +57,7 @@ FAILURES_BY_SOLVER = {
 }
 
 
-class IndexedRun(OneThread):
+class IndexedRun(OneThread, RunTimeSizes):
     """Run of an indexed system; made by :meth:`IndexedStepper.start`.
 
     Args:
@@ -73,6 +75,8 @@ class IndexedRun(OneThread):
         state: positions and momenta of all coordinates in one vector.
         iterations: total solver iterations.
     """
+
+    COUNTERPART = Run
 
     def __init__(
         self,

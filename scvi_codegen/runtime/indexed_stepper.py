@@ -28,6 +28,7 @@ from scvi_codegen.runtime.indexed_problem import IndexedProblem
 from scvi_codegen.runtime.indexed_run import IndexedRun
 from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory
 from scvi_codegen.runtime.inputs import check_inputs_given, check_left_to_inputs, inputs_not_given
+from scvi_codegen.runtime.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.runs_with_inputs import (
     advance_to,
     checked_inputs,
@@ -38,6 +39,7 @@ from scvi_codegen.runtime.runs_with_inputs import (
     prepared_segments,
 )
 from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.runtime.times import steps_to
 from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
 from scvi_codegen.validation.counts import checked_count
@@ -45,7 +47,7 @@ from scvi_codegen.validation.counts import checked_count
 __all__ = ["IndexedStepper"]
 
 
-class IndexedStepper:
+class IndexedStepper(RunTimeSizes):
     """Compiled integrator of an indexed system, for any number of coordinates.
 
     Args:
@@ -56,6 +58,8 @@ class IndexedStepper:
         interface: names and shapes.
         flags: flags of the C compiler.
     """
+
+    COUNTERPART = Stepper
 
     def __init__(
         self,

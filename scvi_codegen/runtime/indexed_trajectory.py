@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self, overload
+from typing import ClassVar, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,14 +22,16 @@ from scvi_codegen.runtime.indexed_dense_output import Continuation, states_betwe
 from scvi_codegen.runtime.indexed_events import IndexedCrossings, IndexedSearch
 from scvi_codegen.runtime.indexed_interface import Numbers
 from scvi_codegen.runtime.indexed_run import IndexedRun
+from scvi_codegen.runtime.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.saved_states import checked_row, checked_rows
 from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory import Trajectory
 
 __all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedTrajectory(Confirmed):
+class IndexedTrajectory(Confirmed, RunTimeSizes):
     """States along a run at k times, beginning with the initial one.
 
     Attributes:
@@ -50,6 +52,7 @@ class IndexedTrajectory(Confirmed):
         confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
     """
 
+    COUNTERPART: ClassVar[type] = Trajectory
     t: Numbers
     q: Mapping[str, Numbers]
     p: Mapping[str, Numbers]

@@ -56,8 +56,13 @@ class ArgumentType:
 
 
 def of(words: str, *types: type) -> ArgumentType:
-    """Return the check for an instance of one of the types."""
-    return ArgumentType(words, lambda value: isinstance(value, types))
+    """Return the check for an instance of one of the types; a type with ``REQUIRES_SIZES`` must be named itself."""
+
+    def accepts(value: Any) -> bool:
+        full = not hasattr(type(value), "REQUIRES_SIZES") or any(each in type(value).__mro__ for each in types)
+        return full and isinstance(value, types)
+
+    return ArgumentType(words, accepts)
 
 
 def several(words: str, *types: type) -> ArgumentType:
@@ -111,7 +116,8 @@ def checks_arguments(
     Traceback (most recent call last):
     scvi_codegen.errors.ArgumentError: name must be text, not 3
 
-    A keyword that the function does not have raises an error with a suggestion.
+    A keyword that the function does not have raises an error with a suggestion. A type that lacks features explains it
+    by its attribute ``REQUIRES_SIZES``.
     """
 
     def decorate(function: Called) -> Called:
@@ -131,6 +137,9 @@ def checks_arguments(
                 if place < len(given) or name in named:
                     value = given[place] if place < len(given) else named[name]
                     if not (value is None and name in optional):
+                        reason = getattr(type(value), "REQUIRES_SIZES", "")
+                        if reason and not kind.accepts(value):
+                            raise error(f"{function.__qualname__}() is not available for {value!r:.60}: {reason}")
                         check_kind(kind, value, name, error)
             return function(*given, **named)
 

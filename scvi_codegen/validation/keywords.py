@@ -15,6 +15,11 @@ EXPLANATIONS: Final = {
     "during a run to run.set_inputs(u=...)",
     "t_eval": "save all states, and interpolate the run: run.at(times)",
     "events": "pass them to .integrate(..., events=...) or compile_stepper(..., events=...)",
+    "threads": "threads share the steps of arrays whose sizes are known at run time only, coordinates=['q[N]']; others "
+    "are too short to be shared",
+    "observe": "it reduces states of arrays whose sizes are known at run time only, coordinates=['q[N]']; here save "
+    "fewer states by save_every",
+    "tables": "with sizes, tables are passed when compiling: compile_stepper(system, method, sizes=..., tables=...)",
     "save_every": "pass it to run.record(n, save_every=...) or .integrate",
     "steps": "pass the number to run.advance(n) or run.record(n)",
     "h": "pass it to a stepper: compile_stepper(...).integrate(q, p, h=..., steps=...)",

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.indexed.system import ArraySystem
-from scvi_codegen.mechanics.system import SYSTEM_OR_ARRAYS, MechanicalSystem
+from scvi_codegen.mechanics.indexed.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step

@@ -108,7 +108,7 @@ def test_options_of_array_systems(ring: str) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("run", "--advise", "1e-9"), "--advise is not available for indexed models"),
+        (("run", "--advise", "1e-9"), "--advise is not available for arrays whose sizes are known"),
         (("run", "--time-transformation", "frequency"), "time_transformation is not supported for indexed systems"),
         (("run", "-o", "ring.csv"), "use .npz"),
         (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
@@ -116,8 +116,8 @@ def test_options_of_array_systems(ring: str) -> None:
         (("run", "--method", "scvi:4"), "not supported for indexed systems"),
         (("run", "--solver", "explicit"), "unknown solver 'explicit' of an indexed system"),
         (("generate", "-o", "folder", "--method", "stoermer-verlet", *NEWTON), "leave out solver='newton'"),
-        (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not available for indexed models"),
-        (("derive", "--html", "page.html"), "--html is not available for indexed models"),
+        (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not available for arrays whose sizes"),
+        (("derive", "--html", "page.html"), "--html is not available for arrays whose sizes are known"),
     ],
 )
 def test_unsupported_options_of_array_systems_are_rejected(ring: str, words: tuple[str, ...], message: str) -> None:

@@ -8,10 +8,9 @@ import click
 
 from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
-from scvi_codegen.cli.sums import reject_options, with_solver
+from scvi_codegen.cli.sums import reject_options
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.indexed_package import generate_sums
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.cross import TARGETS
 from scvi_codegen.rendering.program_source import Embedded
@@ -80,7 +79,7 @@ def generate(
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
     if isinstance(model, IndexedModel):
         reject_options({"embedded": embedded, "single_file": single_file, "fmu": fmu})
-        folder, python = generate_sums(with_solver(solver, model), output, force=force), ""
+        folder, python = generate_package(model, output, solver=solver, force=force), ""
     elif fmu:
         folder, python = generate_fmu(model, output, solver=solver, platforms=platforms, force=force), ""
     else:

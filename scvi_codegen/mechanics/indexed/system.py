@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any
+from typing import Any, ClassVar
 
 from sympy import Expr, S, Symbol
 
@@ -29,15 +29,16 @@ from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
-from scvi_codegen.indices import Access, Array, Loop, Size
+from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop, Size
 from scvi_codegen.mechanics.damping import check_damping, damping_rate
 from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
 from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.validation.argument_types import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
-__all__ = ["ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem", "are_arrays"]
+__all__ = ["ARRAYS", "SYSTEM_OR_ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem", "are_arrays"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +76,7 @@ class ArraySystem:
     inputs: tuple[str, ...] = ()
     constraints: tuple[IndexedTerm, ...] = ()
     damping: Expr = S.Zero
+    REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
     def __repr__(self) -> str:
         shown = ", ".join(map(str, self.coordinates))
@@ -112,18 +114,14 @@ class ArraySystem:
             for term in self.constraints:
                 check_constraint(term, self.coordinates, self.fields, inputs)
             if self.damping != 0:
-                raise SystemDefinitionError("damping requires known sizes: write it as forces")
+                raise SystemDefinitionError("damping of all momenta requires known sizes: write it as forces")
             for array in self.coordinates:
                 if len(array.axes) > 1 and any(not axis.name for axis in array.axes[:-1]):
                     raise SystemDefinitionError(
                         f"of the axes of {array} only the last may be a number: name the others"
                     )
         except SystemDefinitionError as error:
-            sizes = ", ".join(f"'{name}': 8" for name in self.sizes)
-            raise SystemDefinitionError(
-                f"'{self.name}' cannot be compiled for sizes known at run time: {error}. Or give the sizes, as "
-                f"compile_stepper(system, method, sizes={{{sizes}}})"
-            ) from error
+            raise SystemDefinitionError(f"{error}. This concerns '{self.name}': {SIZES_REQUIRED}") from error
 
     @classmethod
     @checks_arguments(
@@ -472,3 +470,6 @@ def _friction(
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)
 """Type check of systems of arrays, for :func:`~scvi_codegen.validation.argument_types.checks_arguments`."""
+
+SYSTEM_OR_ARRAYS = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem, ArraySystem)
+"""Type check of systems, also of those with arrays of run-time sizes."""

@@ -125,13 +125,11 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
         at = start.elements(term.loops)
         for slot, access in term.slots:
             if slot.name in derivatives:
-                np.add.at(
-                    result[access.array.name], at.of(access), _values(start, at, derivatives[slot.name], term.slots)
-                )
+                _add(result[access.array.name], at.of(access), _values(start, at, derivatives[slot.name], term.slots))
     for force in system.forces:
         at = start.elements(force.loops)
         for access, formula in force.targets:
-            np.add.at(result[access.array.name], at.of(access), _values(start, at, formula, force.slots))
+            _add(result[access.array.name], at.of(access), _values(start, at, formula, force.slots))
     if system.momenta:
         pairs = list(zip(system.coordinates, system.momenta, strict=True))
         return {q.name: -result[p.name] for q, p in pairs}, {q.name: result[q.name] for q, _ in pairs}
@@ -139,11 +137,19 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
     return {name: p / masses[name] for name, p in start.p.items()}, result
 
 
+def _add(total: Numbers, places: tuple[Any, ...], values: Any) -> None:
+    """Add values to the entries of an array at places, which may repeat; to a single coordinate all of them."""
+    if places:
+        np.add.at(total, places, values)
+    else:
+        total += np.sum(values)
+
+
 def _masses(start: WholeStart) -> dict[str, Numbers]:
     masses = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in start.system.coordinates}
     for mass in start.system.masses:
         at = start.elements(mass.loops)
-        np.add.at(masses[mass.access.array.name], at.of(mass.access), _values(start, at, mass.formula, mass.slots))
+        _add(masses[mass.access.array.name], at.of(mass.access), _values(start, at, mass.formula, mass.slots))
     return masses
 
 

@@ -1,0 +1,318 @@
+"""Features of the table in docs/features.md, each as a function that uses it on one of three kinds of systems."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from samples import QUICK_FLAGS
+
+import scvi_codegen as sc
+
+__all__ = ["FEATURES", "KINDS", "Kind"]
+
+ENDS = {
+    "named coordinates": ("x", "y", "z"),
+    "known sizes": ("x", "q[2]"),
+    "run-time sizes": ("x", "q[N]"),
+}
+KINDS = tuple(ENDS)
+Q = {"named coordinates": {"x": 0.3, "y": 0.1, "z": -0.2}}
+
+
+class Kind:
+    """A body with two others on springs, by names, by an array of two, or of any number."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.named, self.run_time = name == "named coordinates", name == "run-time sizes"
+        self.coordinates = list(ENDS[name])
+        self.first = "y" if self.named else "q[0]"
+        self.q = Q.get(name, {"x": 0.3, "q": [0.1, -0.2]})
+        self.p = {each: np.zeros(np.shape(value)) for each, value in self.q.items()}
+
+    def sum(self, named: str, indexed: str) -> str:
+        """Return a formula of all bodies but x."""
+        size = self.coordinates[1][2:-1]
+        return named if self.named else f"sum(i in {size}, {indexed})"
+
+    def system(self, *, kinetic: str = "", **beside: Any) -> Any:
+        """Return the system with a further kinetic energy, and other arguments of from_text."""
+        moving, springs = (
+            self.sum("y_dot**2/2 + z_dot**2/2", "q_dot[i]**2/2"),
+            self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2"),
+        )
+        text = f"x_dot**2/2 + {moving} - k*x**2/2 - x**4/9 - {springs}{kinetic}"
+        given = {"parameters": {"k": 1}, **beside}
+        return sc.LagrangianSystem.from_text("bodies", self.coordinates, text, **given)
+
+    @cache  # noqa: B019  (three objects in all)
+    def stepper(self) -> Any:
+        """Return a stepper of the system without anything else."""
+        return self.compiled(self.system())
+
+    def compiled(self, system: Any, method: Any = "svi:2", **given: Any) -> Any:
+        """Return the stepper of a system."""
+        return sc.compile_stepper(system, method, flags=QUICK_FLAGS, **given)
+
+    def run(self, stepper: Any = None, **given: Any) -> Any:
+        """Return a run of few steps."""
+        return (stepper or self.stepper()).integrate(self.q, self.p, **{"h": 0.1, "steps": 4, **given})
+
+    def flat(self) -> tuple[Any, Any]:
+        """Return the state as vectors, or as it is."""
+        return ([0.3, 0.1, -0.2], [0.0] * 3) if not self.run_time else (self.q, self.p)
+
+    def model(self, folder: Path) -> Any:
+        """Return the model of a file."""
+        text = self.system().to_text() if self.named else None
+        springs = self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2")
+        text = text or f"x_dot**2/2 + {self.sum('', 'q_dot[i]**2/2')} - k*x**2/2 - x**4/9 - {springs}"
+        numbers = ", ".join(f"{name} = {value}" for name, value in self.q.items())
+        path = folder / "model.toml"
+        path.write_text(
+            f"[system]\nname = 'bodies'\ncoordinates = {self.coordinates}\nlagrangian = '''{text}'''\n"
+            f"[parameters]\nk = 1\n[initial]\nq = {{{numbers}}}\n"
+            f"q_dot = {{{', '.join(f'{name} = {np.zeros(np.shape(v)).tolist()}' for name, v in self.q.items())}}}\n"
+            "[run]\nstep = 0.1\nspan = 1.0\n"
+        )
+        return sc.load_model(path)
+
+
+def scvi(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(), "scvi:2"))
+
+
+def splittings(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(), "stoermer-verlet")), of.compiled(of.system(), "composition:8")
+
+
+def hamiltonians(of: Kind, _: Path) -> Any:
+    text = f"p_x**2/2 + {of.sum('p_y**2/2 + p_z**2/2 + y**2 + z**2', 'p_q[i]**2/2 + q[i]**2')} + x**4"
+    return of.run(of.compiled(sc.HamiltonianSystem.from_text("bodies", of.coordinates, text)))
+
+
+def full_masses(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(kinetic=f" + {of.sum('x_dot*y_dot/9', 'x_dot*q_dot[i]/9')}")))
+
+
+def forces(of: Kind, _: Path) -> Any:
+    friction = of.sum("y_dot**2 + z_dot**2", "q_dot[i]**2")
+    return of.run(of.compiled(of.system(forces={"x": "cos(t)"}, dissipation=friction)))
+
+
+def damping(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(damping=0.1)))
+
+
+def holonomic(of: Kind, _: Path) -> Any:
+    system = of.system(constraints=[f"{of.first} - x = -0.2"])
+    return of.run(of.compiled(system, "stoermer-verlet" if of.run_time else sc.SVI(1, "gauss-lobatto:2")))
+
+
+def nonholonomic(of: Kind, _: Path) -> Any:
+    dot = "y_dot" if of.named else "q_dot[0]"
+    return of.run(of.compiled(of.system(constraints=[f"{dot} - x*x_dot = 0"]), sc.SVI(1, "gauss-lobatto:2")))
+
+
+def inputs(of: Kind, _: Path) -> Any:
+    stepper = of.compiled(of.system(forces={"x": "u"}, inputs=["u"]))
+    return of.run(stepper, inputs={"u": ([0.0, 1.0], [0.0, 1.0])})
+
+
+def adaptive(of: Kind, _: Path) -> Any:
+    return of.stepper().integrate(of.q, of.p, t_end=1.0)
+
+
+def time_transformation(of: Kind, _: Path) -> Any:
+    stepper = of.compiled(of.system(), time_transformation="1/(1 + x**2)")
+    return stepper.integrate(of.q, of.p, h=0.1, t_end=1.0)
+
+
+def t_eval(of: Kind, _: Path) -> Any:
+    return of.run(t_eval=[0.05, 0.3])
+
+
+def dense_output(of: Kind, _: Path) -> Any:
+    return of.run().at([0.05, 0.3])
+
+
+def events(of: Kind, _: Path) -> Any:
+    return of.run(events="x - 0.25")
+
+
+def ensembles(of: Kind, _: Path) -> Any:
+    starts = {name: np.stack([value, value]) for name, value in of.q.items()}
+    return of.stepper().integrate_ensemble(starts, np.zeros((2, 3)), h=0.1, steps=3)
+
+
+def threads(of: Kind, _: Path) -> Any:
+    return of.run(threads=2)
+
+
+def other_sizes(of: Kind, _: Path) -> Any:
+    q = {"x": 0.0, "q": [0.1, 0.2, 0.3]} if not of.named else [0.0, 0.1, 0.2, 0.3]
+    return of.stepper().integrate(q, q, h=0.1, steps=1)
+
+
+def observe(of: Kind, _: Path) -> Any:
+    return of.run(observe=lambda run: run.energy)
+
+
+def tangent(of: Kind, _: Path) -> Any:
+    return of.stepper().jacobian(*of.flat(), 0.1)
+
+
+def adjoint(of: Kind, _: Path) -> Any:
+    run = of.run()
+    return run.pullback(np.ones((len(run.t), 6)))
+
+
+def hessian_products(of: Kind, _: Path) -> Any:
+    run = of.run()
+    return run.hessian_product(np.ones((len(run.t), 6)), np.ones(6))
+
+
+def chaos(of: Kind, _: Path) -> Any:
+    return of.run(steps=20).megno()
+
+
+def periodic(of: Kind, _: Path) -> Any:
+    q = [0.0, 0.1, -0.1] if not of.run_time else of.q
+    return sc.periodic_orbit(of.stepper(), q, of.flat()[1], period=6.3, steps=60)
+
+
+def fits(of: Kind, _: Path) -> Any:
+    run = of.run(steps=20)
+    return sc.fit(of.stepper(), run.t, run.q, q=of.flat()[0], p=of.flat()[1], h=0.1, unknown=["k"])
+
+
+def jax(of: Kind, _: Path) -> Any:
+    return sc.jax_flow(of.stepper(), steps=3)
+
+
+def torch(of: Kind, _: Path) -> Any:
+    return sc.torch_flow(of.stepper(), steps=3)
+
+
+def casadi(of: Kind, _: Path) -> Any:
+    return sc.casadi_flow(of.stepper(), steps=3)
+
+
+def momentum_maps(of: Kind, _: Path) -> Any:
+    return of.run().momentum_maps()
+
+
+def symmetries(of: Kind, _: Path) -> Any:
+    return sc.symmetries(of.system())
+
+
+def work(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(forces={"x": "cos(t)"}))).work()
+
+
+def discrete_lagrangian(of: Kind, _: Path) -> Any:
+    return of.stepper().discrete_lagrangian(of.flat()[0], of.flat()[0], 0.1)
+
+
+def exact_map(of: Kind, _: Path) -> Any:
+    return sc.exact_map(of.system(), *of.flat(), 0.01, digits=15)
+
+
+def derivation(of: Kind, _: Path) -> Any:
+    return sc.derive(of.system(), "svi:1").to_text()
+
+
+def certificate(of: Kind, _: Path) -> Any:
+    return sc.verify(of.system(), "svi:2", *of.flat(), h=0.05, flags=QUICK_FLAGS)
+
+
+def model_file(of: Kind, folder: Path) -> Any:
+    return of.model(folder)
+
+
+def c_folder(of: Kind, folder: Path) -> Any:
+    return sc.generate_package(of.model(folder), folder / "made")
+
+
+def fmu(of: Kind, folder: Path) -> Any:
+    return sc.generate_fmu(of.model(folder), folder / "made.fmu", flags=QUICK_FLAGS)
+
+
+def advice(of: Kind, _: Path) -> Any:
+    return sc.advise(of.system(), "svi:2", *of.flat(), 1.0, 1e-4)
+
+
+def solve_ivp(of: Kind, _: Path) -> Any:
+    start = np.concatenate([[0.3], np.zeros(5)])
+    return sc.solve_ivp(of.system(), (0.0, 1.0), start)
+
+
+def checkpoints(of: Kind, _: Path) -> Any:
+    run = of.stepper().start(of.q, of.p, h=0.1)
+    run.advance(2)
+    return of.stepper().from_checkpoint(run.checkpoint())
+
+
+def recording(of: Kind, folder: Path) -> Any:
+    return sc.record_run(of.stepper().start(of.q, of.p, h=0.1), folder / "run", steps=3)
+
+
+def export(of: Kind, _: Path) -> Any:
+    return of.run().to_xarray()
+
+
+def newton(of: Kind, _: Path) -> Any:
+    return of.run(of.compiled(of.system(), solver="newton"))
+
+
+FEATURES: dict[str, Callable[[Kind, Path], Any]] = {
+    "SVI, spectral collocation, Runge-Kutta": lambda of, _: of.run(),
+    "SCVI": scvi,
+    "Stoermer-Verlet and compositions": splittings,
+    "Hamiltonians": hamiltonians,
+    "any kinetic energy": full_masses,
+    "forces, Rayleigh dissipation": forces,
+    "uniform damping": damping,
+    "holonomic constraints": holonomic,
+    "nonholonomic constraints": nonholonomic,
+    "inputs": inputs,
+    "adaptive steps": adaptive,
+    "Newton's iteration": newton,
+    "time transformation": time_transformation,
+    "output times `t_eval`": t_eval,
+    "dense output `at`": dense_output,
+    "events": events,
+    "ensembles": ensembles,
+    "threads within a step": threads,
+    "sizes chosen by each run": other_sizes,
+    "reduction of states `observe`": observe,
+    "Jacobians of steps": tangent,
+    "adjoint derivatives": adjoint,
+    "Hessian products": hessian_products,
+    "chaos indicators": chaos,
+    "periodic orbits": periodic,
+    "fits": fits,
+    "JAX": jax,
+    "PyTorch": torch,
+    "CasADi": casadi,
+    "momentum maps": momentum_maps,
+    "symmetries of the system": symmetries,
+    "work of forces": work,
+    "discrete Lagrangian": discrete_lagrangian,
+    "exact map": exact_map,
+    "derivation": derivation,
+    "verification report": certificate,
+    "model files": model_file,
+    "C folder": c_folder,
+    "FMU": fmu,
+    "advice": advice,
+    "`solve_ivp`": solve_ivp,
+    "checkpoints": checkpoints,
+    "recorded runs": recording,
+    "xarray, pandas, HDF5": export,
+}
+"""Function of a kind of system and a folder, by row of the table."""
