@@ -14,9 +14,7 @@ The name of the folder is the prefix of all C names. Importing it compiles the C
 from __future__ import annotations
 
 import json
-import keyword
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +22,9 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import MethodError, ModelFileError, PackageError, StateError
-from scvi_codegen.models.folders import CERTIFICATE_FILE, FORMAT, INTERFACE_FILE, record_text, write_folder
-from scvi_codegen.rendering.source import PREFIX, Interface, Source, check_interface, included
+from scvi_codegen.models.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
+from scvi_codegen.models.generated_folders import damaged, prefix_of, read_record, source_in
+from scvi_codegen.rendering.source import Interface, Source, check_interface
 from scvi_codegen.runtime.compiled_method import Variants
 from scvi_codegen.runtime.stepper import Stepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
@@ -36,16 +35,13 @@ if TYPE_CHECKING:
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.program_source import Embedded, ExampleRun
 
-__all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_package", "model_text", "prefix_of"]
+__all__ = ["CERTIFICATE_FILE", "MODEL", "example_of", "generate_package", "load_package", "model_text"]
 
 OUTPUTS = 20
 COMPARED = 1e-9
 """Tolerance of adaptive steps shown next to an example with a fixed step size."""
 ADVANCE_TO = "_advance_to("
 """Declaration in the header of an integrator with adaptive steps."""
-
-OTHER_NAMES = frozenset({"main", "scvi_codegen", "numpy", "cffi", "platformdirs"})
-"""Folder names that would collide with ``main.c`` or shadow imports of the package."""
 
 
 EITHER_MODEL = ArgumentType("a Model", lambda value: hasattr(value, "system") and hasattr(value, "method"))
@@ -116,78 +112,14 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, PackageError):
             raise
-        raise _damaged(target, error) from error
+        raise damaged(target, error) from error
     source = source_in(target, interface.prefix)
     try:
         check_interface(source, interface)
     except ValueError as error:
-        raise _damaged(target, error) from error
+        raise damaged(target, error) from error
     controlled = source if ADVANCE_TO in source.declarations else None
     return Stepper(source, interface, variants=Variants({"controlled": controlled}))
-
-
-def read_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return ``interface.json`` of a generated folder; raises as :func:`source_in`."""
-    target = Path(folder)
-    try:
-        record = json.loads((target / INTERFACE_FILE).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise PackageError(f"{target} is not a generated package: {error.filename}: {error.strerror}") from error
-    except ValueError as error:
-        raise _damaged(target, error) from error
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise PackageError(f"{target / INTERFACE_FILE} has another format: generate the folder again")
-    return record
-
-
-def source_in(folder: Path, prefix: str) -> Source:
-    """Return the C code in a generated folder.
-
-    Raises:
-        PackageError: if the folder lacks a file or was written by another version.
-    """
-    if not PREFIX.fullmatch(prefix):
-        raise _damaged(folder, ValueError(f"{prefix!r} is not a prefix of C names"))
-    try:
-        header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
-        declarations = "\n".join(read_record(folder)["declarations"])
-        support = tuple((name, _read(folder / name)) for name in included(code))
-    except OSError as error:
-        raise PackageError(f"{folder} is not a generated package: {error.filename}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        if isinstance(error, PackageError):
-            raise
-        raise _damaged(folder, error) from error
-    return Source(prefix=prefix, header=header, code=code, declarations=declarations, support=support)
-
-
-def _damaged(folder: Path, error: Exception) -> PackageError:
-    return PackageError(f"{folder / INTERFACE_FILE} is damaged ({error!r}): generate the folder again")
-
-
-def _read(file: Path) -> str:
-    return file.read_text(encoding="utf-8")
-
-
-def prefix_of(folder: Path) -> str:
-    """Return the name of the folder, validated as a prefix of C names and as a Python module."""
-    from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
-
-    try:
-        name = folder.resolve().name
-        name.encode()
-    except ValueError as error:
-        raise PackageError(f"{str(folder)!r} cannot be the name of a folder: {error}") from error
-    cleaned = c_identifier(name)
-    if name != cleaned:
-        raise PackageError(
-            "the name of the folder must be a prefix of C names and a name of a Python package; "
-            f"'{name}' is not (lower-case letters, digits and underscores, at most {LONGEST_PREFIX}): "
-            f"use '{cleaned}'"
-        )
-    if keyword.iskeyword(name) or name in sys.stdlib_module_names or name in OTHER_NAMES:
-        raise PackageError(f"'{name}' is reserved in C or Python: use '{name}_integrator' for the folder")
-    return name
 
 
 def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:

@@ -72,7 +72,6 @@ def test_keywords_of_other_programs_are_recognised(wrong, meant, stepper):
     [
         (sc.compile_stepper, {"h": 0.1}, "takes no 'h': pass it to a stepper"),
         (sc.compile_stepper, {"degree": 8}, "takes no 'degree': include it in the method, 'svi:8'"),
-        (sc.verify, {"velocity": [0.0]}, "takes no 'velocity': use momenta, p = stepper.momentum(q, velocity)"),
         (sc.LagrangianSystem.from_text, {"L": "x"}, "takes no 'L'; did you mean 'lagrangian'?"),
     ],
     ids=lambda each: getattr(each, "__name__", None) or str(each),
