@@ -126,13 +126,13 @@ class Curve:
         cls, motion: ExactMotion, grid: Grid, t: Number, h: Number, start: Array, velocity: Array, digits: int
     ) -> Curve:
         """Return the solution of (2) with this initial position and velocity, computed piece after piece."""
-        position, speed, found, length = start, velocity, [], h / grid.pieces
+        position, speed, coefficients, length = start, velocity, [], h / grid.pieces
         for index in range(grid.pieces):
             first = cls(motion, grid.piece, t + index * length, length, position, speed, np.empty((0,)))
             curve = first._uniformly_accelerated()._solved(digits)
-            found.append(curve.z * grid.pieces)
+            coefficients.append(curve.z * grid.pieces)
             position, speed = curve.ends()[1], curve.end_velocities()[1]
-        return cls(motion, grid, t, h, start, velocity, np.concatenate(found))
+        return cls(motion, grid, t, h, start, velocity, np.concatenate(coefficients))
 
     def _uniformly_accelerated(self) -> Curve:
         rest = np.array([mp.zero] * len(self.position), dtype=object)

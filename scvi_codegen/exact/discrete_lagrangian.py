@@ -226,20 +226,20 @@ def _number(value: Any, name: str) -> Number:
 def _parameter_values(system: LagrangianSystem, parameters: Values) -> dict[str, Number]:
     names = [parameter.name for parameter in system.parameters]
     if parameters is None or isinstance(parameters, Mapping):
-        given = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})
+        by_name = dict(zip(names, system.defaults, strict=True)) | dict(parameters or {})
         for name in system.inputs:
             if f"{name}_0" not in (parameters or {}):
                 raise StateError(f"the input {name} is not set: give its value as parameters={{'{name}_0': ...}}")
     elif len(parameters) == len(names):
-        given = dict(zip(names, parameters, strict=True))
+        by_name = dict(zip(names, parameters, strict=True))
     else:
         raise StateError(f"parameters must be {len(names)} numbers ({', '.join(names)}), not {len(parameters)}")
-    for name in given:
+    for name in by_name:
         if name not in names:
             raise StateError(
                 f"there is no parameter '{name}'{closest(name, names)} Known: {', '.join(names) or 'none'}"
             )
-    return {name: _number(value, f"the parameter {name}") for name, value in given.items()}
+    return {name: _number(value, f"the parameter {name}") for name, value in by_name.items()}
 
 
 def _shown(values: Array) -> str:

@@ -83,12 +83,12 @@ def damped(residual: Solve, solve: Solve, x: Array, update: Array) -> tuple[Arra
 def inverse(matrix: Floats) -> Floats:
     """Return the inverse of a matrix that is regular wherever the mass matrix is."""
     try:
-        found = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+        result = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     except np.linalg.LinAlgError as failure:
         raise NotConvergedError("the mass matrix d2L/dv2 is singular at an iterate") from failure
-    if not np.isfinite(found).all():
+    if not np.isfinite(result).all():
         raise NotConvergedError("an iterate exceeds the range of double precision")
-    return found
+    return result
 
 
 def scaled(solve: Callable[[Floats], Floats], right: Array) -> Array:
@@ -96,8 +96,8 @@ def scaled(solve: Callable[[Floats], Floats], right: Array) -> Array:
     size = largest(right)
     if size == 0:
         return right
-    found = [mp.mpf(float(value)) * size for value in solve((right / size).astype(float).ravel())]
-    return np.array(found, dtype=object).reshape(right.shape)
+    solution = [mp.mpf(float(value)) * size for value in solve((right / size).astype(float).ravel())]
+    return np.array(solution, dtype=object).reshape(right.shape)
 
 
 def solver(matrix: Floats) -> Solve:

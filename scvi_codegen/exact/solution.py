@@ -55,9 +55,9 @@ class ExactMotion:
 
     def with_parameters(self, parameters: Sequence[Number]) -> ExactMotion:
         """Return the same functions with other values of the parameters, in order."""
-        found = copy(self)
-        found.parameters = [mp.mpf(value) for value in parameters]
-        return found
+        result = copy(self)
+        result.parameters = [mp.mpf(value) for value in parameters]
+        return result
 
     @cached_property
     def _formula(self) -> Tape:
@@ -116,12 +116,12 @@ class ExactMotion:
         def rate(f: sympy.Expr) -> sympy.Expr:
             return sympy.Add(f.diff(t), *(f.diff(x) * y for x, y in zip(q, v, strict=True)))
 
-        given = self.system.constraints
-        rolling = [any(g.has(x) for x in v) for g in given]
-        bound = [sympy.S.Zero if own else g for g, own in zip(given, rolling, strict=True)]
-        rates = [g if own else rate(g) for g, own in zip(given, rolling, strict=True)]
+        constraints = self.system.constraints
+        rolling = [any(g.has(x) for x in v) for g in constraints]
+        positions = [sympy.S.Zero if nonholonomic else g for g, nonholonomic in zip(constraints, rolling, strict=True)]
+        rates = [g if nonholonomic else rate(g) for g, nonholonomic in zip(constraints, rolling, strict=True)]
         derivatives = [moving.diff(x) for moving in rates for x in v]
-        return Tape([*derivatives, *map(rate, rates), *bound, *rates], self.symbols)
+        return Tape([*derivatives, *map(rate, rates), *positions, *rates], self.symbols)
 
     def _values(self, tape: Tape, q: Numbers, second: Numbers, t: Number) -> Numbers:
         return np.array(tape([*q, *second, t, *self.parameters]), dtype=object)
@@ -164,8 +164,8 @@ class ExactMotion:
         q, second = np.split(state, 2)
         m = len(q)
         if self.hamiltonian:
-            found = self._values(self._right_hand_side, q, second, t)
-            return np.concatenate([found[m:], -found[:m]])
+            values = self._values(self._right_hand_side, q, second, t)
+            return np.concatenate([values[m:], -values[:m]])
         mass, applied = self._mass_and_applied(q, second, t)
         if self.system.constraints:
             return np.concatenate([second, self._constrained_accelerations(mass, applied, q, second, t)[:m]])
@@ -173,9 +173,9 @@ class ExactMotion:
 
     def _mass_and_applied(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return L_vv and the applied force (L_vv times unconstrained accelerations) at (q, v) of a Lagrangian."""
-        m, found = len(q), self._values(self._right_hand_side, q, v, t)
-        derivatives = found[m:].reshape(m, 2 * m + 1)
-        return derivatives[:, :m], found[:m] - derivatives[:, m : 2 * m] @ v - derivatives[:, 2 * m]
+        m, values = len(q), self._values(self._right_hand_side, q, v, t)
+        derivatives = values[m:].reshape(m, 2 * m + 1)
+        return derivatives[:, :m], values[:m] - derivatives[:, m : 2 * m] @ v - derivatives[:, 2 * m]
 
     def _constrained_accelerations(self, mass: Numbers, applied: Numbers, q: Numbers, v: Numbers, t: Number) -> Numbers:
         """Return (m + c,) accelerations, and multipliers with which constraints have zero second derivatives."""
@@ -184,8 +184,8 @@ class ExactMotion:
 
     def _constraint_terms(self, q: Numbers, v: Numbers, t: Number) -> tuple[Numbers, Numbers]:
         """Return the (c, m) constraint Jacobian; (3, c) d/dt of the rates at constant v, constraints, rates."""
-        m, count, found = len(q), len(self.system.constraints), self._values(self._constraint_tape, q, v, t)
-        return found[: count * m].reshape(count, m), found[count * m :].reshape(3, count)
+        m, count, values = len(q), len(self.system.constraints), self._values(self._constraint_tape, q, v, t)
+        return values[: count * m].reshape(count, m), values[count * m :].reshape(3, count)
 
     def met(self, q: Any, p: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
         """Project (q, p) onto the constraints to all digits; without constraints it is returned unchanged."""
@@ -219,16 +219,16 @@ class ExactMotion:
 
     def residual(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Numbers:
         """Return the (m,) Euler-Lagrange residual of a Lagrangian, d/dt dL/dv - dL/dq - f."""
-        m, found = len(q), self._values(self._right_hand_side, q, v, t)
-        derivatives = found[m:].reshape(m, 2 * m + 1)
-        residual: Numbers = derivatives[:, :m] @ a + derivatives[:, m : 2 * m] @ v + derivatives[:, 2 * m] - found[:m]
+        m, values = len(q), self._values(self._right_hand_side, q, v, t)
+        derivatives = values[m:].reshape(m, 2 * m + 1)
+        residual: Numbers = derivatives[:, :m] @ a + derivatives[:, m : 2 * m] @ v + derivatives[:, 2 * m] - values[:m]
         return residual
 
     def residual_jacobian(self, q: Numbers, v: Numbers, t: Number, a: Numbers) -> Floats:
         """Return the (3, m, m) derivatives of the residual by position, velocity and acceleration, in doubles."""
-        places, tape = self._residual_jacobian_tape
+        indices, tape = self._residual_jacobian_tape
         matrices = np.zeros((len(q), 3 * len(q)))
-        matrices[places] = [float(value) for value in tape([*q, *v, *a, t, *self.parameters])]
+        matrices[indices] = [float(value) for value in tape([*q, *v, *a, t, *self.parameters])]
         return np.stack(np.split(matrices, 3, axis=1))
 
     @cached_property
@@ -241,7 +241,7 @@ class ExactMotion:
             for row, force in zip(self._curvature, self._by_position, strict=True)
         ]
         entries = jacobian(residual, (*q, *v, *a))
-        rows, columns = ([place[k] for place in entries] for k in range(2))
+        rows, columns = ([index[k] for index in entries] for k in range(2))
         return (rows, columns), Tape(list(entries.values()), (*q, *v, *a, t, *self.system.parameters))
 
     def flow(self, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers]:
@@ -258,9 +258,9 @@ class ExactMotion:
         return position, second if self.hamiltonian else self.momentum(position, second, t + h)
 
     def _integrated_flow(self, start: Numbers, h: Number, t: Number, halvings: int) -> Numbers:
-        found = self._extrapolated(start, h, t)
-        if found is not None:
-            return found
+        state = self._extrapolated(start, h, t)
+        if state is not None:
+            return state
         if not halvings:
             raise StateError("the exact trajectory cannot be computed over one step: it may contain a singularity")
         middle = self._integrated_flow(start, h / 2, t, halvings - 1)

@@ -63,10 +63,12 @@ class DerivedStep:
     def __init__(self, system: MechanicalSystem, stages: StageSystem) -> None:
         self.system, self.stages, self.motion = system, stages, exact_motion(system)
         symbols = [(*group.arguments, system.time, *system.parameters) for group in stages.stage_groups]
-        self.kernels = [Tape(group.results, own) for group, own in zip(stages.stage_groups, symbols, strict=True)]
+        self.kernels = [
+            Tape(group.results, arguments) for group, arguments in zip(stages.stage_groups, symbols, strict=True)
+        ]
         self.scalars = [
-            None if group.scalar is None else Tape([group.scalar], own)
-            for group, own in zip(stages.stage_groups, symbols, strict=True)
+            None if group.scalar is None else Tape([group.scalar], arguments)
+            for group, arguments in zip(stages.stage_groups, symbols, strict=True)
         ]
         self.damping = Tape([stages.damping], system.parameters)
         self.rate = Tape([system.clock.rate], symbols[0]) if system.clock else None
@@ -83,9 +85,9 @@ class DerivedStep:
 
     def with_parameters(self, parameters: Sequence[Number]) -> DerivedStep:
         """Return the same equations with other values of the parameters, in order."""
-        found = copy(self)
-        found.motion = self.motion.with_parameters(parameters)
-        return found
+        result = copy(self)
+        result.motion = self.motion.with_parameters(parameters)
+        return result
 
     @property
     def unknowns(self) -> int:
@@ -145,7 +147,10 @@ class DerivedStep:
             raise StateError(f"'{self.system.name}' has no time transformation")
         known = _Known(numbers(q), numbers(p), mp.mpf(h), mp.zero)
         group, z = self.stages.stage_groups[0], np.array(solved.unknowns, dtype=object)
-        rates = [self.rate(self._point(group, n, own, known))[0] for n, own in enumerate(self._arguments(0, z, known))]
+        rates = [
+            self.rate(self._point(group, n, arguments, known))[0]
+            for n, arguments in enumerate(self._arguments(0, z, known))
+        ]
         return known.h * mp.fdot(shape.weights, rates)
 
     def action_gradient(self, solved: SolvedStep, q: Any, p: Any, h: Any, t: Any = 0) -> tuple[Numbers, Numbers] | None:
@@ -162,14 +167,14 @@ class DerivedStep:
             return self._action(values[m:], _Known(values[:m], known.p, known.h, known.t))
 
         derivatives = np.empty_like(joined)
-        for place in range(len(joined)):
-            width = mp.mpf(10) ** -18 * max(1, abs(joined[place]))
+        for k in range(len(joined)):
+            width = mp.mpf(10) ** -18 * max(1, abs(joined[k]))
             ends = []
             for sign in (1, -1):
                 moved = joined.copy()
-                moved[place] += sign * width
+                moved[k] += sign * width
                 ends.append(action(moved))
-            derivatives[place] = (ends[0] - ends[1]) / (2 * width)
+            derivatives[k] = (ends[0] - ends[1]) / (2 * width)
         return derivatives[:m], derivatives[m:]
 
     def _action(self, z: Numbers, known: _Known) -> Number:
@@ -236,8 +241,8 @@ class DerivedStep:
         """Return the residuals of the equations, followed by p1."""
         m = self.system.dimension
         starts = [
-            known.p * x if own.stop - own.start == m else numbers([0] * (own.stop - own.start))
-            for own, x in zip(self.rows, self.momenta, strict=True)
+            known.p * x if row.stop - row.start == m else numbers([0] * (row.stop - row.start))
+            for row, x in zip(self.rows, self.momenta, strict=True)
         ]
         rows = np.concatenate(starts)
         for f, group in enumerate(self.stages.stage_groups):
@@ -259,13 +264,13 @@ class DerivedStep:
                 derivatives = self._kernel_jacobian(f, n, arguments[n], known)
                 for s, rows in enumerate(self.scatters[f]):
                     for g, gather in enumerate(group.gathers):
-                        own = derivatives[self.results[f][s], self.arguments[f][g]]
+                        derivative = derivatives[self.results[f][s], self.arguments[f][g]]
                         moved = mp.mpf(gather.scale.numerator) / gather.scale.denominator * known.h**gather.power
                         for r in np.flatnonzero(rows[n, :-1]):
                             factor = self._factor(group, s, n, r, known) * rows[n, r] * moved
                             for b in np.flatnonzero(self.gathers[f][g][n, 1:]):
                                 entry = factor * self.gathers[f][g][n, b + 1] * powers[b]
-                                matrix[self.rows[r], self.blocks[b]] += own * entry
+                                matrix[self.rows[r], self.blocks[b]] += derivative * entry
         return matrix
 
     def _kernel_jacobian(self, f: int, n: int, arguments: Numbers, known: _Known) -> Numbers:

@@ -74,10 +74,10 @@ class _Accumulation:
     def of(self, node: Expr) -> _Gradient:
         if not node.args:
             return self.known.get(node, {})
-        found = self.known.get(node)
-        if found is None:
-            found = self.known[node] = self.derived(node)
-        return found
+        derivative = self.known.get(node)
+        if derivative is None:
+            derivative = self.known[node] = self.derived(node)
+        return derivative
 
     def derived(self, node: Expr) -> _Gradient:
         inner = [self.of(argument) for argument in node.args]

@@ -113,8 +113,8 @@ def parse_indexed(
 
 def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
     """Return the term of a formula over loops, with the accesses that occur in it."""
-    found = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
-    return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in found))
+    occurring = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
+    return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in occurring))
 
 
 class _Indices(Parser):
@@ -128,8 +128,8 @@ class _Indices(Parser):
     def expect(self, *texts: str) -> Token:
         token = self.peek()
         if token.text not in texts:
-            found = f"not '{token.text}'" if token.text else "but the formula ends"
-            self.refuse(f"{' or '.join(repr(text) for text in texts)} is expected here, {found}", token.column)
+            actual = f"not '{token.text}'" if token.text else "but the formula ends"
+            self.refuse(f"{' or '.join(repr(text) for text in texts)} is expected here, {actual}", token.column)
         self.position += 1
         return token
 
@@ -198,7 +198,7 @@ class IndexedParser(_Indices):
         super().__init__(text, symbols)
         self.arrays, self.tables = ({each.name: each for each in group} for group in (arrays, tables))
         self.sizes = {name for array in (*arrays, *tables) for name in array.names}
-        self.bound: dict[str, Bound] = {}
+        self.in_scope: dict[str, Bound] = {}
         self.nested = 1
         self.accesses: dict[Symbol, Access] = {}
         self.sums: dict[Symbol, tuple[tuple[Loop, ...], Expr, int]] = {}
@@ -214,8 +214,8 @@ class IndexedParser(_Indices):
         if self.peek().text == "[":
             known = ", ".join(map(str, self.arrays.values())) or "none"
             self.refuse(f"'{name}' is not an array{closest(name, self.arrays)} Arrays: {known}", column)
-        if name in self.bound or name in self.sizes:
-            what = "an index" if name in self.bound else "a size"
+        if name in self.in_scope or name in self.sizes:
+            what = "an index" if name in self.in_scope else "a size"
             self.refuse(
                 f"'{name}' is {what}, which may occur only in brackets and bounds: declare a parameter for its value",
                 column,
@@ -232,10 +232,10 @@ class IndexedParser(_Indices):
             if self.peek(1).text not in ("in", "<"):
                 break
             loops += self.loop()
-        inner = any(isinstance(bound, Loop) for bound in self.bound.values())
+        inner = any(isinstance(bound, Loop) for bound in self.in_scope.values())
         if inner or (self.sizes and all(not loop.first.name and not loop.end.name for loop in loops)):
             return self.written_out(loops, column)
-        self.bound |= {loop.index: loop for loop in loops}
+        self.in_scope |= {loop.index: loop for loop in loops}
         formula = self.sum()
         self.end_of_sum(loops)
         placeholder = symbol(f"sum {len(self.sums)}")
@@ -245,7 +245,7 @@ class IndexedParser(_Indices):
     def end_of_sum(self, loops: Sequence[Loop]) -> None:
         """Parse the closing bracket of a sum and release its indices."""
         for loop in loops:
-            del self.bound[loop.index]
+            del self.in_scope[loop.index]
         self.close()
 
     def written_out(self, loops: Sequence[Loop], column: int) -> Expr:
@@ -275,7 +275,7 @@ class IndexedParser(_Indices):
         start, formulas = self.position, []
         for row in rows:
             self.position = start
-            self.bound |= row
+            self.in_scope |= row
             formulas.append(self.sum())
         self.end_of_sum(loops)
         self.nested //= count
@@ -290,11 +290,11 @@ class IndexedParser(_Indices):
         self.expect("in")
         column, size = self.column, self.size()
         span = (size, self.size() + 1) if self.accept("..") else (Size("", 0), size)
-        for bound in span:
-            if bound.name and bound.name not in self.sizes:
+        for end in span:
+            if end.name and end.name not in self.sizes:
                 known = ", ".join(sorted(self.sizes)) or "none"
                 self.refuse(
-                    f"'{bound.name}' is not the size of an array{closest(bound.name, self.sizes)} Sizes: {known}",
+                    f"'{end.name}' is not the size of an array{closest(end.name, self.sizes)} Sizes: {known}",
                     column,
                 )
         periodic = self.peek().text == "periodic"
@@ -312,7 +312,7 @@ class IndexedParser(_Indices):
             check_name(token.text)
         except SystemDefinitionError as error:
             self.refuse(str(error), token.column)
-        if token.text in self.bound:
+        if token.text in self.in_scope:
             self.refuse(f"the index '{token.text}' is used by an enclosing sum: choose another", token.column)
         if any(token.text in names for names in (self.arrays, self.tables, self.symbols, self.sizes)):
             self.refuse(f"'{token.text}' is the name of something else: choose another index", token.column)
@@ -321,8 +321,8 @@ class IndexedParser(_Indices):
         """Parse ``[indices]`` after the name of an array."""
         if array.axes and self.peek().text != "[":
             self.refuse(f"'{array.name}' is an array: write {array}", column)
-        places = self.brackets(array, column) if array.axes else ()
-        access = Access(array=array, places=places)
+        indices = self.brackets(array, column) if array.axes else ()
+        access = Access(array=array, places=indices)
         slot = symbol(str(access))
         self.accesses[slot] = access
         return slot
@@ -330,18 +330,18 @@ class IndexedParser(_Indices):
     def brackets(self, array: Array, column: int) -> tuple[Place, ...]:
         """Parse the indices of an entry, and check each against its axis."""
         self.expect("[")
-        places = [self.place()]
+        indices = [self.place()]
         while self.accept(","):
-            places.append(self.place())
+            indices.append(self.place())
         self.expect("]")
-        if len(places) == 1 and self.tables.get(array.name) is array and array.axes[-1] == Size("", 1):
-            places.append(Place())  # pins[p] is pins[p, 0]
-        if len(places) != len(array.axes):
-            self.refuse(f"'{array}' has {len(array.axes)} axes, but {len(places)} indices are given", column)
-        for place, axis in zip(places, array.axes, strict=True):
-            if problem := self.leaves(place, axis):
-                self.refuse(f"{Access(array=array, places=tuple(places))}: {problem}", column)
-        return tuple(places)
+        if len(indices) == 1 and self.tables.get(array.name) is array and array.axes[-1] == Size("", 1):
+            indices.append(Place())  # pins[p] is pins[p, 0]
+        if len(indices) != len(array.axes):
+            self.refuse(f"'{array}' has {len(array.axes)} axes, but {len(indices)} indices are given", column)
+        for subscript, axis in zip(indices, array.axes, strict=True):
+            if problem := self.leaves(subscript, axis):
+                self.refuse(f"{Access(array=array, places=tuple(indices))}: {problem}", column)
+        return tuple(indices)
 
     def place(self) -> Place:
         """Parse one index of an array entry."""
@@ -352,11 +352,11 @@ class IndexedParser(_Indices):
             return self.entry_of_table()
         if token.text in self.sizes:
             return Place(base=self.size())
-        bound = self.bound.get(token.text)
+        bound = self.in_scope.get(token.text)
         if bound is None:
-            known = ", ".join(self.bound) or "none here"
+            known = ", ".join(self.in_scope) or "none here"
             message = (
-                f"'{token.text}' is not an index{closest(token.text, self.bound)} Indices: {known}. An "
+                f"'{token.text}' is not an index{closest(token.text, self.in_scope)} Indices: {known}. An "
                 "array is accessed by"
             )
             self.refuse(f"{message} a whole number, N-1, i, i+1 or an entry of a table, bonds[b, 0]", token.column)
@@ -377,16 +377,16 @@ class IndexedParser(_Indices):
             )
         return Place(index=row.index, table=table.name, column=columns[0].base.number)
 
-    def leaves(self, place: Place, axis: Size) -> str:
+    def leaves(self, subscript: Place, axis: Size) -> str:
         """Return why an index is outside an axis; empty if it is inside, or if that depends on other sizes."""
-        base = place.base
-        if place.table:
+        base = subscript.base
+        if subscript.table:
             return ""
-        if not place.index:
+        if not subscript.index:
             below = base.number < 0 and not base.name
             above = base.name == axis.name and base.number >= axis.number
             return f"{base} is outside an axis of size {axis}" if below or above else ""
-        loop = self.bound[place.index]
+        loop = self.in_scope[subscript.index]
         assert isinstance(loop, Loop)
         if loop.periodic:
             whole = loop.is_whole and loop.end == axis
@@ -395,10 +395,9 @@ class IndexedParser(_Indices):
         remedy = f"or write '{loop.index} in {axis} periodic'"
         if not loop.first.name and (first := loop.first.number + base.number) < 0:
             begin = loop.first + -first
-            return (
-                f"{place} is {first} at {loop.index} = {loop.first}: begin at {loop.index} in {begin}..{last}, {remedy}"
-            )
+            at = f"{subscript} is {first} at {loop.index} = {loop.first}"
+            return f"{at}: begin at {loop.index} in {begin}..{last}, {remedy}"
         if loop.end.name == axis.name and (beyond := loop.end.number + base.number - axis.number) > 0:
             span, leaves = f"{loop.first}..{last + -beyond}", last + base.number
-            return f"{place} is {leaves} at {loop.index} = {last}: end at {loop.index} in {span}, {remedy}"
+            return f"{subscript} is {leaves} at {loop.index} = {last}: end at {loop.index} in {span}, {remedy}"
         return ""

@@ -47,7 +47,7 @@ def parse_constraint(
     loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
     parsers = [IndexedParser(side, symbols, arrays, tables) for side in sides]
     for parser in parsers:
-        parser.bound = {loop.index: loop for loop in loops}
+        parser.in_scope = {loop.index: loop for loop in loops}
     left, *right = map(parsed, parsers)
     if any(parser.sums for parser in parsers):
         message = "a constraint must not contain a sum over a whole array: constraints couple few entries each"
@@ -61,11 +61,11 @@ class _Loops(IndexedParser):
 
     def read(self) -> list[Loop]:
         """Parse all loops."""
-        found = self.loop()
-        self.bound |= {loop.index: loop for loop in found}
+        loops = self.loop()
+        self.in_scope |= {loop.index: loop for loop in loops}
         while self.accept(","):
-            found += self.loop()
-            self.bound |= {loop.index: loop for loop in found}
+            loops += self.loop()
+            self.in_scope |= {loop.index: loop for loop in loops}
         if self.peek().kind != "end":
             self.refuse(f"a comma or the end is expected here, not '{self.peek().text}'", self.peek().column)
-        return found
+        return loops

@@ -67,15 +67,15 @@ def parse_force(
     for name, axis in bounds.items():
         values: list[Bound] = [Loop(index=name, first=Size("", 0), end=axis)] if axis.name else [*range(axis.number)]
         rows = [{**row, name: value} for row in rows for value in values]
-    found = []
+    forces = []
     for row in rows:
-        place, formula = (IndexedParser(given, symbols, arrays, tables) for given in (target, text))
-        place.bound, formula.bound = dict(row), dict(row)
-        slot, expression = parsed(place), parsed(formula)
+        targets, formula = (IndexedParser(given, symbols, arrays, tables) for given in (target, text))
+        targets.in_scope, formula.in_scope = dict(row), dict(row)
+        slot, expression = parsed(targets), parsed(formula)
         loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
         term = term_of(loops, expression, formula.accesses)
-        found.append(IndexedForce(loops=loops, slots=term.slots, targets=((place.accesses[slot], expression),)))
-    return tuple(found)
+        forces.append(IndexedForce(loops=loops, slots=term.slots, targets=((targets.accesses[slot], expression),)))
+    return tuple(forces)
 
 
 class _Target(IndexedParser):

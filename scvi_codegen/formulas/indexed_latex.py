@@ -49,5 +49,7 @@ def _letter(name: str) -> str:
     return name if len(name) == 1 else rf"\mathrm{{{name}}}".replace("_", r"\_")
 
 
-def _place(place: Place) -> str:
-    return rf"{_letter(place.table)}_{{{place.index} {place.column}}}" if place.table else str(place)
+def _place(subscript: Place) -> str:
+    return (
+        rf"{_letter(subscript.table)}_{{{subscript.index} {subscript.column}}}" if subscript.table else str(subscript)
+    )

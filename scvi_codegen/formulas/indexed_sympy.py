@@ -37,10 +37,10 @@ def indexed_text(expression: Expr) -> str:
 class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Sum(self, expression: Sum) -> str:
         wrapped = dict(map(_wrapped, expression.function.atoms(Mod)))
-        for place in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):
-            if place.is_Add and place.free_symbols & set(wrapped):
+        for index in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):
+            if index.is_Add and index.free_symbols & set(wrapped):
                 raise SystemDefinitionError(
-                    f"{place} leaves a periodic axis: write Mod({place}, ..), as in its other indices"
+                    f"{index} leaves a periodic axis: write Mod({index}, ..), as in its other indices"
                 )
         loops = ", ".join(_loops(expression.limits, wrapped))
         return f"sum({loops}, {self._print(expression.function)})"
@@ -58,9 +58,9 @@ class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 def _wrapped(expression: Mod) -> tuple[Symbol, Expr]:
     """Return the index in a periodic expression Mod(i + k, N), and the period."""
-    place, length = expression.args
-    indices = [each for each in place.free_symbols if each not in length.free_symbols]
-    if len(indices) != 1 or not (place - indices[0]).is_Integer:
+    index, length = expression.args
+    indices = [each for each in index.free_symbols if each not in length.free_symbols]
+    if len(indices) != 1 or not (index - indices[0]).is_Integer:
         raise SystemDefinitionError(f"{expression} is not an index of a periodic axis: write Mod(i + 1, N)")
     return indices[0], length
 

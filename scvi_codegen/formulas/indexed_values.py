@@ -54,12 +54,12 @@ class Elements:
         """Return the indices of an access at all elements, one array or number per axis."""
         return tuple(self._place(place) for place in access.places)
 
-    def _place(self, place: Place) -> Any:
-        if place.table:
-            return self.tables[place.table][self.index[place.index], place.column]
-        if not place.index:
-            return place.base.at(self.sizes)
-        loop, moved = self.loops[place.index], self.index[place.index] + place.base.number
+    def _place(self, subscript: Place) -> Any:
+        if subscript.table:
+            return self.tables[subscript.table][self.index[subscript.index], subscript.column]
+        if not subscript.index:
+            return subscript.base.at(self.sizes)
+        loop, moved = self.loops[subscript.index], self.index[subscript.index] + subscript.base.number
         return moved % loop.end.at(self.sizes) if loop.periodic else moved
 
     def values(
@@ -78,6 +78,6 @@ class Elements:
             numbers: values by symbol.
         """
         known: dict[Expr, Any] = {slot: arrays[access.array.name][self.of(access)] for slot, access in slots}
-        found = on_arrays(formula, {**known, **numbers})
+        entries = on_arrays(formula, {**known, **numbers})
         count = next((len(values) for values in self.index.values()), 1)
-        return np.broadcast_to(found, (count,)) if self.index else found
+        return np.broadcast_to(entries, (count,)) if self.index else entries

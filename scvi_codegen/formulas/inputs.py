@@ -47,15 +47,15 @@ def with_inputs(parameters: Mapping[str, float], inputs: Sequence[str]) -> dict[
 
 def input_formulas(inputs: Sequence[str], time: Symbol) -> Mapping[Symbol, Expr]:
     """Return the cubic polynomial of each input, by its symbol."""
-    found: dict[Symbol, Expr] = {}
+    formulas: dict[Symbol, Expr] = {}
     for name in inputs:
         c0, c1, c2, c3, start = (symbol(f"{name}_{part}") for part in PARTS)
         s = time - start
-        found[symbol(name)] = c0 + s * (c1 + s * (c2 + s * c3))
-    return found
+        formulas[symbol(name)] = c0 + s * (c1 + s * (c2 + s * c3))
+    return formulas
 
 
 def inputs_by_name(formula: Expr, inputs: Sequence[str]) -> Expr:
     """Return a formula with each input's polynomial replaced by its symbol (coefficient 0; others set to 0)."""
-    own: dict[Basic, Basic] = {symbol(part): Integer(0) for part in input_parameters(inputs)}
-    return formula.xreplace(own | {symbol(f"{name}_0"): symbol(name) for name in inputs})
+    rules: dict[Basic, Basic] = {symbol(part): Integer(0) for part in input_parameters(inputs)}
+    return formula.xreplace(rules | {symbol(f"{name}_0"): symbol(name) for name in inputs})

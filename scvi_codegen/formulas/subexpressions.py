@@ -13,13 +13,13 @@ __all__ = ["identity", "key_of", "parts"]
 
 def parts(*expressions: sympy.Basic) -> dict[sympy.Basic, None]:
     """Return all distinct subexpressions, beginning with the expressions themselves."""
-    found = dict.fromkeys(expressions)
+    result = dict.fromkeys(expressions)
     waiting = list(expressions)
     while waiting:
-        new = [argument for argument in waiting.pop().args if argument not in found]
-        found.update(dict.fromkeys(new))
+        new = [argument for argument in waiting.pop().args if argument not in result]
+        result.update(dict.fromkeys(new))
         waiting += new
-    return found
+    return result
 
 
 def identity(expression: sympy.Basic) -> str:
@@ -36,17 +36,17 @@ def identity(expression: sympy.Basic) -> str:
     Integer(2)
     Pow(2, 3)
     """
-    places: dict[sympy.Basic, int] = {}
+    numbers: dict[sympy.Basic, int] = {}
     lines: list[str] = []
 
-    def place(part: sympy.Basic) -> int:
-        if part not in places:
-            inner = ", ".join([str(place(argument)) for argument in part.args])
+    def number_of(part: sympy.Basic) -> int:
+        if part not in numbers:
+            inner = ", ".join([str(number_of(argument)) for argument in part.args])
             lines.append(f"{type(part).__name__}({inner})" if part.args else sympy.srepr(part))
-            places[part] = len(lines) - 1
-        return places[part]
+            numbers[part] = len(lines) - 1
+        return numbers[part]
 
-    place(expression)
+    number_of(expression)
     return "\n".join(lines)
 
 

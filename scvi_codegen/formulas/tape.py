@@ -28,7 +28,7 @@ class Tape:
     def __init__(self, expressions: Sequence[sympy.Expr], symbols: Sequence[sympy.Symbol]) -> None:
         self.symbols = tuple(symbols)
         self._start: list[Number] = [mp.zero] * len(symbols)
-        self._places: dict[sympy.Expr, int] = {symbol: place for place, symbol in enumerate(symbols)}
+        self._places: dict[sympy.Expr, int] = {symbol: register for register, symbol in enumerate(symbols)}
         self._steps: list[tuple[int, Callable[..., Number], tuple[int, ...]]] = []
         self._results = [self._place(expression) for expression in expressions]
 
@@ -40,14 +40,14 @@ class Tape:
         """
         values = [*numbers, *self._start[len(numbers) :]]
         try:
-            for place, operation, operands in self._steps:
-                values[place] = operation(*[values[operand] for operand in operands])
+            for register, operation, operands in self._steps:
+                values[register] = operation(*[values[operand] for operand in operands])
         except (ValueError, TypeError, AttributeError) as error:
             raise ArithmeticError(f"no real value: {error}") from error
-        found = [values[place] for place in self._results]
-        if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in found):
+        results = [values[register] for register in self._results]
+        if not all(isinstance(value, mp.mpf) and abs(value) <= LARGEST for value in results):
             raise ArithmeticError("a value is not a finite real number: the state is outside the domain of the formula")
-        return found
+        return results
 
     def _place(self, expression: sympy.Expr) -> int:
         """Return the index of an expression's value, appending the operations that compute it."""

@@ -63,7 +63,7 @@ class Translation:
     ) -> None:
         self.rules: dict[Expr, Expr] = {}
         free = expression.free_symbols.union(*(other.free_symbols for other in others))
-        self.free = sorted(free, key=lambda given: str(given.name))
+        self.free = sorted(free, key=lambda each: str(each.name))
         self.user_time = self._time(coordinates, time, parameters)
         if self.user_time is not None:
             self._add(self.user_time, TIME)
@@ -142,8 +142,8 @@ class Translation:
 
     def _add_named_functions(self, expressions: Sequence[Expr], names: set[str]) -> None:
         """Add the functions of time that have the name of a parameter or an input."""
-        found = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
-        for function in sorted(found, key=str):
+        functions = set().union(*(expression.atoms(AppliedUndef) for expression in expressions)) - self.rules.keys()
+        for function in sorted(functions, key=str):
             if function.func.__name__ in names and function.args == (self.user_time,):
                 self._add(function, identifier(function.func.__name__))
 

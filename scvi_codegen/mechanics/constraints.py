@@ -40,18 +40,18 @@ __all__ = [
 ]
 
 
-def constraints_of(given: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
+def constraints_of(constraints: Iterable[Any] | None, read: Callable[[Any], Expr]) -> tuple[Expr, ...]:
     """Return g of each formula; an equation, ``left = right`` or SymPy's ``Eq``, becomes left - right."""
-    found = []
-    for formula in given or ():
+    expressions = []
+    for formula in constraints or ():
         equation = [formula.lhs, formula.rhs] if isinstance(formula, sympy.Eq) else [formula]
         sides = formula.split("=") if isinstance(formula, str) else equation
         if len(sides) > 2:
             raise SystemDefinitionError(
                 f"the constraint '{formula}' has more than one '=': write one equation per constraint"
             )
-        found.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))
-    return tuple(found)
+        expressions.append(read(sides[0]) - read(sides[1]) if len(sides) == 2 else read(formula))
+    return tuple(expressions)
 
 
 def check_constraints(system: MechanicalSystem) -> None:
@@ -138,11 +138,11 @@ def time_derivatives(system: MechanicalSystem, functions: Sequence[Expr]) -> tup
     """Return d/dt of functions of (q, t) along a trajectory, as expressions in (q, v, t); v is held constant."""
     rates = dict(zip(system.coordinates, system.velocities, strict=True)) | {system.time: sympy.S.One}
     variables = tuple(rates)
-    found = []
+    results = []
     for function in functions:
         derivatives = gradient(function, variables)
-        found.append(sympy.Add(*(derivative * rates[variables[j]] for j, derivative in derivatives.items())))
-    return tuple(found)
+        results.append(sympy.Add(*(derivative * rates[variables[j]] for j, derivative in derivatives.items())))
+    return tuple(results)
 
 
 def with_constraint_forces(system: MechanicalSystem, forces: Sequence[Expr]) -> tuple[Expr, ...]:

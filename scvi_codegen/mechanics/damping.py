@@ -27,9 +27,9 @@ from scvi_codegen.errors import SystemDefinitionError
 __all__ = ["check_damping", "damping_rate"]
 
 
-def damping_rate(given: Any, read: Callable[[Any], Expr]) -> Expr:
+def damping_rate(damping: Any, read: Callable[[Any], Expr]) -> Expr:
     """Return the damping rate gamma, 0 if it is ``None``."""
-    return sympy.S.Zero if given is None else read(given)
+    return sympy.S.Zero if damping is None else read(damping)
 
 
 def check_damping(name: str, damping: Expr, parameters: Sequence[Symbol]) -> None:

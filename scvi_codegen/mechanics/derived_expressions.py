@@ -208,10 +208,10 @@ class Forms:
         curve = (system.coordinates, system.velocities, *curve_rates(system, count))
         variables = (*(symbol for group in curve[:-1] for symbol in group), system.time)
         rates = (*(symbol for group in curve[1:] for symbol in group), sympy.S.One)
-        found = [system.lagrangian]
+        derivatives_of_l = [system.lagrangian]
         for _ in range(count):
-            found.append(_along(found[-1:], variables, rates)[0])
-        return tuple(found[1:])
+            derivatives_of_l.append(_along(derivatives_of_l[-1:], variables, rates)[0])
+        return tuple(derivatives_of_l[1:])
 
     @staticmethod
     def _gradient_tuple(scalar: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:

@@ -28,28 +28,28 @@ __all__ = ["dissipative_forces", "forces_by_coordinate"]
 
 
 def forces_by_coordinate(
-    coordinates: Sequence[Symbol], given: Mapping[Any, Any], read: Callable[[Any], Expr]
+    coordinates: Sequence[Symbol], by_name: Mapping[Any, Any], read: Callable[[Any], Expr]
 ) -> tuple[Expr, ...]:
     """Return the m forces, 0 for coordinates without one; an empty tuple if all are 0.
 
     Args:
         coordinates: of the system.
-        given: force by coordinate, which is a symbol or its name.
+        by_name: force by coordinate, which is a symbol or its name.
         read: converts a value to an expression in canonical symbols.
 
     Raises:
         SystemDefinitionError: for keys that are not coordinates.
     """
-    if not isinstance(given, Mapping):
-        raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {given!r}")
+    if not isinstance(by_name, Mapping):
+        raise SystemDefinitionError(f"forces must be a mapping from coordinates to formulas, not {by_name!r}")
     names = [q.name for q in coordinates]
-    forces = {name_of_key(key): value for key, value in given.items()}
+    forces = {name_of_key(key): value for key, value in by_name.items()}
     for name in forces:
         if name not in names:
             hint = f"{closest(name, names)} Coordinates: {', '.join(names)}"
             raise SystemDefinitionError(f"there is a force on '{name}', which is not a coordinate{hint}")
-    found = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
-    return found if any(f != 0 for f in found) else ()
+    ordered = tuple(read(forces[name]) if name in forces else sympy.S.Zero for name in names)
+    return ordered if any(f != 0 for f in ordered) else ()
 
 
 def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple[Expr, ...]:

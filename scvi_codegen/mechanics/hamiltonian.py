@@ -134,7 +134,7 @@ class HamiltonianSystem(MechanicalSystem):
         -p**2/2 + p*q_dot + cos(q)
         """
         if are_arrays(coordinates, parameters or (), tables):
-            found = ArraySystem.from_text(
+            arrays = ArraySystem.from_text(
                 name=name,
                 coordinates=coordinates,
                 hamiltonian=hamiltonian,
@@ -146,12 +146,12 @@ class HamiltonianSystem(MechanicalSystem):
                 inputs=inputs,
                 constraints=constraints,
             )
-            return cast(HamiltonianSystem, found) if found.sizes else cls(**unrolled_fields(found, {}))
+            return cast(HamiltonianSystem, arrays) if arrays.sizes else cls(**unrolled_fields(arrays, {}))
         names = _default_momenta(coordinates) if momenta is None else tuple(momenta)
         values = with_inputs(parameters or {}, inputs)
         check_names(coordinates, (*values, *inputs), names)
-        symbols = {given: symbol(given) for given in [*coordinates, *names, TIME, *values, *inputs]}
-        variables = tuple(symbols[given] for given in coordinates)
+        symbols = {each: symbol(each) for each in [*coordinates, *names, TIME, *values, *inputs]}
+        variables = tuple(symbols[each] for each in coordinates)
         driven = input_formulas(inputs, symbols[TIME])
 
         def read(text: str) -> Expr:
@@ -160,13 +160,13 @@ class HamiltonianSystem(MechanicalSystem):
         system = cls(
             name=name,
             coordinates=variables,
-            momenta=tuple(symbols[given] for given in names),
+            momenta=tuple(symbols[each] for each in names),
             time=symbols[TIME],
-            parameters=tuple(symbols[given] for given in values),
-            defaults=tuple(number(given, value) for given, value in values.items()),
+            parameters=tuple(symbols[each] for each in values),
+            defaults=tuple(number(each, value) for each, value in values.items()),
             hamiltonian=read(hamiltonian),
             forces=forces_by_coordinate(variables, forces or {}, read),
-            damping=damping_rate(damping, lambda given: read(str(given))),
+            damping=damping_rate(damping, lambda formula: read(str(formula))),
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
@@ -212,35 +212,35 @@ class HamiltonianSystem(MechanicalSystem):
             inputs: functions of time, symbols or names whose values are passed to each run.
         """
         hamiltonian = sympy_expression(hamiltonian, "Hamiltonian")
-        acting = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
-        rate = damping_rate(damping, lambda given: sympy_expression(given, "damping"))
-        own = tuple(name_of_key(each) for each in inputs)
-        given = with_inputs(named_parameters(parameters), own)
+        applied = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        rate = damping_rate(damping, lambda formula: sympy_expression(formula, "damping"))
+        input_names = tuple(name_of_key(each) for each in inputs)
+        constants = with_inputs(named_parameters(parameters), input_names)
         translation = Translation(
             hamiltonian,
             coordinates,
-            (*acting.values(), rate),
+            (*applied.values(), rate),
             momenta=momenta,
             time=time,
-            parameters=tuple(given),
-            inputs=own,
+            parameters=tuple(constants),
+            inputs=input_names,
         )
-        driven = input_formulas(own, symbol(TIME))
+        driven = input_formulas(input_names, symbol(TIME))
         system = cls(
             name=name,
             coordinates=translation.coordinates,
             momenta=translation.momenta,
             time=symbol(TIME),
             parameters=translation.parameters,
-            defaults=tuple(number(parameter, value) for parameter, value in given.items()),
+            defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
             hamiltonian=translation.apply(hamiltonian, "Hamiltonian").xreplace(driven),
             forces=forces_by_coordinate(
                 translation.coordinates,
-                {translation.rules.get(q, q): f for q, f in acting.items()},
-                lambda given: translation.apply(given, "forces").xreplace(driven),
+                {translation.rules.get(q, q): f for q, f in applied.items()},
+                lambda formula: translation.apply(formula, "forces").xreplace(driven),
             ),
             damping=translation.apply(rate, "damping").xreplace(driven),
-            inputs=own,
+            inputs=input_names,
         )
         warn_of_mistakes(system)
         return system
@@ -329,14 +329,14 @@ def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ())
     Raises:
         SystemDefinitionError: if d2H/dp2 is singular, or SymPy finds no closed-form solution of v = dH/dp.
     """
-    found = _lagrangian_of(system)
+    lagrangian = _lagrangian_of(system)
     if not constraints:
-        return found
-    known = {x.name: x for x in (*system.coordinates, *found.velocities, system.time, *system.parameters)}
+        return lagrangian
+    known = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
     known |= {name: symbol(name) for name in system.inputs}
     driven = input_formulas(system.inputs, system.time)
     return replace(
-        found, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
+        lagrangian, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
     )
 
 

@@ -184,7 +184,7 @@ class LagrangianSystem(MechanicalSystem):
             defaults=tuple(number(parameter, value) for parameter, value in values.items()),
             lagrangian=read(lagrangian),
             forces=_forces(variables, forces, dissipation, read),
-            damping=damping_rate(damping, lambda given: read(str(given))),
+            damping=damping_rate(damping, lambda formula: read(str(formula))),
             constraints=constraints_of(constraints, read),
             inputs=tuple(inputs),
         )
@@ -262,37 +262,43 @@ class LagrangianSystem(MechanicalSystem):
                 )
             )
         lagrangian = sympy_expression(lagrangian, "Lagrangian")
-        acting = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
+        applied = {q: sympy_expression(f, f"force on {q}") for q, f in (forces or {}).items()}
         friction = None if dissipation is None else sympy_expression(dissipation, "dissipation")
-        rate = damping_rate(damping, lambda given: sympy_expression(given, "damping"))
-        bound = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
-        own = tuple(name_of_key(each) for each in inputs)
-        given = with_inputs(named_parameters(parameters), own)
-        beside = (*acting.values(), *(() if friction is None else (friction,)), rate, *bound)
+        rate = damping_rate(damping, lambda formula: sympy_expression(formula, "damping"))
+        conditions = constraints_of(constraints, lambda g: sympy_expression(g, "constraint"))
+        input_names = tuple(name_of_key(each) for each in inputs)
+        constants = with_inputs(named_parameters(parameters), input_names)
+        others = (*applied.values(), *(() if friction is None else (friction,)), rate, *conditions)
         translation = Translation(
-            lagrangian, coordinates, beside, velocities=velocities, time=time, parameters=tuple(given), inputs=own
+            lagrangian,
+            coordinates,
+            others,
+            velocities=velocities,
+            time=time,
+            parameters=tuple(constants),
+            inputs=input_names,
         )
-        driven = input_formulas(own, symbol(TIME))
+        driven = input_formulas(input_names, symbol(TIME))
 
-        def read(given: Expr, what: str = "Lagrangian") -> Expr:
-            return translation.apply(given, what).xreplace(driven)
+        def read(formula: Expr, what: str = "Lagrangian") -> Expr:
+            return translation.apply(formula, what).xreplace(driven)
 
         system = cls(
             name=name,
             coordinates=translation.coordinates,
             time=symbol(TIME),
             parameters=translation.parameters,
-            defaults=tuple(number(parameter, value) for parameter, value in given.items()),
+            defaults=tuple(number(parameter, value) for parameter, value in constants.items()),
             lagrangian=read(lagrangian),
             forces=_forces(
                 translation.coordinates,
-                {translation.rules.get(q, q): f for q, f in acting.items()},
+                {translation.rules.get(q, q): f for q, f in applied.items()},
                 friction,
-                lambda given: read(given, "forces"),
+                lambda formula: read(formula, "forces"),
             ),
             damping=read(rate, "damping"),
-            constraints=constraints_of(bound, lambda given: read(given, "constraints")),
-            inputs=own,
+            constraints=constraints_of(conditions, lambda formula: read(formula, "constraints")),
+            inputs=input_names,
         )
         warn_of_mistakes(system)
         return system
@@ -320,8 +326,8 @@ class LagrangianSystem(MechanicalSystem):
         """
         from scvi_codegen.mechanics.multibody.readers import forces_of_lagranges_method
 
-        bound = [sympy.sympify(g) for g in method._hol_coneqs]  # private attribute: SymPy has no public one
-        rolling = list(method.coneqs)[len(bound) :]  # coneqs begins with the rates of the holonomic constraints
+        holonomic = [sympy.sympify(g) for g in method._hol_coneqs]  # private attribute: SymPy has no public one
+        rolling = list(method.coneqs)[len(holonomic) :]  # coneqs begins with the rates of the holonomic constraints
         lagrangian = method._L[0]  # private attribute: SymPy has no public one
         return cls.from_sympy(
             name=name,
@@ -329,7 +335,7 @@ class LagrangianSystem(MechanicalSystem):
             coordinates=list(method.q),
             parameters=parameters,
             forces=forces_of_lagranges_method(method),
-            constraints=[*bound, *rolling],
+            constraints=[*holonomic, *rolling],
             inputs=inputs,
         )
 
@@ -402,12 +408,12 @@ LagrangianSystem.register(ArrayLagrangian)
 
 def _forces(
     coordinates: tuple[Symbol, ...],
-    given: Mapping[Any, Any] | None,
+    applied: Mapping[Any, Any] | None,
     dissipation: Any,
     read: Callable[[Any], Expr],
 ) -> tuple[Expr, ...]:
     """Return the forces of a system plus those of its dissipation function."""
-    forces = forces_by_coordinate(coordinates, given or {}, read)
+    forces = forces_by_coordinate(coordinates, applied or {}, read)
     if dissipation is None:
         return forces
     friction = dissipative_forces(read(dissipation), tuple(symbol(q.name + DOT) for q in coordinates))
@@ -423,10 +429,10 @@ def _check_velocities(system: LagrangianSystem) -> None:
 
 def _check_mass_matrix(system: LagrangianSystem) -> None:
     others = (*system.coordinates, system.time)
-    found = singular_part(system.lagrangian, system.velocities, others, system.constants)
-    if found is None:
+    singular = singular_part(system.lagrangian, system.velocities, others, system.constants)
+    if singular is None:
         return
-    velocities, block = found
+    velocities, block = singular
     names = ", ".join(velocity.name for velocity in velocities)
     if velocities and not block:
         raise SystemDefinitionError(_degenerate_message(system, velocities, "occurs only linearly in L"))
@@ -436,8 +442,8 @@ def _check_mass_matrix(system: LagrangianSystem) -> None:
             f"{subject} is singular: some velocities occur only in products with too few others. "
             f"{REQUIRED} Give each coordinate its own kinetic energy"
         )
-    own = set[Symbol]().union(*(entry.free_symbols for entry in block.values()))
-    used = {parameter: value for parameter, value in system.constants.items() if parameter in own}
+    occurring = set[Symbol]().union(*(entry.free_symbols for entry in block.values()))
+    used = {parameter: value for parameter, value in system.constants.items() if parameter in occurring}
     zero = " and ".join(parameter.name for parameter, value in used.items() if value == 0)
     values = " with the default parameters" if used else ""
     direction = null_direction(block, velocities)
@@ -464,9 +470,9 @@ def _degenerate_message(system: LagrangianSystem, velocities: Sequence[Symbol], 
         )
     derivative = sympy.expand(system.lagrangian.diff(symbol(names[0])))
     multiplies = derivative.has(*system.coordinates) and not derivative.has(symbol(names[0]), *system.velocities)
-    bound = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(derivative)}'] in its place"
+    hint = f"; if {names[0]} is a Lagrange multiplier, give constraints=['{system.text_of(derivative)}'] in its place"
     return (
         f"coordinate '{names[0]}' of '{system.name}' has no kinetic energy: velocity '{velocities[0]}' {how}. "
-        f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{bound if multiplies else ''}; if {names[0]} "
+        f"{REQUIRED} Add the missing term, such as m*{velocities[0]}**2/2{hint if multiplies else ''}; if {names[0]} "
         "is a known function of time, make it an input or write the function out"
     )

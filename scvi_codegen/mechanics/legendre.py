@@ -39,12 +39,19 @@ def legendre_dual(system: MechanicalSystem, variables: Sequence[Symbol], duals: 
     still, moving = f.as_independent(*variables, as_Add=True)
     dual = sympy.Add(*(x * y for x, y in zip(solution.values(), duals, strict=True)), -moving.xreplace(solution))
     positive = positive_parameters(system)
-    return sympy.simplify(dual.xreplace(positive)).xreplace({dummy: given for given, dummy in positive.items()}) - still
+    return (
+        sympy.simplify(dual.xreplace(positive)).xreplace({dummy: parameter for parameter, dummy in positive.items()})
+        - still
+    )
 
 
 def positive_parameters(system: MechanicalSystem) -> dict[Symbol, Symbol]:
     """Return positive dummies for the parameters with positive defaults, so that roots of their squares simplify."""
-    return {given: sympy.Dummy(given.name, positive=True) for given, value in system.constants.items() if value > 0}
+    return {
+        parameter: sympy.Dummy(parameter.name, positive=True)
+        for parameter, value in system.constants.items()
+        if value > 0
+    }
 
 
 def _inverse_form(hessian_entries: Mapping[tuple[int, int], Expr], block: Sequence[int], y: Sequence[Expr]) -> Expr:
@@ -77,9 +84,9 @@ def _inverse_derivative(
     positive = positive_parameters(system)
     back = {dummy: symbol for symbol, dummy in positive.items()}
     for root in _roots(derivative.xreplace(positive) - y, x):
-        found = root.xreplace(back)
-        if unsupported_part(found) is None and _is_inverse(system, found, derivative, x, y):
-            return found
+        solution = root.xreplace(back)
+        if unsupported_part(solution) is None and _is_inverse(system, solution, derivative, x, y):
+            return solution
     raise SystemDefinitionError(
         f"SymPy does not solve {y} = {derivative} for {x}, as the Legendre transform requires: define the "
         "other function yourself"

@@ -49,8 +49,8 @@ def warn_of_unused(
     """Warn of parameters and inputs of the system ``name`` that are not among the symbols ``used``."""
     parts = {each: {symbol(f"{each}_{part}") for part in PARTS} for each in inputs}
     kinds = [f"input '{each}'" for each, symbols in parts.items() if not symbols & used]
-    own = reduce(set.union, parts.values(), set[Symbol]())
-    kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in own]
+    occurring = reduce(set.union, parts.values(), set[Symbol]())
+    kinds += [f"parameter '{each}'" for each in parameters if each not in used and each not in occurring]
     for kind in kinds:
         where = f"the {function}, the forces or the constraints of '{name}'"
         warn(f"{kind} is not used in {where}; remove it or use it.", SystemDefinitionWarning)
@@ -62,13 +62,13 @@ def warn_of_negative(name: str, coefficients: Mapping[str, Expr], constants: Map
     No warning is given where a coefficient was negative for all positive values tried: the sign is then in the formula.
     """
     for what, formula in coefficients.items():
-        own = sorted(formula.free_symbols & constants.keys(), key=str)
-        if not own or len(own) < len(formula.free_symbols):
+        occurring = sorted(formula.free_symbols & constants.keys(), key=str)
+        if not occurring or len(occurring) < len(formula.free_symbols):
             continue
-        tape = Tape([formula], own)
-        value = _value(tape, [constants[each] for each in own])
-        if value is not None and value < 0 and any(sample >= 0 for sample in _positive_samples(tape, len(own))):
-            defaults = ", ".join(f"{each} = {constants[each]:g}" for each in own)
+        tape = Tape([formula], occurring)
+        value = _value(tape, [constants[each] for each in occurring])
+        if value is not None and value < 0 and any(sample >= 0 for sample in _positive_samples(tape, len(occurring))):
+            defaults = ", ".join(f"{each} = {constants[each]:g}" for each in occurring)
             text = str(formula)
             shown = f"{what} = {text}" if len(text) <= 60 else what
             warn(

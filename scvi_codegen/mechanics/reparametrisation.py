@@ -78,9 +78,9 @@ def reparametrise(system: MechanicalSystem, time_transformation: str | Expr) -> 
             f"time transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     if system.forces or system.damping != 0:
-        acting = "forces act" if system.forces else "damping acts"
+        cause = "forces act" if system.forces else "damping acts"
         raise SystemDefinitionError(
-            f"{acting} on '{system.name}', so its energy is not conserved, which the symplectic time "
+            f"{cause} on '{system.name}', so its energy is not conserved, which the symplectic time "
             f"transformation requires. Use adaptive steps (t_end=...), or {REVERSIBLE}"
         )
     if any(nonholonomic_expressions(system)):

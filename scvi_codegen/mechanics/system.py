@@ -159,8 +159,8 @@ class MechanicalSystem(ABC):
     def _constraints_work(self) -> bool:
         """Return whether constraints can do work: they contain time, or A v + b = 0 with non-zero b."""
         at_rest = dict.fromkeys(self.velocities, sympy.S.Zero)
-        bound = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
-        return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in bound)
+        rolling = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
+        return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in rolling)
 
     def key(self) -> tuple[str, ...]:
         """Return the key of this system in caches, made from its type and all of its fields."""
@@ -220,10 +220,10 @@ class MechanicalSystem(ABC):
             raise SystemDefinitionError(
                 f"the name {self.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
             )
-        for given in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
-            if not isinstance(given, Symbol) or given != symbol(given.name):
+        for each in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
+            if not isinstance(each, Symbol) or each != symbol(each.name):
                 raise SystemDefinitionError(
-                    f"{given!r} is not a real symbol: build systems with from_sympy or from_text"
+                    f"{each!r} is not a real symbol: build systems with from_sympy or from_text"
                 )
         if self.time.name != TIME:
             raise SystemDefinitionError(f"time is called '{TIME}', not '{self.time}': build systems with from_sympy")
@@ -270,10 +270,10 @@ def _free(name: str, taken: set[str]) -> str:
 
 def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:
     """Return default values by name, for keys that are symbols or names."""
-    given = {name_of_key(key): value for key, value in (parameters or {}).items()}
-    if len(given) < len(parameters or {}):
+    by_name = {name_of_key(key): value for key, value in (parameters or {}).items()}
+    if len(by_name) < len(parameters or {}):
         raise SystemDefinitionError("two parameters have the same name: rename one of them")
-    return given
+    return by_name
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)

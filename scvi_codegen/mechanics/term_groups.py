@@ -49,14 +49,14 @@ class TermGroup:
 
     def where(self, chosen: Sequence[bool]) -> TermGroup:
         """Return the group with only the chosen terms."""
-        places, *values = (tuple(compress(column, chosen)) for column in (self.places, *self.values))
-        return replace(self, places=places, values=tuple(values))
+        indices, *values = (tuple(compress(column, chosen)) for column in (self.places, *self.values))
+        return replace(self, places=indices, values=tuple(values))
 
     @property
     def partials(self) -> tuple[Expr, ...]:
         """Derivatives of the formula by ``slots``, with common factors extracted, since many share the rest."""
-        found = gradient(self.formula, self.slots)
-        return tuple(factor_terms(found.get(k, S.Zero)) for k in range(len(self.slots)))
+        derivatives = gradient(self.formula, self.slots)
+        return tuple(factor_terms(derivatives.get(k, S.Zero)) for k in range(len(self.slots)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,20 +96,20 @@ class SimilarTerms:
 
         pairs = zip(self.terms, self.leaves, strict=True)
         ordered = sorted(pairs, key=lambda pair: (pattern(pair), pair[1].places))
-        for _, found in groupby(ordered, pattern):
-            yield SimilarTerms(*zip(*found, strict=True))
+        for _, similar in groupby(ordered, pattern):
+            yield SimilarTerms(*zip(*similar, strict=True))
 
-    def group(self, slot: Callable[[str, int], Symbol], given: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
+    def group(self, slot: Callable[[str, int], Symbol], constant: Callable[[int], Symbol], sign: int = 1) -> TermGroup:
         """Return the term group.
 
         Args:
             slot: symbol of a coordinate, by its array and its column in the table of indices.
-            given: symbol of a constant, by its number.
+            constant: symbol of a constant, by its number.
             sign: factor of the formula.
         """
         first, columns = self.leaves[0], list(zip(*(each.constants for each in self.leaves), strict=True))
         varying = [k for k, column in enumerate(columns) if len(set(column)) > 1]
-        symbols = [given(k) if k in varying else column[0] for k, column in enumerate(columns)]
+        symbols = [constant(k) if k in varying else column[0] for k, column in enumerate(columns)]
         return TermGroup(
             formula=sign * first.substituted(self.terms[0], slot, symbols),
             slots=tuple(slot("", k) for k in range(len(first.places))),
@@ -132,9 +132,11 @@ def rolled(system: MechanicalSystem) -> SplitSystem | None:
     large = [kind for kind in kinds if len(kind) >= MIN_GROUP_SIZE]
     if not large:
         return None
-    slot, given = (_stem(name, system.parameters) for name in ("slot", "given"))
+    slot, constant = (_stem(name, system.parameters) for name in ("slot", "given"))
     groups = [
-        each.group(lambda _, k: symbol(f"{slot}{k}"), lambda k: symbol(f"{given}{k}"), -1 if system.auxiliaries else 1)
+        each.group(
+            lambda _, k: symbol(f"{slot}{k}"), lambda k: symbol(f"{constant}{k}"), -1 if system.auxiliaries else 1
+        )
         for kind in large
         for each in kind.groups
     ]
@@ -146,18 +148,18 @@ def rolled(system: MechanicalSystem) -> SplitSystem | None:
 
 def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
     """Merge groups with the same indices."""
-    found: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
+    merged: dict[tuple[tuple[int, ...], ...], TermGroup] = {}
     for group in groups:
-        other = found.setdefault(group.places, group)
+        other = merged.setdefault(group.places, group)
         if other is not group:
-            given = tuple(symbol(f"{each.name}_{len(other.given)}") for each in group.given)
-            found[group.places] = replace(
+            constants = tuple(symbol(f"{each.name}_{len(other.given)}") for each in group.given)
+            merged[group.places] = replace(
                 other,
-                formula=other.formula + group.formula.xreplace(dict(zip(group.given, given, strict=True))),
-                given=(*other.given, *given),
+                formula=other.formula + group.formula.xreplace(dict(zip(group.given, constants, strict=True))),
+                given=(*other.given, *constants),
                 values=(*other.values, *group.values),
             )
-    return tuple(found.values())
+    return tuple(merged.values())
 
 
 def _stem(name: str, parameters: Sequence[Symbol]) -> str:
@@ -170,7 +172,7 @@ def _stem(name: str, parameters: Sequence[Symbol]) -> str:
 
 def similar_terms(
     terms: Iterable[Expr],
-    places: Mapping[Symbol, tuple[str, int]],
+    indices: Mapping[Symbol, tuple[str, int]],
     names: Iterable[Symbol],
     first: Iterable[tuple[int, ...]] = repeat(()),
 ) -> tuple[SimilarTerms, ...]:
@@ -178,18 +180,18 @@ def similar_terms(
 
     Args:
         terms: in canonical form.
-        places: array and index of each coordinate, velocity or momentum.
+        indices: array and index of each coordinate, velocity or momentum.
         names: parameters.
         first: indices that precede those of each term, such as the coordinate on which a force acts.
     """
     kinds: dict[str, list[tuple[Expr, _Leaves]]] = {}
     shapes, known = dict[Expr, str](), set(names)
     for term, begun in zip(terms, first, strict=False):
-        leaves = _Leaves(places, known, shapes, [*begun])
+        leaves = _Leaves(indices, known, shapes, [*begun])
         kinds.setdefault(leaves.key(term), []).append((term, leaves))
         if len(kinds) > MAX_GROUPS:
             return ()
-    return tuple(SimilarTerms(*zip(*found, strict=True)) for _, found in sorted(kinds.items()))
+    return tuple(SimilarTerms(*zip(*similar, strict=True)) for _, similar in sorted(kinds.items()))
 
 
 @dataclass(slots=True)
@@ -221,16 +223,16 @@ class _Leaves:
         if formula.args:
             return f"{formula.func.__name__}({', '.join(self.key(part) for part in formula.args)})"
         if formula in self.arrays:
-            array, place = self.arrays[formula]
-            return f"{array}{{{_number(self.places, place)}}}"
+            array, index = self.arrays[formula]
+            return f"{array}{{{_number(self.places, index)}}}"
         return f"[{_number(self.constants, formula)}]" if self._is_constant(formula) else str(formula)
 
     def shape(self, formula: Expr) -> str:
         """Return the structure of a formula without numbered leaves."""
-        found = self.shapes.get(formula)
-        if found is None:
-            found = self.shapes[formula] = self._shape(formula)
-        return found
+        known = self.shapes.get(formula)
+        if known is None:
+            known = self.shapes[formula] = self._shape(formula)
+        return known
 
     def _shape(self, formula: Expr) -> str:
         if formula.is_Pow:
@@ -252,8 +254,8 @@ class _Leaves:
             parts = formula.args[: len(formula.args) - len(fixed)]
             return formula.func(*(self.substituted(part, slot, constants) for part in parts), *fixed)
         if formula in self.arrays:
-            array, place = self.arrays[formula]
-            return slot(array, self.places.index(place))
+            array, index = self.arrays[formula]
+            return slot(array, self.places.index(index))
         return constants[self.constants.index(formula)] if self._is_constant(formula) else formula
 
 

@@ -113,7 +113,7 @@ def _frequency(system: MechanicalSystem) -> Expr:
     positive = positive_parameters(system)
     _, simplest = sympy.factor(sympy.simplify(squares.xreplace(positive))).as_coeff_Mul()
     root = simplest ** sympy.Rational(-1, 4)
-    return sympy.powdenest(root, force=True).xreplace({stand_in: given for given, stand_in in positive.items()})
+    return sympy.powdenest(root, force=True).xreplace({stand_in: parameter for parameter, stand_in in positive.items()})
 
 
 def _distance(system: MechanicalSystem) -> Expr:

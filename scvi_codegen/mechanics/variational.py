@@ -41,15 +41,15 @@ def variational_system(system: MechanicalSystem, count: int) -> LagrangianSystem
         SystemDefinitionError: for other systems; use :meth:`Trajectory.tangent` for them.
     """
     twin, number = equivalent_lagrangian(system), checked_count(count, "count", least=1)
-    found = with_tangent_vectors(twin, number) if twin else None
-    if found is None:
+    system_of_both = with_tangent_vectors(twin, number) if twin else None
+    if system_of_both is None:
         raise SystemDefinitionError(
             f"the variational equations of '{system.name}' cannot be solved by fixed-point iteration "
             "together with the trajectory: that requires constant masses, one per coordinate, forces "
             "of position and time only, and no constraints. Use run.tangent(), which supports all "
             "systems"
         )
-    return found
+    return system_of_both
 
 
 def with_tangent_vectors(system: LagrangianSystem, count: int) -> LagrangianSystem | None:
@@ -61,7 +61,7 @@ def with_tangent_vectors(system: LagrangianSystem, count: int) -> LagrangianSyst
     if not forms.separable or system.constraints or system.clock:
         return None
     word = "change"
-    while any(f"_{word}" in given.name for given in (*system.coordinates, *system.parameters)):
+    while any(f"_{word}" in each.name for each in (*system.coordinates, *system.parameters)):
         word += "s"
     lagrangian, forces = [system.lagrangian], [*(system.forces or [sympy.S.Zero] * system.dimension)]
     coordinates = [*system.coordinates]

@@ -38,16 +38,16 @@ def exchanges(system: MechanicalSystem) -> tuple[WorkRate, ...]:
     """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
     if not system.forces and system.damping == 0:
         return ()
-    found = [WorkRate(name="energy", rate=_along(system, system.velocities))]
+    rates = [WorkRate(name="energy", rate=_along(system, system.velocities))]
     for symmetry in symmetries(replace(system, forces=(), damping=sympy.S.Zero)):
         direction_symbols = set().union(*(xi.free_symbols for xi in symmetry.direction))
         rate = _along(system, symmetry.direction)
         if direction_symbols.isdisjoint(symmetry.momenta) and rate != 0:
-            found.append(WorkRate(name=symmetry.name, rate=rate))
-    return tuple(found)
+            rates.append(WorkRate(name=symmetry.name, rate=rate))
+    return tuple(rates)
 
 
 def _along(system: MechanicalSystem, direction: tuple[Expr, ...]) -> Expr:
     forces = system.forces or (sympy.S.Zero,) * system.dimension
-    acting = (f - system.damping * p for f, p in zip(forces, forms_of(system).momentum, strict=True))
-    return sympy.Add(*(f * xi for f, xi in zip(acting, direction, strict=True)))
+    applied = (f - system.damping * p for f, p in zip(forces, forms_of(system).momentum, strict=True))
+    return sympy.Add(*(f * xi for f, xi in zip(applied, direction, strict=True)))

@@ -123,8 +123,8 @@ def _with_multipliers(system: MechanicalSystem, group: StageGroup) -> StageGroup
     columns, rows = len(group.gathers[0].table.entries[0]), len(group.scatters[0].table.entries[0]) - 1
     none, one = Table.constant(points, 1 + points), Table.constant(points, 1)
     gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in group.gathers]
-    place = Table.joined(Table.constant(points, columns), one, Table.identity(points))
-    gathers.append(Gather(arguments=factors, table=place, power=-1))
+    table = Table.joined(Table.constant(points, columns), one, Table.identity(points))
+    gathers.append(Gather(arguments=factors, table=table, power=-1))
     scatters = [replace(scatter, table=_with_end(scatter.table, rows, points)) for scatter in group.scatters]
     scatters[0] = replace(scatters[0], results=with_constraint_forces(system, scatters[0].results))
     conditions = [[int(row == n - 1) for row in range(points)] for n in range(points)]
@@ -157,7 +157,7 @@ def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: S
         for gather, name in zip(group.gathers, ("A", "L"), strict=True)
     ]
     conditions = [[int(row == n) for row in range(size)] for n in range(size)]
-    place = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))
+    table = Table.joined(Table.constant(size, rows + 1), Table.named("", conditions), Table.constant(size, 2))
     return (
         StageGroup(
             name="rolling",
@@ -165,7 +165,7 @@ def _velocity_conditions(system: MechanicalSystem, stages: StageSystem, group: S
             weights=(mp.one,) * size,
             weight_names=("",) * size,
             gathers=tuple(gathers),
-            scatters=(Scatter(results=conditions_table, table=place, power=0),),
+            scatters=(Scatter(results=conditions_table, table=table, power=0),),
             computes="Velocity constraints",
         ),
     )

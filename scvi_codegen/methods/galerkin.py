@@ -76,8 +76,8 @@ class SVI(Method):
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", degree_count(self.degree, "the degree of a spectral variational integrator"))
         object.__setattr__(self, "space", resolve_space(self.space))
-        own = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
-        object.__setattr__(self, "quadrature", resolve_quadrature(own, self.degree))
+        rule = self.curves.default_rule(self.degree) if self.quadrature is None else self.quadrature
+        object.__setattr__(self, "quadrature", resolve_quadrature(rule, self.degree))
         if self.nodes is not None and not self.curves.nodal:
             raise MethodError(f"nodes apply to polynomials only, not to {self.curves.name}: leave them out")
         object.__setattr__(self, "nodes", resolve_nodes(self.nodes, self.degree))
@@ -110,14 +110,14 @@ class SVI(Method):
     @property
     def name(self) -> str:
         """Name ``svi-<degree>-<quadrature>[-<curves>]``."""
-        own = [] if self.curves.nodal else [self.curves.name]
-        return "-".join(["svi", str(self.degree), self.rule.name, *own]).replace(":", "-").replace(" ", "-")
+        suffix = [] if self.curves.nodal else [self.curves.name]
+        return "-".join(["svi", str(self.degree), self.rule.name, *suffix]).replace(":", "-").replace(" ", "-")
 
     @property
     def title(self) -> str:
         """Display title."""
-        own = "" if self.curves.nodal else f" {self.curves.name},"
-        return f"Galerkin spectral variational integrator,{own} degree {self.degree}, {self.rule.name}"
+        suffix = "" if self.curves.nodal else f" {self.curves.name},"
+        return f"Galerkin spectral variational integrator,{suffix} degree {self.degree}, {self.rule.name}"
 
     @property
     def order(self) -> int | None:

@@ -122,14 +122,14 @@ def action_groups(
         ScalarStageGroup(
             name=f"derivative_{k}" if k else "quadrature",
             abscissae=abscissae,
-            weights=own,
+            weights=group_weights,
             weight_names=tuple(f"{'d' * k}w_{n}" for n in range(1, len(abscissae) + 1)),
             gathers=gathers[: k + 2],
             scalar=scalar,
             power=k,
             forces=(system.forces,) if system.forces else (),
         )
-        for k, (own, scalar) in enumerate(zip(weights, scalars, strict=True))
+        for k, (group_weights, scalar) in enumerate(zip(weights, scalars, strict=True))
     )
 
 
@@ -137,9 +137,9 @@ def _curve_gathers(system: MechanicalSystem, position: Matrix, velocities: Seque
     """Return Q, v and further time derivatives of the curve, one per table."""
     points = len(position)
     rates = (system.velocities, *curve_rates(system, len(velocities) - 1))
-    place = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
+    gather_table = Table.joined(Table.constant(points, 1, 1), Table.named("a", position))
     return (
-        Gather(arguments=system.coordinates, table=place, power=0),
+        Gather(arguments=system.coordinates, table=gather_table, power=0),
         *(
             Gather(
                 arguments=arguments,

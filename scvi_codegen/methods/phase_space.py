@@ -100,19 +100,19 @@ def _block(group: _Group, n: int) -> Block:
 
 
 def _extended(
-    stage_group: StageGroup, own: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
+    stage_group: StageGroup, numbers: Sequence[int], groups: Sequence[_Group], added: Sequence[tuple[int, int]]
 ) -> StageGroup:
-    """Return a stage group with the gathers and scatters of its ``own`` groups; columns of the others are 0."""
+    """Return a stage group with the gathers and scatters of its ``numbers`` groups; columns of the others are 0."""
     points, rows = len(stage_group.abscissae), len(stage_group.scatters[0].table.entries[0]) - 1
     none = Table.constant(points, len(added))
     gathers = [replace(gather, table=Table.joined(gather.table, none)) for gather in stage_group.gathers]
     scatters = [replace(scatter, table=_inserted(scatter.table, none, rows)) for scatter in stage_group.scatters]
     known = Table.constant(points, len(stage_group.gathers[0].table.entries[0]))
     before, last = Table.constant(points, rows), Table.constant(points, 1)
-    for g in own:
-        place = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
-        gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, place), power=-1))
-        scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, place, last), power=0))
+    for g in numbers:
+        selection = Table.named("", [[int(column == (g, n)) for column in added] for n in range(points)])
+        gathers.append(Gather(arguments=groups[g].symbols, table=Table.joined(known, selection), power=-1))
+        scatters.append(Scatter(results=groups[g].results, table=Table.joined(before, selection, last), power=0))
     return replace(stage_group, gathers=tuple(gathers), scatters=tuple(scatters))
 
 

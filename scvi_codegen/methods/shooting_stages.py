@@ -97,7 +97,7 @@ def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bo
     if rounded:
         table = Table(entries=dyadic(position.table.entries), names=position.table.names)
         position = replace(position, table=table)
-    own = Gather(
+    multiplier_gather = Gather(
         arguments=multipliers(system),
         table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
         power=-1,
@@ -107,7 +107,7 @@ def _multiplier_group(system: MechanicalSystem, tableau: Tableau, *, rounded: bo
         abscissae=tableau.c,
         weights=(mp.one,) * size,
         weight_names=("",) * size,
-        gathers=(position, velocity, acceleration, own),
+        gathers=(position, velocity, acceleration, multiplier_gather),
         scalar=forms_of(system).multiplied_residual,
         power=1,
         in_action=False,
@@ -200,7 +200,7 @@ def printed_increments(system: MechanicalSystem, tableau: Tableau, rule: Quadrat
 def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> StageSystem:
     """Return the stationarity of G = L_d + sum lambda_i . E_i in the paper's Q^1 .. Q^s, v0, lambda_1 .. lambda_s."""
     size = nodes.degree
-    own = Gather(
+    multiplier_gather = Gather(
         arguments=multipliers(system),
         table=Table.joined(Table.constant(size, 2 + size), Table.identity(size)),
         power=0,
@@ -210,7 +210,7 @@ def shooting_nodal(system: MechanicalSystem, nodes: Nodes, rule: Quadrature) -> 
         abscissae=nodes.abscissae[1:],
         weights=(mp.one,) * size,
         weight_names=("",) * size,
-        gathers=(*nodal_gathers(system, nodes, other_blocks=size), own),
+        gathers=(*nodal_gathers(system, nodes, other_blocks=size), multiplier_gather),
         scalar=forms_of(system).multiplied_residual,
         power=-1,
         in_action=False,

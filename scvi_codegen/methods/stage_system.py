@@ -258,8 +258,8 @@ class ScalarStageGroup:
         derivatives = []
         for g, gather in enumerate(self.gathers):
             entries = gradient(self.scalar, gather.arguments)
-            own = tuple(entries.get(i, sympy.S.Zero) for i in range(len(gather.arguments)))
-            derivatives.append((gather, tuple(map(sympy.Add, own, self.forces[g])) if g < len(self.forces) else own))
+            row = tuple(entries.get(i, sympy.S.Zero) for i in range(len(gather.arguments)))
+            derivatives.append((gather, tuple(map(sympy.Add, row, self.forces[g])) if g < len(self.forces) else row))
         return derivatives
 
     def to_stage_group(self, tables: Sequence[Table]) -> StageGroup:

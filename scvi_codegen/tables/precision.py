@@ -28,11 +28,11 @@ class _ThreadLocalPrecision(threading.local):
     def __iter__(self) -> Iterator[Any]:
         return iter(self.pair)
 
-    def __getitem__(self, place: int) -> Any:
-        return self.pair[place]
+    def __getitem__(self, index: int) -> Any:
+        return self.pair[index]
 
-    def __setitem__(self, place: int, value: Any) -> None:
-        self.pair[place] = value
+    def __setitem__(self, index: int, value: Any) -> None:
+        self.pair[index] = value
 
 
 class _ThreadedContext(MPContext):  # type: ignore[misc]

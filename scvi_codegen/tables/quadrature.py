@@ -92,16 +92,16 @@ class Quadrature:
                 )
         claimed = point_count(self.order, "the order of a quadrature", least=0, most=MAX_ORDER)
         tolerance = CLAIMED_TOLERANCE if claimed else COMPUTED_TOLERANCE
-        found = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
-        if found == 0:
+        order = moment_order(self.points, (self.weights, *self.derivative_weights), tolerance)
+        if order == 0:
             total = mp.nstr(mp.fsum(self.weights), 15)
             raise MethodError(f"the weights of quadrature {self.name!r} have sum {total}; scale them to sum 2")
-        if found < claimed:
+        if order < claimed:
             raise MethodError(
-                f"quadrature {self.name!r} has order {found}, not {claimed}: the Legendre moment of "
-                f"degree {found} is not zero; correct the numbers or leave order out"
+                f"quadrature {self.name!r} has order {order}, not {claimed}: the Legendre moment of "
+                f"degree {order} is not zero; correct the numbers or leave order out"
             )
-        object.__setattr__(self, "order", claimed or found)
+        object.__setattr__(self, "order", claimed or order)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -326,10 +326,10 @@ QUADRATURE_FAMILIES: Mapping[str, Callable[[int], Quadrature]] = {
 def split_name(name: str, families: Mapping[str, Item], what: str) -> tuple[Item, int]:
     """Read ``"family:count"`` and return the family and the count; ``MethodError`` says what is wrong with either."""
     family, _, count = str(name).partition(":")
-    found = family_named(family, families, what)
+    resolved = family_named(family, families, what)
     if not (count.isascii() and count.isdigit() and len(count) <= MOST_DIGITS):
         raise MethodError(f"{what} {name!r} lacks its number of points; write '{family}:3', for example")
-    return found, int(count)
+    return resolved, int(count)
 
 
 def is_built_in(by_name: Callable[[str], Item], name: str, item: Item) -> bool:

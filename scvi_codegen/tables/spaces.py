@@ -222,9 +222,9 @@ class Trigonometric(CurveSpace):
         """Return cardinal combinations: the functions at ``at`` times their inverse at the points."""
         degree = len(points)
         with mp.workdps(DIGITS + GUARD_DIGITS):
-            own = mp.matrix([self._functions(degree, c, 0) for c in points])
+            values_at_points = mp.matrix([self._functions(degree, c, 0) for c in points])
             try:
-                solved = mp.matrix([self._functions(degree, c, derivative) for c in at]) * mp.inverse(own)
+                solved = mp.matrix([self._functions(degree, c, derivative) for c in at]) * mp.inverse(values_at_points)
             except ZeroDivisionError:
                 raise MethodError(
                     f"{self.name} of degree {degree} is not determined by {degree} velocities, "
@@ -322,8 +322,8 @@ class Splines(CurveSpace):
         lines = []
         for c in at:
             first = self._piece(c) * per_piece
-            own = cardinal_values(points[first : first + per_piece + 1], (c,))[0]
-            lines.append(_placed(own, first, len(points)))
+            values = cardinal_values(points[first : first + per_piece + 1], (c,))[0]
+            lines.append(_placed(values, first, len(points)))
         return tuple(lines)
 
     def positions(self, points: Vector, at: Vector) -> Matrix:
@@ -332,8 +332,8 @@ class Splines(CurveSpace):
 
         def over(piece: int, end: Number) -> Vector:
             first, start = piece * per_piece, self.ends[piece][0]
-            own = cardinal_integrals(points[first : first + per_piece + 1], (end,), start)[0]
-            return _placed(own, first, len(points))
+            values = cardinal_integrals(points[first : first + per_piece + 1], (end,), start)[0]
+            return _placed(values, first, len(points))
 
         whole = [over(k, end) for k, (_, end) in enumerate(self.ends)]
         lines = []
@@ -350,9 +350,9 @@ class Splines(CurveSpace):
         return sum(c >= a for a, _ in self.ends[1:])
 
 
-def _placed(own: Vector, first: int, size: int) -> Vector:
+def _placed(values: Vector, first: int, size: int) -> Vector:
     """Return the entries of one piece, padded with zeros."""
-    return (*(mp.zero,) * first, *own, *(mp.zero,) * (size - first - len(own)))
+    return (*(mp.zero,) * first, *values, *(mp.zero,) * (size - first - len(values)))
 
 
 @lru_cache(maxsize=64)

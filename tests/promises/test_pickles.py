@@ -39,14 +39,14 @@ def stepper(option: str) -> Stepper:
     return compile_stepper(KEPLER, "svi:3", **{"flags": QUICK_FLAGS, **STEPPERS[option]})
 
 
-def copied(given: Any) -> Any:
-    return pickle.loads(pickle.dumps(given))
+def copied(original: Any) -> Any:
+    return pickle.loads(pickle.dumps(original))
 
 
 def test_every_option_of_a_stepper_is_in_the_table() -> None:
     signature = inspect.signature(compile_stepper)
     options = {name for name, each in signature.parameters.items() if each.kind is each.KEYWORD_ONLY}
-    assert options == set(STEPPERS) - {""}
+    assert options - {"sizes", "tables"} == set(STEPPERS) - {""}  # these two replace the system
 
 
 @pytest.mark.parametrize("option", STEPPERS)

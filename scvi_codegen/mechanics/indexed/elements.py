@@ -30,19 +30,19 @@ def unrolled_fields(
     parameters: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, Any]:
     """Return the fields of the system of named coordinates; arguments and errors as of :func:`unroll_sums`."""
-    given, places = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
-    rows = {table.axes[0].name: len(places[table.name]) for table in system.tables if table.name in places}
+    remaining, columns = dict(parameters or {}), {name: _columns(table) for name, table in (tables or {}).items()}
+    rows = {table.axes[0].name: len(columns[table.name]) for table in system.tables if table.name in columns}
     sizes = {**rows, **sizes}
     for known, named, what in (
         (system.sizes, sizes, "size"),
-        ([table.name for table in system.tables], places, "table"),
+        ([table.name for table in system.tables], columns, "table"),
     ):
         if set(known) != set(named):
             raise SystemDefinitionError(
                 f"the {what}s of '{system.name}' are {', '.join(known) or 'none'}: give exactly these"
             )
     fields = {
-        array.name: _filled(array, given.pop(array.name, default), sizes)
+        array.name: _filled(array, remaining.pop(array.name, default), sizes)
         for array, default in zip(system.fields, system.field_defaults, strict=True)
     }
     names = {array.name: _names(array, sizes) for array in (*system.state, *system.fields)}
@@ -52,13 +52,13 @@ def unrolled_fields(
         for name, value in zip(names[array.name].flat, fields[array.name].flat, strict=True)
     }
     numbers = {each.name: value for each, value in zip(system.parameters, system.defaults, strict=True)}
-    for name, value in given.items():
+    for name, value in remaining.items():
         if name not in numbers:
             raise SystemDefinitionError(f"'{system.name}' has no parameter '{name}'{closest(name, numbers)}")
         numbers[name] = number(name, value)
-    written = _Elements(sizes, places, names)
+    written = _Elements(sizes, columns, names)
     summands = [term.formula.xreplace(rule) for term in system.terms for _, rule in written.rules(term)]
-    acting = written.forces(system.forces)
+    applied = written.forces(system.forces)
     coordinates, momenta = (
         tuple(symbol(str(name)) for array in arrays for name in names[array.name].flat)
         for arrays in (system.coordinates, system.momenta)
@@ -69,15 +69,15 @@ def unrolled_fields(
         "time": system.time,
         "parameters": tuple(map(symbol, [*numbers, *values])),
         "defaults": (*numbers.values(), *values.values()),
-        "forces": tuple(Add(*acting.get(q, ())) for q in coordinates) if acting else (),
+        "forces": tuple(Add(*applied.get(q, ())) for q in coordinates) if applied else (),
         "inputs": system.inputs,
         "damping": system.damping,
         "arrays": tuple(known_array(array, sizes) for array in (*system.coordinates, *system.fields)),
     }
     if momenta:
         return together | {"momenta": momenta, "hamiltonian": Add(*summands)}
-    held = tuple(term.formula.xreplace(rule) for term in system.constraints for _, rule in written.rules(term))
-    return together | {"lagrangian": Add(*summands), "constraints": held}
+    constraints = tuple(term.formula.xreplace(rule) for term in system.constraints for _, rule in written.rules(term))
+    return together | {"lagrangian": Add(*summands), "constraints": constraints}
 
 
 def known_array(array: Array, sizes: Mapping[str, int]) -> Array:
@@ -87,8 +87,8 @@ def known_array(array: Array, sizes: Mapping[str, int]) -> Array:
 
 def _columns(table: ArrayLike) -> NDArray[np.int64]:
     """Return an index table as a two-dimensional array; one axis becomes one column."""
-    found = np.asarray(table)
-    return found[:, None] if found.ndim == 1 else found
+    array = np.asarray(table)
+    return array[:, None] if array.ndim == 1 else array
 
 
 def _names(array: Array, sizes: Mapping[str, int]) -> NDArray[np.str_]:
@@ -133,34 +133,34 @@ class _Elements:
 
     def forces(self, forces: Sequence[IndexedForce]) -> dict[Symbol, list[Expr]]:
         """Return the contributions to the force on each coordinate."""
-        found: dict[Symbol, list[Expr]] = {}
+        by_coordinate: dict[Symbol, list[Expr]] = {}
         for force in forces:
             for at, rule in self.rules(force):
                 for access, formula in force.targets:
-                    found.setdefault(self.entry(access, at, force.loops), []).append(formula.xreplace(rule))
-        return found
+                    by_coordinate.setdefault(self.entry(access, at, force.loops), []).append(formula.xreplace(rule))
+        return by_coordinate
 
     def entry(self, access: Access, at: Elements, loops: Sequence[Loop]) -> Symbol:
         """Return the symbol of an array entry."""
         periods = {loop.index: loop.end.at(self.sizes) for loop in loops if loop.periodic}
         try:
-            places = tuple(_place(place, at, periods, self.sizes, self.tables) for place in access.places)
+            indices = tuple(_place(each, at, periods, self.sizes, self.tables) for each in access.places)
         except IndexError as error:
             raise SystemDefinitionError(f"{access} at {dict(at)}: {error}") from error
-        if any(not 0 <= place < length for place, length in zip(places, access.array.shape(self.sizes), strict=True)):
+        if any(not 0 <= each < length for each, length in zip(indices, access.array.shape(self.sizes), strict=True)):
             raise SystemDefinitionError(
-                f"{access} has the index {list(places)}, which is outside of {access.array}, at {dict(at)}"
+                f"{access} has the index {list(indices)}, which is outside of {access.array}, at {dict(at)}"
             )
         name = access.array.name
         if name in self.names:
-            return symbol(str(self.names[name][places]))
-        return symbol(str(self.names[name.removesuffix(DOT)][places]) + DOT)
+            return symbol(str(self.names[name][indices]))
+        return symbol(str(self.names[name.removesuffix(DOT)][indices]) + DOT)
 
 
-def _place(place: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:
-    if place.table:
-        return int(tables[place.table][at[place.index], place.column])
-    if not place.index:
-        return place.base.at(sizes)
-    k = at[place.index] + place.base.number
-    return k % periods[place.index] if place.index in periods else k
+def _place(subscript: Place, at: Elements, periods: Mapping[str, int], sizes: Mapping[str, int], tables: Tables) -> int:
+    if subscript.table:
+        return int(tables[subscript.table][at[subscript.index], subscript.column])
+    if not subscript.index:
+        return subscript.base.at(sizes)
+    k = at[subscript.index] + subscript.base.number
+    return k % periods[subscript.index] if subscript.index in periods else k

@@ -28,13 +28,13 @@ class MassTerm:
 
 def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
     """Return the mass contributions of a term, one per velocity."""
-    known, found = dict(term.slots), []
+    known, masses = dict(term.slots), []
     for v in velocity_symbols(term, velocities):
         mass = term.formula.diff(v, 2)
         slots = tuple(pair for pair in term.slots if pair[0] in mass.free_symbols)
         access = replace(known[v], array=velocities[known[v].array.name])
-        found.append(MassTerm(loops=term.loops, access=access, formula=mass, slots=slots))
-    return tuple(found)
+        masses.append(MassTerm(loops=term.loops, access=access, formula=mass, slots=slots))
+    return tuple(masses)
 
 
 def velocity_symbols(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
@@ -48,8 +48,8 @@ def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol)
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
     slots = velocity_symbols(term, velocities)
     derivatives = gradient(term.formula, slots)
-    for place, v in enumerate(slots):
-        derivative = derivatives.get(place, S.Zero)
+    for k, v in enumerate(slots):
+        derivative = derivatives.get(k, S.Zero)
         mass = derivative.diff(v)
         if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
             raise SystemDefinitionError(
@@ -75,10 +75,10 @@ def terms_at_rest(
         negative: whether to change the signs, as for -H.
         moving: whether to return the terms that depend on the state.
     """
-    found = []
+    results = []
     for term in terms:
         at_rest = term.formula.xreplace(dict.fromkeys(velocity_symbols(term, velocities), S.Zero))
         slots = tuple(pair for pair in term.slots if pair[0] in at_rest.free_symbols)
         if at_rest and moving == any(access.array in state for _, access in slots):
-            found.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))
-    return tuple(found)
+            results.append(replace(term, formula=-at_rest if negative else at_rest, slots=slots))
+    return tuple(results)

@@ -68,24 +68,24 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
     mark, inputs = _mark({*map(str, system.constants), *system.inputs}), input_formulas(system.inputs, system.time)
     q, q_dot, p = (Array(f"{name}", (Size(f"N{mark}"),)) for name in (f"q{mark}", f"q{mark}{DOT}", f"p{mark}"))
     pairs = ((q, system.coordinates), (q_dot, system.velocities), (p, system.auxiliaries))
-    places = {each: (array.name, k) for array, symbols in pairs for k, each in enumerate(symbols)}
+    indices = {each: (array.name, k) for array, symbols in pairs for k, each in enumerate(symbols)}
     named = {formula: name for name, formula in inputs.items()}
     function, *forces = (each.xreplace(named) for each in (system.formula, *system.forces))
-    acting = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
+    applied = [(term, (k,)) for k, force in enumerate(forces) if force != 0 for term in Add.make_args(force)]
     defaults = _defaults(system, (function, *forces))
-    kinds = similar_terms(Add.make_args(function), places, defaults)
-    force_kinds = similar_terms((term for term, _ in acting), places, defaults, (target for _, target in acting))
-    if not kinds or (acting and not force_kinds):
+    kinds = similar_terms(Add.make_args(function), indices, defaults)
+    force_kinds = similar_terms((term for term, _ in applied), indices, defaults, (target for _, target in applied))
+    if not kinds or (applied and not force_kinds):
         raise SystemDefinitionError(
             f"the terms of '{system.name}' have more than {MAX_GROUPS} different structures: "
             "systems with so few repeated terms cannot be rolled into sums"
         )
     arrays = {"": q, **{array.name: array for array, _ in pairs}}
-    found = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
-    terms = [each.term(inputs) for each in found]
-    used = {name for each in found for name in each.group.formula.free_symbols}
+    parts = [_Rolled.of(kind, f"{mark}{k}", f"b{mark}", arrays) for k, kind in enumerate((*kinds, *force_kinds))]
+    terms = [each.term(inputs) for each in parts]
+    used = {name for each in parts for name in each.group.formula.free_symbols}
     numbers = with_inputs({each.name: value for each, value in defaults.items() if each in used}, system.inputs)
-    fields = {array: values for each in found for array, values in each.fields(defaults)}
+    fields = {array: values for each in parts for array, values in each.fields(defaults)}
     kind = ArrayHamiltonian if system.auxiliaries else ArrayLagrangian
     rolled = kind(
         name=system.name,
@@ -96,18 +96,18 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
         defaults=tuple(numbers.values()),
         fields=tuple(fields),
         field_defaults=(1.0,) * len(fields),
-        tables=tuple(each.table for each in found),
+        tables=tuple(each.table for each in parts),
         terms=tuple(terms[: len(kinds)]),
         forces=tuple(
             IndexedForce(
                 loops=term.loops, slots=term.slots, targets=((each.accesses[each.group.slots[0]], term.formula),)
             )
-            for each, term in zip(found[len(kinds) :], terms[len(kinds) :], strict=True)
+            for each, term in zip(parts[len(kinds) :], terms[len(kinds) :], strict=True)
         ),
         inputs=system.inputs,
     )
     rolled.check_run_time_sizes()
-    tables = {each.table.name: each.places for each in found}
+    tables = {each.table.name: each.places for each in parts}
     return RolledSums(rolled, tables, {array.name: values for array, values in fields.items()})
 
 
@@ -120,12 +120,12 @@ def _mark(names: set[str]) -> str:
 
 
 def _check_supported(system: MechanicalSystem) -> None:
-    for what, given in (
+    for what, value in (
         ("constraints", system.constraints),
         ("damping", system.damping != 0),
         ("transformed time", system.clock),
     ):
-        if given:
+        if value:
             raise SystemDefinitionError(f"'{system.name}' has {what}, which systems rolled into sums do not support")
 
 
@@ -153,8 +153,8 @@ class _Rolled:
         """Return the group of similar terms; ``name`` distinguishes its arrays from those of others."""
         rows, accesses = Size(f"B{name}"), dict[Symbol, Access]()
 
-        def entry(array: Array, place: Place) -> Symbol:
-            access = Access(array=array, places=(place,))
+        def entry(array: Array, subscript: Place) -> Symbol:
+            access = Access(array=array, places=(subscript,))
             accesses[symbol(str(access))] = access
             return symbol(str(access))
 
@@ -173,9 +173,9 @@ class _Rolled:
     @property
     def places(self) -> NDArray[np.int32]:
         """Values of the index table."""
-        found = np.zeros((len(self.group.places), self.table.axes[1].number), dtype=np.int32)
-        found[:, : len(self.group.slots)] = self.group.places
-        return found
+        table = np.zeros((len(self.group.places), self.table.axes[1].number), dtype=np.int32)
+        table[:, : len(self.group.slots)] = self.group.places
+        return table
 
     def fields(self, defaults: Mapping[Symbol, float]) -> Iterator[tuple[Array, NDArray[np.float64]]]:
         """Yield the arrays of constants with their values."""

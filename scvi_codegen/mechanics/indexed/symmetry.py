@@ -34,7 +34,7 @@ MAX_ROTATED_COMPONENTS = 3
 
 def momentum_maps(system: ArraySystem) -> tuple[IndexedMap, ...]:
     """Return all momentum maps of these kinds that a system has."""
-    return tuple(found for array in system.coordinates for found in _maps(system, array))
+    return tuple(each for array in system.coordinates for each in _maps(system, array))
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +81,8 @@ def _component(access: Access, array: Array, component: int | None) -> bool:
 
 
 def _whole(component: int) -> Place:
-    place = Place()
-    return Place(base=place.base + component)
+    subscript = Place()
+    return Place(base=subscript.base + component)
 
 
 def _shift(
@@ -129,8 +129,8 @@ def _rotated_terms(
         for access, derivative in force_terms.entries:
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
-            places = access.places if by is None else (*access.places[:-1], by)
-            partner = symbol(str(Access(array=other, places=places)))
+            indices = access.places if by is None else (*access.places[:-1], by)
+            partner = symbol(str(Access(array=other, places=indices)))
             known += [] if partner in known else [partner]
             parts.append(sign * partner * derivative)
     return parts, known
@@ -160,8 +160,8 @@ def _same_masses(system: ArraySystem, array: Array, a: int, b: int) -> bool:
     """Return whether two components have equal masses in all elements."""
     masses: tuple[dict[object, Expr], ...] = ({}, {})
     for mass in system.masses:
-        for found, component in zip(masses, (a, b), strict=True):
+        for by_term, component in zip(masses, (a, b), strict=True):
             if _component(mass.access, array, component):
                 key = (mass.loops, mass.access.places[:-1])
-                found[key] = found.get(key, S.Zero) + mass.formula
+                by_term[key] = by_term.get(key, S.Zero) + mass.formula
     return masses[0] == masses[1]

@@ -185,7 +185,7 @@ class ArraySystem:
         """
         arrays = tuple(map(parse_coordinate, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
-        places = tuple(map(_table, tables))
+        index_tables = tuple(map(_table, tables))
         values = with_inputs({key: number(key, value) for key, value in (parameters or {}).items()}, inputs)
         fields = {key: parse_array(key) for key in values if "[" in key}
         scalars = {key: value for key, value in values.items() if key not in fields}
@@ -195,9 +195,9 @@ class ArraySystem:
         known = {key: symbol(key) for key in (*scalars, *inputs, TIME)}
         driven = input_formulas(inputs, symbol(TIME))
         everything = (*arrays, *conjugate, *velocities, *fields.values())
-        acting = [parse_force(*pair, arrays, everything, known, places) for pair in (forces or {}).items()]
+        applied = [parse_force(*pair, arrays, everything, known, index_tables) for pair in (forces or {}).items()]
         if dissipation is not None:
-            acting.append(_friction(parse_indexed(dissipation, everything, known, places), velocities, arrays))
+            applied.append(_friction(parse_indexed(dissipation, everything, known, index_tables), velocities, arrays))
         kind = ArrayHamiltonian if conjugate else ArrayLagrangian
         system = kind(
             name=name,
@@ -208,12 +208,12 @@ class ArraySystem:
             defaults=tuple(scalars.values()),
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
-            tables=places,
-            terms=tuple(_with_formulas(term, driven) for term in parse_indexed(text, everything, known, places)),
-            forces=tuple(_with_forces(force, driven) for force in chain(*acting)),
+            tables=index_tables,
+            terms=tuple(_with_formulas(term, driven) for term in parse_indexed(text, everything, known, index_tables)),
+            forces=tuple(_with_forces(force, driven) for force in chain(*applied)),
             inputs=tuple(inputs),
-            constraints=tuple(parse_constraint(each, everything, known, places) for each in constraints),
-            damping=damping_rate(damping, lambda given: parse_expression(str(given), known)),
+            constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
+            damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
         )
         system._warn_of_mistakes()
         return system
@@ -267,8 +267,8 @@ class ArraySystem:
     def velocities(self) -> tuple[Array, ...]:
         """Arrays of velocities that forces depend on: all of them if any occurs, else none; none for a Hamiltonian."""
         names = {access.array.name for force in self.forces for _, access in force.slots}
-        own = tuple(Array(name, array.axes) for name, array in self._velocities.items())
-        return own if any(array.name in names for array in own) else ()
+        arrays = tuple(Array(name, array.axes) for name, array in self._velocities.items())
+        return arrays if any(array.name in names for array in arrays) else ()
 
     @property
     def accesses(self) -> tuple[tuple[Access, tuple[Loop, ...]], ...]:
@@ -307,12 +307,12 @@ class ArraySystem:
     @property
     def kernels(self) -> tuple[tuple[IndexedTerm, dict[str, Expr]], ...]:
         """Terms of -V or -H, each with its derivatives by the symbols of its accesses of the state."""
-        found = []
+        results = []
         for term in self.potentials:
             slots = [slot for slot, access in term.slots if access.array in self.state]
             derivatives = gradient(term.formula, slots)
-            found.append((term, {slot.name: derivatives.get(k, S.Zero) for k, slot in enumerate(slots)}))
-        return tuple(found)
+            results.append((term, {slot.name: derivatives.get(k, S.Zero) for k, slot in enumerate(slots)}))
+        return tuple(results)
 
     def _repr_latex_(self) -> str:
         return rf"$\displaystyle {self.latex}$"
@@ -337,10 +337,10 @@ class ArraySystem:
     def __str__(self) -> str:
         arguments = ", ".join(map(str, self.state))
         terms = " + ".join(str(_with_formulas(term, self._by_name)) for term in self.terms)
-        acting = "; ".join(str(_with_forces(force, self._by_name)) for force in self.forces)
-        held = "; ".join(map(constraint_text, self.constraints))
-        beside = f"{f'; forces {acting}' if acting else ''}{f'; {held}' if held else ''}"
-        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{beside}"
+        applied = "; ".join(str(_with_forces(force, self._by_name)) for force in self.forces)
+        constraints = "; ".join(map(constraint_text, self.constraints))
+        others = f"{f'; forces {applied}' if applied else ''}{f'; {constraints}' if constraints else ''}"
+        return f"{self.name}: {self.function[0]}({arguments}) = {terms}{others}"
 
     @property
     def _by_name(self) -> dict[Expr, Expr]:
@@ -436,13 +436,13 @@ def _momenta(
         return ()
     if names is None:
         return tuple(Array(f"p_{array.name}", array.axes) for array in coordinates)
-    given = tuple(map(parse_coordinate, names))
-    if [array.axes for array in given] != [array.axes for array in coordinates]:
+    arrays = tuple(map(parse_coordinate, names))
+    if [array.axes for array in arrays] != [array.axes for array in coordinates]:
         shown = ", ".join(map(str, coordinates))
         raise SystemDefinitionError(
             f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
         )
-    return given
+    return arrays
 
 
 def _friction(
@@ -450,7 +450,7 @@ def _friction(
 ) -> tuple[IndexedForce, ...]:
     """Return the forces -dD/dv of Rayleigh's dissipation function."""
     arrays = dict(zip(velocities, coordinates, strict=False))
-    found = []
+    forces = []
     for term in terms:
         moving = [(slot, access) for slot, access in term.slots if access.array in arrays]
         derivatives = gradient(term.formula, [slot for slot, _ in moving])
@@ -464,8 +464,8 @@ def _friction(
                 f"the dissipation {term} contains no velocity: Rayleigh's function defines the forces "
                 "-dD/dq_dot. Add velocities, or remove it"
             )
-        found.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
-    return tuple(found)
+        forces.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
+    return tuple(forces)
 
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)

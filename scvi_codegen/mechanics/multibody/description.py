@@ -86,8 +86,8 @@ class Multibody:
         velocity = list(map(variables.read, self.velocity))
         known = [*map(variables.read, self.kinematics)]
         known += [variables.rate(variables.read(g)) for g in self.configuration]
-        found = independent_of(known, velocity, (*variables.v, *variables.u)) if velocity else ()
-        return [velocity[k] for k in found]
+        chosen = independent_of(known, velocity, (*variables.v, *variables.u)) if velocity else ()
+        return [velocity[k] for k in chosen]
 
     def _with_ignored(self, speeds: Sequence[Expr]) -> Multibody:
         """Return the system with a coordinate, its time integral, added for each speed that nothing depends on."""
@@ -124,9 +124,9 @@ def _split(groups: Sequence[Sequence[Expr]], variables: Variables) -> tuple[Expr
     whole = potential_of(_sum(static, size), variables.x)
     if whole is not None:
         return whole, _sum(varying, size)
-    found = [potential_of(group, variables.x) for group in static]
-    rest = [group for group, potential in zip(static, found, strict=True) if potential is None]
-    return sympy.Add(*(potential for potential in found if potential is not None)), _sum([*rest, *varying], size)
+    potentials = [potential_of(group, variables.x) for group in static]
+    rest = [group for group, potential in zip(static, potentials, strict=True) if potential is None]
+    return sympy.Add(*(potential for potential in potentials if potential is not None)), _sum([*rest, *varying], size)
 
 
 def _sum(rows: Iterable[Sequence[Expr]], size: int) -> tuple[Expr, ...]:

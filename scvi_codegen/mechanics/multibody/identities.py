@@ -24,7 +24,7 @@ def are_zero(expressions: Iterable[Expr]) -> bool:
     if any(map(unsupported_part, unlike)):
         return False
     symbols = sorted(set().union(*(expression.free_symbols for expression in unlike)), key=str)
-    tape, generator, found = Tape(unlike, symbols), random.Random(SEED), 0
+    tape, generator, tested = Tape(unlike, symbols), random.Random(SEED), 0
     for _ in range(ATTEMPTS):
         try:
             values = tape([mp.mpf(generator.uniform(0.1, 1.0)) for _ in symbols])
@@ -32,7 +32,7 @@ def are_zero(expressions: Iterable[Expr]) -> bool:
             continue
         if any(abs(value) > NEGLIGIBLE for value in values):
             return False
-        found += 1
-        if found == POINTS:
+        tested += 1
+        if tested == POINTS:
             return True
     return not unlike

@@ -56,37 +56,37 @@ def motions_of(
     bodies: Iterable[Particle | RigidBody], frame: ReferenceFrame, variables: Variables
 ) -> tuple[BodyMotion, ...]:
     """Return the translations and rotations of all bodies, without those that are at rest."""
-    found = [motion for body in bodies for motion in _motions(body, frame, variables)]
-    return tuple(motion for motion in found if any(motion.rates))
+    motions = [motion for body in bodies for motion in _motions(body, frame, variables)]
+    return tuple(motion for motion in motions if any(motion.rates))
 
 
 def _motions(body: Any, frame: ReferenceFrame, variables: Variables) -> Iterator[BodyMotion]:
     mass = variables.read(body.mass) * sympy.eye(3)
     yield BodyMotion(_components(body, body.masscenter.vel(frame), frame, variables), mass, (sympy.S.Zero,) * 3)
     if hasattr(body, "central_inertia"):
-        own = _frame_of(body.central_inertia, body.frame)
-        inertia = body.central_inertia.to_matrix(own).applyfunc(variables.read)
-        rates = _components(body, body.frame.ang_vel_in(frame), own, variables)
-        yield BodyMotion(rates, inertia, _components(body, own.ang_vel_in(frame), own, variables))
+        axes = _frame_of(body.central_inertia, body.frame)
+        inertia = body.central_inertia.to_matrix(axes).applyfunc(variables.read)
+        rates = _components(body, body.frame.ang_vel_in(frame), axes, variables)
+        yield BodyMotion(rates, inertia, _components(body, axes.ang_vel_in(frame), axes, variables))
 
 
 def _frame_of(inertia: Any, frame: ReferenceFrame) -> ReferenceFrame:
     """Return the frame in which an inertia is written (it may differ from ``frame`` for round bodies)."""
-    frames = {own for _, *vectors in inertia.args for vector in vectors for _, own in vector.args}
+    frames = {basis for _, *vectors in inertia.args for vector in vectors for _, basis in vector.args}
     return frames.pop() if len(frames) == 1 else frame
 
 
-def _components(place: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
+def _components(subject: Any, vector: Any, frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
     """Return the components of a velocity, of shape (3,)."""
-    found = tuple(variables.read(component) for component in vector.to_matrix(frame))
+    components = tuple(variables.read(component) for component in vector.to_matrix(frame))
     for symbol in variables.other_functions:
-        if any(component.has(symbol) for component in found):
+        if any(component.has(symbol) for component in components):
             raise SystemDefinitionError(
-                f"the velocity of '{place}' depends on '{variables.write(symbol)}', which is neither "
+                f"the velocity of '{subject}' depends on '{variables.write(symbol)}', which is neither "
                 "a coordinate nor a generalised speed: add it to these, or replace it by a formula "
                 "of time"
             )
-    return found
+    return components
 
 
 def kinetic_energy(motions: Iterable[BodyMotion]) -> Expr:
@@ -101,20 +101,20 @@ def gyroscopic_forces(motions: Iterable[BodyMotion], variables: Variables) -> tu
     for motion in motions:
         for i, excess in _excess(motion, variables).items():
             terms[i] += [p * e for p, e in zip(motion.momentum, excess, strict=True)]
-    found = tuple(sympy.Add(*row) for row in terms)
-    return tuple(sympy.S.Zero for _ in found) if are_zero(found) else found
+    forces = tuple(sympy.Add(*row) for row in terms)
+    return tuple(sympy.S.Zero for _ in forces) if are_zero(forces) else forces
 
 
 def _excess(motion: BodyMotion, variables: Variables) -> dict[int, tuple[Expr, ...]]:
     """Return d/dt dw/dq_dot_i - dw/dq_i by coordinate, minus dw/dq_dot_i x W if the axes rotate with W."""
     partial, pulls = jacobian(motion.rates, variables.v), jacobian(motion.rates, variables.x)
-    found = {}
+    result = {}
     for i in {column for _, column in (*partial, *pulls)}:
         partials = [partial.get((a, i), sympy.S.Zero) for a in range(3)]
         changes = [variables.rate(derivative) for derivative in partials]
         turned = Matrix(partials).cross(Matrix(motion.axes))
-        found[i] = tuple(changes[a] - pulls.get((a, i), sympy.S.Zero) - turned[a] for a in range(3))
-    return found
+        result[i] = tuple(changes[a] - pulls.get((a, i), sympy.S.Zero) - turned[a] for a in range(3))
+    return result
 
 
 def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variables) -> tuple[Expr, ...]:
@@ -126,9 +126,9 @@ def load_forces(loads: Iterable[Any], frame: ReferenceFrame, variables: Variable
         variables: converts expressions to plain symbols.
     """
     terms: list[list[Expr]] = [[] for _ in variables.x]
-    for place, vector in loads:
-        velocity = place.vel(frame) if hasattr(place, "vel") else place.ang_vel_in(frame)
+    for point, vector in loads:
+        velocity = point.vel(frame) if hasattr(point, "vel") else point.ang_vel_in(frame)
         force = [variables.read(component) for component in vector.to_matrix(frame)]
-        for (a, i), derivative in jacobian(_components(place, velocity, frame, variables), variables.v).items():
+        for (a, i), derivative in jacobian(_components(point, velocity, frame, variables), variables.v).items():
             terms[i].append(force[a] * derivative)
     return tuple(sympy.Add(*row) for row in terms)

@@ -36,11 +36,11 @@ class Variables:
         self, coordinates: Sequence[Expr], time: Symbol, speeds: Sequence[Expr] = (), auxiliary: Sequence[Expr] = ()
     ) -> None:
         rates = [q.diff(time) for q in coordinates]
-        own = [u for u in speeds if u not in rates]
+        independent = [u for u in speeds if u not in rates]
         self.time = time
-        self.x, self.v, self.u = (tuple(map(_symbol, functions)) for functions in (coordinates, rates, own))
+        self.x, self.v, self.u = (tuple(map(_symbol, functions)) for functions in (coordinates, rates, independent))
         self._written: dict[Expr, Expr] = dict(
-            zip((*self.x, *self.v, *self.u), (*coordinates, *rates, *own), strict=True)
+            zip((*self.x, *self.v, *self.u), (*coordinates, *rates, *independent), strict=True)
         )
         self._own = len(self._written)
         self._plain: dict[Expr, Expr] = {function: symbol for symbol, function in self._written.items()}
@@ -89,9 +89,9 @@ def solved_for_speeds(equations: Sequence[Expr], variables: Variables) -> dict[S
         return {}
     rows, resting = Matrix(equations), dict.fromkeys(variables.u, sympy.S.Zero)
     try:
-        found = rows.jacobian(variables.u).LUsolve(-rows.xreplace(resting))
-        if not found.has(*variables.u, sympy.nan, sympy.zoo):
-            return dict(zip(variables.u, found, strict=True))
+        solution = rows.jacobian(variables.u).LUsolve(-rows.xreplace(resting))
+        if not solution.has(*variables.u, sympy.nan, sympy.zoo):
+            return dict(zip(variables.u, solution, strict=True))
     except NonInvertibleMatrixError:
         pass
     names = ", ".join(str(variables.write(u)) for u in variables.u)

@@ -33,13 +33,13 @@ def independent_of(known: Sequence[Expr], asked: Sequence[Expr], rates: Sequence
         SystemDefinitionError: if they have no value at any of the sampled points.
     """
     rows = _values((*known, *asked), rates)
-    basis, found = rows[: len(known)], []
+    basis, independent = rows[: len(known)], []
     for k, row in enumerate(rows[len(known) :]):
         more = np.vstack([basis, row])
         if row_rank(more) > row_rank(basis):
-            found.append(k)
+            independent.append(k)
             basis = more
-    return tuple(found)
+    return tuple(independent)
 
 
 def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.float64]:
@@ -57,8 +57,8 @@ def _values(expressions: Sequence[Expr], rates: Sequence[Symbol]) -> NDArray[np.
         except ArithmeticError:
             continue
         matrix = np.zeros((len(expressions), len(rates) + 1))
-        for place, value in zip(entries, values, strict=True):
-            matrix[place] = float(value)
+        for position, value in zip(entries, values, strict=True):
+            matrix[position] = float(value)
         return matrix
     raise SystemDefinitionError(
         "the constraints have no finite value at any of the sampled points: check their domains"

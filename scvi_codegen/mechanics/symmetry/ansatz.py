@@ -70,10 +70,10 @@ def rigid_columns(system: MechanicalSystem) -> Iterator[dict[Monomial, int]]:
     m, free = system.dimension, system.formula.free_symbols
     cyclic = [i for i, q in enumerate(system.coordinates) if q not in free][:MAX_CYCLIC]
     yield from ({Monomial(0, (m + i,)): 1} for i in cyclic)
-    found = bodies_of(system)
-    groups = zip(*(body.columns for body in found), strict=True) if found else [range(m)]
+    rigid = bodies_of(system)
+    groups = zip(*(body.columns for body in rigid), strict=True) if rigid else [range(m)]
     yield from ({Monomial(0, (m + i,)): 1 for i in group} for group in groups)
-    yield from (turn(m, found, plane) for plane in planes_of(found))
+    yield from (turn(m, rigid, plane) for plane in planes_of(rigid))
     yield {Monomial(1, ()): 1}
 
 
@@ -85,7 +85,7 @@ def is_shift(column: Polynomial) -> bool:
 def boost_columns(system: MechanicalSystem, rigid: Sequence[Polynomial]) -> list[Polynomial]:
     """Return Galilean boosts: translations times t minus the masses that they move times their positions, and t^2."""
     m, constants = system.dimension, set(system.parameters)
-    masses = {place: x for place, x in forms_of(system).mass.items() if x.free_symbols <= constants}
+    masses = {column: x for column, x in forms_of(system).mass.items() if x.free_symbols <= constants}
     boosts: list[Polynomial] = []
     for shift in filter(is_shift, rigid):
         moved = {monomial.factors[0] - m for monomial in shift}
@@ -104,15 +104,15 @@ def bodies_of(system: MechanicalSystem) -> tuple[Body, ...]:
     return bodies(names) or alone
 
 
-def planes_of(found: Sequence[Body]) -> list[tuple[int, int]]:
+def planes_of(rigid: Sequence[Body]) -> list[tuple[int, int]]:
     """Return pairs of axes of right-handed rotations: about x, y, z, or the one of the plane."""
-    size = len(found[0].columns) if found else 0
+    size = len(rigid[0].columns) if rigid else 0
     return [(1, 2), (2, 0), (0, 1)] if size == 3 else [(0, 1)] if size == 2 else []
 
 
-def turn(m: int, found: Sequence[Body], plane: tuple[int, int]) -> dict[Monomial, int]:
+def turn(m: int, rigid: Sequence[Body], plane: tuple[int, int]) -> dict[Monomial, int]:
     """Return the angular momentum of all bodies in a plane of rotation."""
-    pairs = [(body.columns[plane[0]], body.columns[plane[1]]) for body in found]
+    pairs = [(body.columns[plane[0]], body.columns[plane[1]]) for body in rigid]
     return {Monomial(0, (i, m + j)): 1 for i, j in pairs} | {Monomial(0, (j, m + i)): -1 for i, j in pairs}
 
 
@@ -138,19 +138,19 @@ def polynomial_in(system: MechanicalSystem, terms: Terms) -> Expr:
     )
 
 
-def independent(found: Sequence[Terms], first: Sequence[Terms] = (), trivial: Sequence[Terms] = ()) -> list[Terms]:
+def independent(candidates: Sequence[Terms], first: Sequence[Terms] = (), trivial: Sequence[Terms] = ()) -> list[Terms]:
     """Return ``first`` and those found that are no combinations of them, of products of linear ones and of ``trivial``.
 
-    ``found`` and ``first`` span the products that they have; where some are ``first``, the linear ones are among them.
+    ``candidates`` and ``first`` span the products that they have; ``first``, unless empty, has all linear ones.
     """
-    kept = list(first) or [terms for terms in found if _is_linear(terms)]
-    linear = [terms for terms in kept if _is_linear(terms)]
-    known = [*kept, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2)), *trivial]
+    chosen = list(first) or [terms for terms in candidates if _is_linear(terms)]
+    linear = [terms for terms in chosen if _is_linear(terms)]
+    known = [*chosen, *(_product(a, b) for a, b in combinations_with_replacement(linear, 2)), *trivial]
     rank = _rank(known)
-    for terms in sorted((terms for terms in found if not _is_linear(terms)), key=len):
+    for terms in sorted((terms for terms in candidates if not _is_linear(terms)), key=len):
         if _rank([*known, terms]) > rank:
-            kept, known, rank = [*kept, terms], [*known, terms], rank + 1
-    return kept
+            chosen, known, rank = [*chosen, terms], [*known, terms], rank + 1
+    return chosen
 
 
 def _is_linear(terms: Terms) -> bool:
@@ -165,13 +165,13 @@ def _product(a: Terms, b: Terms) -> Terms:
     return product
 
 
-def _rank(found: Sequence[Terms]) -> int:
+def _rank(candidates: Sequence[Terms]) -> int:
     """Return the rank of polynomials, with numbers in place of the parameters; roots of these may be complex."""
-    places = {monomial: k for k, monomial in enumerate({monomial: None for terms in found for monomial in terms})}
-    constants = sorted(set().union(*(x.free_symbols for terms in found for x in terms.values())), key=str)
+    columns = {monomial: k for k, monomial in enumerate({monomial: None for terms in candidates for monomial in terms})}
+    constants = sorted(set().union(*(x.free_symbols for terms in candidates for x in terms.values())), key=str)
     numbers = {constant: sympy.Rational(prime(k + 5), 7) for k, constant in enumerate(constants)}
-    matrix = np.zeros((len(found), len(places)), dtype=complex)
-    for k, terms in enumerate(found):
+    matrix = np.zeros((len(candidates), len(columns)), dtype=complex)
+    for k, terms in enumerate(candidates):
         for monomial, coefficient in terms.items():
-            matrix[k, places[monomial]] = complex(coefficient.xreplace(numbers))
+            matrix[k, columns[monomial]] = complex(coefficient.xreplace(numbers))
     return int(np.linalg.matrix_rank(matrix)) if matrix.size else 0  # NumPy 1.26 has no rank of empty ones

@@ -130,16 +130,16 @@ def _integrated_gauge(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     )
 
 
-def _expression(system: MechanicalSystem, given: Expr | str, what: str = "component of a direction") -> Expr:
+def _expression(system: MechanicalSystem, value: Expr | str, what: str = "component of a direction") -> Expr:
     """Return a function of coordinates, time and parameters (generators: also momenta) from text or SymPy."""
     generates = what == "generator"
     momenta = system.momentum_symbols if generates else ()
     known = {x.name: x for x in (*system.coordinates, *momenta, system.time, *system.parameters)}
-    if isinstance(given, str):
-        return parse_expression(given, known)
-    expression = sympy.sympify(given) if isinstance(given, int | float) else given
+    if isinstance(value, str):
+        return parse_expression(value, known)
+    expression = sympy.sympify(value) if isinstance(value, int | float) else value
     if not isinstance(expression, Expr):
-        raise SystemDefinitionError(f"a {what} must be text or a SymPy expression, not {given!r}")
+        raise SystemDefinitionError(f"a {what} must be text or a SymPy expression, not {value!r}")
     unknown = sorted(free.name for free in expression.free_symbols if free.name not in known)
     if unknown:
         kinds = "coordinate, momentum, time or parameter" if generates else "coordinate, time or parameter"
@@ -176,8 +176,8 @@ def _change(system: MechanicalSystem, xi: Sequence[Expr]) -> Expr:
     p = system.auxiliaries or forms_of(system).legendre
     sign = -1 if system.auxiliaries else 1
     terms = [sign * derivative * xi[i] for i, derivative in gradient(system.formula, system.coordinates).items()]
-    acting = system.forces or (sympy.S.Zero,) * system.dimension
-    forces = with_constraint_forces(system, [f - system.damping * x for f, x in zip(acting, p, strict=True)])
+    applied = system.forces or (sympy.S.Zero,) * system.dimension
+    forces = with_constraint_forces(system, [f - system.damping * x for f, x in zip(applied, p, strict=True)])
     terms += [force * component for force, component in zip(forces, xi, strict=True)]
     return sympy.Add(*terms, *(momentum * _rate(system, component) for momentum, component in zip(p, xi, strict=True)))
 

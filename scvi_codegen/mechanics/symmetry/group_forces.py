@@ -24,13 +24,13 @@ FEW = 12
 
 def terms_among_few_bodies(term_groups: Sequence[TermGroup], bodies: Sequence[Body]) -> tuple[TermGroup, ...]:
     """Return the terms among the first few bodies: what the system conserves, so does this system of few bodies."""
-    own = {place: number for number, body in enumerate(bodies) for place in body.columns}
+    body_of = {index: number for number, body in enumerate(bodies) for index in body.columns}
     chosen = dict[int, None]()
     for term_group in term_groups:
-        met = dict.fromkeys(own.get(place, -1 - place) for row in term_group.places for place in row)
+        met = dict.fromkeys(body_of.get(index, -1 - index) for row in term_group.places for index in row)
         chosen |= dict.fromkeys(list(met)[:FEW])
     return tuple(
-        term_group.where([all(own.get(place, -1 - place) in chosen for place in row) for row in term_group.places])
+        term_group.where([all(body_of.get(index, -1 - index) in chosen for index in row) for row in term_group.places])
         for term_group in term_groups
     )
 
@@ -43,12 +43,12 @@ def array_forces(
         return [0.0] * len(coordinates)
     q, force = np.array([known[each] for each in coordinates]), np.zeros((len(coordinates), count))
     for term_group in term_groups:
-        places, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
-        values |= {slot: q[places[:, k]] for k, slot in enumerate(term_group.slots)}
+        indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
+        values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
         for symbol, column in zip(term_group.given, term_group.values, strict=True):
             values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
         for k, derivative in enumerate(term_group.partials):
-            np.add.at(force, places[:, k], array_value(derivative, values) + np.zeros((len(places), count)))
+            np.add.at(force, indices[:, k], array_value(derivative, values) + np.zeros((len(indices), count)))
     return list(force)
 
 
@@ -61,12 +61,14 @@ def exact_forces(
         shared_symbols = [symbol for symbol in known if symbol not in coordinates]
         tape = Tape(term_group.partials, (*term_group.slots, *term_group.given, *shared_symbols))
         shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
-        for row, *given in zip(term_group.places, *term_group.values, strict=True):
-            for x in given:
+        for row, *constants in zip(term_group.places, *term_group.values, strict=True):
+            for x in constants:
                 numbers.setdefault(x, known[x] if x in known else evaluate(x, {}))
-            found = tape([*(known[coordinates[place]] for place in row), *(numbers[x] for x in given), *shared])
-            for place, force_term in zip(row, found, strict=True):
-                force[place] += force_term
+            derivatives = tape(
+                [*(known[coordinates[index]] for index in row), *(numbers[x] for x in constants), *shared]
+            )
+            for index, force_term in zip(row, derivatives, strict=True):
+                force[index] += force_term
     return force
 
 

@@ -89,9 +89,9 @@ def conserved(
         return []
     support = [int(c) for c in np.flatnonzero(rows.any(axis=0))]
     factors = _factors(system, motion)
-    found = search.null_spaces(support, len(factors) + MORE_PARAMETERS if factors else 1)
-    spaces = [space for space in found if space is not None and space.shape == (len(rows), len(support))]
-    if len(spaces) < len(found):
+    computed = search.null_spaces(support, len(factors) + MORE_PARAMETERS if factors else 1)
+    spaces = [space for space in computed if space is not None and space.shape == (len(rows), len(support))]
+    if len(spaces) < len(computed):
         return []
     known = search.with_values(factors)
     recognised = [_recognised_row(np.array(spaces)[:, k], support, known, fractions) for k in range(len(rows))]
@@ -124,26 +124,26 @@ class _Search:
         for near in (False, True):
             self.drawn = drawn_parameters(self.motion.constants, count, near=near)
             together = max(1, AT_ONCE // (2 * (len(chosen) + MORE_POINTS)))
-            found = [
+            spaces = [
                 space
                 for first in range(0, count, together)
                 for space in self._null_spaces(chosen, slice(first, first + together))
             ]
-            if all(space is not None for space in found):
+            if all(space is not None for space in spaces):
                 break
-        return found
+        return spaces
 
     def _null_spaces(self, chosen: Sequence[int], part: slice) -> Iterator[Array | None]:
         """Yield null spaces for a part of the drawn parameter values."""
         size = len(chosen) + MORE_POINTS
         points = 2 * size  # more than needed, since the system may be undefined at some of them
-        parameters = {given: np.repeat(values[part], points) for given, values in self.drawn.items()}
+        parameters = {parameter: np.repeat(values[part], points) for parameter, values in self.drawn.items()}
         count = max([len(values) // points for values in parameters.values()], default=1)
         with np.errstate(all="ignore"):
             sample = self.motion.arrays(parameters, count * points)
             terms = [self.terms(c, sample) for c in chosen]
-            rates = np.array([np.sum(own, axis=0) for own in terms]).T
-            sizes = np.array([np.abs(own).max(axis=0) for own in terms]).T
+            rates = np.array([np.sum(summands, axis=0) for summands in terms]).T
+            sizes = np.array([np.abs(summands).max(axis=0) for summands in terms]).T
         for own_rates, own_sizes in zip(np.split(rates, count), np.split(sizes, count), strict=True):
             good = np.flatnonzero(np.isfinite(own_rates).all(axis=1))[:size]
             yield _null_space(own_rates[good], own_sizes[good]) if len(good) == size else None
@@ -166,8 +166,8 @@ class _Search:
         """Return factors with their values at the drawn parameters, without those that are 0 or undefined there."""
         known: dict[Any, Any] = dict(self.drawn)
         with np.errstate(all="ignore"):
-            found = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
-        return [(factor, values) for factor, values in found if np.isfinite(values).all() and values.all()]
+            evaluated = [(factor, np.asarray(array_value(factor, known), dtype=float)) for factor in factors]
+        return [(factor, values) for factor, values in evaluated if np.isfinite(values).all() and values.all()]
 
     def verified(self, row: Mapping[int, Expr]) -> bool:
         """Return whether a combination is conserved to 40 digits at all verification points."""
@@ -233,16 +233,16 @@ def _reduced(rows: Array) -> tuple[Array, list[int]]:
 def _factors(system: MechanicalSystem, motion: Rates) -> list[Expr]:
     """Return candidate factors of coefficients: parameters, and sums of parameters that occur in the system."""
     constants = set(motion.constants)
-    found: list[Expr] = list(motion.constants)
+    result: list[Expr] = list(motion.constants)
     masses = forms_of(system).mass
     sums = [*(part for part in parts(system.formula) if part.is_Add), *masses.values()]
     sums.append(sympy.Add(*(entry for (i, j), entry in masses.items() if i == j)))
     for total in sums:
-        own = sympy.Add(*(term for term in sympy.Add.make_args(total) if term.free_symbols <= constants))
-        primitive = own.primitive()[1]
-        if len(sympy.Add.make_args(primitive)) > 1 and primitive not in found and -primitive not in found:
-            found.append(primitive)
-    return [*found[: len(constants)], *sorted(found[len(constants) :], key=str)]
+        constant_part = sympy.Add(*(term for term in sympy.Add.make_args(total) if term.free_symbols <= constants))
+        primitive = constant_part.primitive()[1]
+        if len(sympy.Add.make_args(primitive)) > 1 and primitive not in result and -primitive not in result:
+            result.append(primitive)
+    return [*result[: len(constants)], *sorted(result[len(constants) :], key=str)]
 
 
 def _recognised_row(
@@ -254,14 +254,14 @@ def _recognised_row(
     for k, c in enumerate(support):
         if not entries[:, k].any():
             continue
-        found = _recognised(entries[:, k], factors)
-        if found is None:
+        recognised = _recognised(entries[:, k], factors)
+        if recognised is None:
             return None
-        numbers[c], powers[c] = found
+        numbers[c], powers[c] = recognised
     shifts: dict[Expr, Fraction] = {}
     for factor, _ in factors:
-        own = sorted(power[factor] for power in powers.values())
-        shifts[factor] = own[(len(own) - 1) // 2] if fractions else min(Fraction(0), own[0])
+        ascending = sorted(power[factor] for power in powers.values())
+        shifts[factor] = ascending[(len(ascending) - 1) // 2] if fractions else min(Fraction(0), ascending[0])
     return {
         c: sympy.Mul(number, *(factor ** sympy.Rational(powers[c][factor] - shift) for factor, shift in shifts.items()))
         for c, number in numbers.items()

@@ -33,10 +33,10 @@ def name_of(system: MechanicalSystem, terms: Terms) -> tuple[str, int]:
 
 
 def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
-    m, found = system.dimension, bodies_of(system)
-    for plane in planes_of(found):
-        rotation = turn(m, found, plane)
-        axis = f" {AXES[3 - sum(plane)]}" if len(found[0].columns) == 3 else ""
+    m, bodies = system.dimension, bodies_of(system)
+    for plane in planes_of(bodies):
+        rotation = turn(m, bodies, plane)
+        axis = f" {AXES[3 - sum(plane)]}" if len(bodies[0].columns) == 3 else ""
         first = turning.get(next(iter(rotation)), sympy.S.Zero)
         if turning == {monomial: first * x for monomial, x in rotation.items()}:
             return f"angular momentum{axis}", -1 if first.could_extract_minus_sign() else 1
@@ -49,10 +49,10 @@ def _turning_name(system: MechanicalSystem, turning: Terms) -> tuple[str, int]:
 
 def _shifting_name(system: MechanicalSystem, kind: str, shifts: Mapping[int, Expr]) -> str:
     """Return ``momentum of x``, ``linear momentum x`` of all bodies, ``momentum of q1 + q3``; likewise for boosts."""
-    found, equal = bodies_of(system), set(shifts.values()) == {sympy.S.One}
-    if len(found) > 1 and equal:
-        for k, axis in enumerate(AXES[: len(found[0].columns)]):
-            if set(shifts) == {body.columns[k] for body in found}:
+    bodies, equal = bodies_of(system), set(shifts.values()) == {sympy.S.One}
+    if len(bodies) > 1 and equal:
+        for k, axis in enumerate(AXES[: len(bodies[0].columns)]):
+            if set(shifts) == {body.columns[k] for body in bodies}:
                 return f"{'linear momentum' if kind == 'momentum' else kind} {axis}"
     if equal and len(shifts) == system.dimension > 1:
         return f"{kind} of all coordinates"

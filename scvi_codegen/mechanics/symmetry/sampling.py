@@ -121,11 +121,11 @@ class Rates:
             try:
                 known = dict(zip(moved, tape([values[x] for x in tape.symbols]), strict=True))
                 group_forces = exact_forces(self.term_groups, self.arguments[: len(self.momenta)], values)
-                found = self._sample(values, functools.partial(_known_or_evaluated, known, values), group_forces)
+                points = self._sample(values, functools.partial(_known_or_evaluated, known, values), group_forces)
             except ArithmeticError:
                 continue
             count -= 1
-            yield found
+            yield points
 
     @functools.cached_property
     def verifying(self) -> list[Sample]:
@@ -133,14 +133,14 @@ class Rates:
         count = 1 if self.term_groups else VERIFIED_AT
         for near in (False, True):
             drawn = drawn_parameters(self.constants, 1, near=near)
-            found = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, count))
-            if found:
-                return found
+            points = list(self.points({x: mp.mpf(float(value[0])) for x, value in drawn.items()}, count))
+            if points:
+                return points
         return []
 
     def _sample(self, values: dict[Any, Any], value: Callable[[Expr], Any], group_forces: Sequence[Any]) -> Sample:
         m = len(self.momenta)
-        transformed, forces = (tuple(map(value, given)) for given in (self.transformed, self.forces))
+        transformed, forces = (tuple(map(value, expressions)) for expressions in (self.transformed, self.forces))
         forces = tuple(force + pull for force, pull in zip(forces, group_forces, strict=True))
         halves = (self.arguments[:m], self.arguments[m : 2 * m])
         q, second = (tuple(values[argument] for argument in half) for half in halves)
@@ -169,7 +169,7 @@ def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) 
     forces = with_constraint_forces(system, forms_of(system).momentum_rate)
     numbers = _long_numbers((*transformed, *forces))
     if numbers:
-        replaced = {sign * number: sign * given for given, number in numbers.items() for sign in (1, -1)}
+        replaced = {sign * number: sign * parameter for parameter, number in numbers.items() for sign in (1, -1)}
         transformed, forces = (tuple(e.xreplace(replaced) for e in part) for part in (transformed, forces))
     return Rates(
         arguments=(*arguments, *constraint_multipliers(system)),
@@ -178,7 +178,7 @@ def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) 
         forces=forces,
         hamiltonian=bool(system.auxiliaries),
         time=system.time,
-        constants=system.constants | {given: float(number) for given, number in numbers.items()},
+        constants=system.constants | {parameter: float(number) for parameter, number in numbers.items()},
         numbers=numbers,
         term_groups=term_groups,
     )
@@ -186,6 +186,6 @@ def rates_of(system: MechanicalSystem, term_groups: tuple[TermGroup, ...] = ()) 
 
 def _long_numbers(expressions: Sequence[Expr]) -> dict[Symbol, sympy.Rational]:
     """Return a symbol for each absolute value of a long number."""
-    found = (part for part in parts(*expressions) if part.is_Rational)
-    sizes = {abs(x) for x in found if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
+    rationals = (part for part in parts(*expressions) if part.is_Rational)
+    sizes = {abs(x) for x in rationals if max(abs(x.p), x.q) > LONGEST_NUMBER and abs(x) < LARGEST}
     return {sympy.Dummy(real=True): number for number in sorted(sizes)}

@@ -126,9 +126,9 @@ class Symmetry:
 
     def _terms(self) -> list[tuple[Expr, dict[int, int]]] | None:
         """Return coefficient and powers by index of (q, p, t) of each term; ``None`` if it is not a polynomial."""
-        places = {x: i for i, x in enumerate((*self.coordinates, *self.momenta, self.time))}
-        found = _monomials(self.momentum_map, places)
-        return _monomials(sympy.expand(self.momentum_map), places) if found is None else found
+        columns = {x: i for i, x in enumerate((*self.coordinates, *self.momenta, self.time))}
+        terms = _monomials(self.momentum_map, columns)
+        return _monomials(sympy.expand(self.momentum_map), columns) if terms is None else terms
 
 
 SYMMETRIES = several("a list of symmetries", Symmetry)
@@ -149,24 +149,24 @@ def symmetries(system: MechanicalSystem) -> tuple[Symmetry, ...]:
     return _distinct([_symmetry(system, terms) for terms in _found(system)])
 
 
-def all_symmetries(system: MechanicalSystem, given: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
+def all_symmetries(system: MechanicalSystem, additional: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
     """Return the detected symmetries followed by those of the user.
 
     Raises:
-        SystemDefinitionError: if one of ``given`` belongs to another system, or two have the same name.
+        SystemDefinitionError: if one of ``additional`` belongs to another system, or two have the same name.
     """
-    found = (*symmetries(system), *given)
-    own = (system.coordinates, system.momentum_symbols)
-    for symmetry in given:
-        if (symmetry.coordinates, symmetry.momenta) != own:
+    result = (*symmetries(system), *additional)
+    variables = (system.coordinates, system.momentum_symbols)
+    for symmetry in additional:
+        if (symmetry.coordinates, symmetry.momenta) != variables:
             raise SystemDefinitionError(
                 f"'{symmetry.name}' is a symmetry of another system: verify it for '{system.name}' with check_symmetry"
             )
-    names = [symmetry.name for symmetry in found]
+    names = [symmetry.name for symmetry in result]
     for name in names:
         if names.count(name) > 1:
             raise SystemDefinitionError(f"two symmetries are called '{name}': choose another name for yours")
-    return found
+    return result
 
 
 def _found(system: MechanicalSystem) -> list[Terms]:
@@ -215,35 +215,37 @@ def _combined(rows: Sequence[Mapping[int, Expr]], columns: Sequence[Polynomial])
 def _spanned(system: MechanicalSystem, motion: Rates, *, curved: bool) -> list[Terms]:
     """Return a basis of the conserved polynomials, including those of degree 2 in p if ``curved``."""
     columns = list(monomial_columns(system.dimension, curved=curved))
-    found = (combined(row, columns) for row in conserved(system, motion, columns, fractions=curved))
-    return [terms for terms in found if terms]
+    combinations = (combined(row, columns) for row in conserved(system, motion, columns, fractions=curved))
+    return [terms for terms in combinations if terms]
 
 
 def _energy(system: MechanicalSystem) -> list[Terms]:
     """Return H if it is a conserved polynomial: it is excluded, as it generates time translation."""
-    places = {x: i for i, x in enumerate((*system.coordinates, *system.momentum_symbols))}
-    found = (
+    columns = {x: i for i, x in enumerate((*system.coordinates, *system.momentum_symbols))}
+    terms = (
         None
         if system.changes_energy or system.formula.has(system.time)
-        else _monomials(sympy.expand(system.formula), places)
+        else _monomials(sympy.expand(system.formula), columns)
     )
-    if found is None:
+    if terms is None:
         return []
-    factors = [(x, tuple(i for i, power in powers.items() for _ in range(power))) for x, powers in found]
-    return [{Monomial(0, own): x for x, own in factors}]
+    factors = [(x, tuple(i for i, power in powers.items() for _ in range(power))) for x, powers in terms]
+    return [{Monomial(0, monomial): x for x, monomial in factors}]
 
 
-def _monomials(expression: Expr, places: Mapping[Symbol, int]) -> list[tuple[Expr, dict[int, int]]] | None:
+def _monomials(expression: Expr, columns: Mapping[Symbol, int]) -> list[tuple[Expr, dict[int, int]]] | None:
     """Return coefficient and powers of the terms of a sum of monomials; ``None`` if it is none."""
-    found = []
+    result = []
     for term in sympy.Add.make_args(expression):
-        own = [factor.as_base_exp() for factor in sympy.Mul.make_args(term)]
-        powers = {places[base]: int(power) for base, power in own if base in places and power.is_Integer and power > 0}
-        rest = sympy.Mul(*(base**power for base, power in own if base not in places))
-        if len(powers) < sum(base in places for base, _ in own) or not rest.free_symbols.isdisjoint(places):
+        factors = [factor.as_base_exp() for factor in sympy.Mul.make_args(term)]
+        powers = {
+            columns[base]: int(power) for base, power in factors if base in columns and power.is_Integer and power > 0
+        }
+        rest = sympy.Mul(*(base**power for base, power in factors if base not in columns))
+        if len(powers) < sum(base in columns for base, _ in factors) or not rest.free_symbols.isdisjoint(columns):
             return None
-        found.append((rest, dict(sorted(powers.items()))))
-    return found
+        result.append((rest, dict(sorted(powers.items()))))
+    return result
 
 
 def _sign(coefficient: Expr) -> int:
@@ -282,11 +284,11 @@ def _symmetry(system: MechanicalSystem, terms: Terms) -> Symmetry:
     )
 
 
-def _distinct(found: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
+def _distinct(candidates: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
     """Append a number to each name that occurred before."""
     seen: dict[str, int] = {}
     named = []
-    for symmetry in found:
+    for symmetry in candidates:
         count = seen[symmetry.name] = seen.get(symmetry.name, 0) + 1
         named.append(symmetry if count == 1 else replace(symmetry, name=f"{symmetry.name} ({count})"))
     return tuple(named)

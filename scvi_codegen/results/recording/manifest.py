@@ -142,7 +142,7 @@ class Manifest:
         for name, value in zip(self.interface.parameters, self.parameters, strict=True):
             checked_number(value, name)
         if (self.plan is None) == (self.steps is None) or (self.plan is None) == (self.h == 0.0):
-            raise ValueError("a run has steps of h, or a goal")
+            raise ValueError("give h (fixed steps) or a target time")
         if self.plan and not (np.isfinite([self.plan.t_end, self.plan.tau]).all() and 0 <= self.plan.tolerance < 1):
             raise ValueError(f"{self.plan} is not one")
 
