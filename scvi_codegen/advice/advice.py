@@ -279,8 +279,8 @@ def _warnings(pilot: Pilot, tolerance: float, n: int) -> Iterator[str]:
             return
         yield f"the tolerance cannot be met: {chaos}, so round-off alone exceeds it"
         digits = math.log10(tolerance / max(pilot.final_quarter_error(n), 2.0**-52))
-        kept = max(0.0, abs(pilot.length) + digits * tenfold)
-        yield f"the recommended step meets it for about {kept:.3g} units of time"
+        reliable = max(0.0, abs(pilot.length) + digits * tenfold)
+        yield f"the recommended step meets it for about {reliable:.3g} units of time"
     elif floor > tolerance / SAFETY:
         yield f"round-off alone causes an error of about {floor:.1g} at the end, for any step size"
     elif not pilot.whole and pilot.growth > EXPONENTIAL_POWER:

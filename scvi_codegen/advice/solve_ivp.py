@@ -136,7 +136,7 @@ def solve_ivp(
         raise StateError("args are the parameters in order: give args or parameters, not both")
     parameters = parameters if args is None else args
     start, end = _span(t_span)
-    q, given = _halves(y0) if velocity is None else (y0, None)
+    q, p0 = _halves(y0) if velocity is None else (y0, None)
     requested_times = None if t_eval is None else times_of_run(t_eval, start, end)
     if error is not None:
         others = {
@@ -149,7 +149,7 @@ def solve_ivp(
         checked_error(error, others)
     request = _StepRequest(h, rtol, tolerance, error)
     stepper, uncompiled = _stepper(system, method, (time_transformation, controller), request)
-    p = stepper._initial_momenta(q, given, velocity, start, parameters)
+    p = stepper._initial_momenta(q, p0, velocity, start, parameters)
     along: dict[str, Any] = {"t": start, "parameters": parameters, "options": options}
     plan = _plan(stepper, uncompiled, request, (q, p, end - start), along)
     settings = {
@@ -252,8 +252,8 @@ ALTERNATIVES = {
 """Alternatives to arguments of ``solve_ivp`` that are not supported."""
 
 
-def _refuse(given: Mapping[str, float | None]) -> None:
-    for name, value in given.items():
+def _refuse(arguments: Mapping[str, float | None]) -> None:
+    for name, value in arguments.items():
         if value is not None:
             raise StateError(f"solve_ivp has no {name}={value!r}: {ALTERNATIVES[name]}")
 

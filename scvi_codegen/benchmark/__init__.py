@@ -179,10 +179,10 @@ def benchmark(
 
 def _sections(name: str) -> tuple[str, ...]:
     """Return the section of that name, or all whose names begin with it and a colon."""
-    found = (name,) if name in SECTIONS else tuple(each for each in SECTIONS if each.startswith(f"{name}:"))
-    if not found:
+    names = (name,) if name in SECTIONS else tuple(each for each in SECTIONS if each.startswith(f"{name}:"))
+    if not names:
         raise StateError(f"there is no section '{name}'{closest(name, SECTIONS)} Known: {', '.join(SECTIONS)}")
-    return found
+    return names
 
 
 Result = CaseResult | ResultTable
@@ -196,13 +196,13 @@ def _known(json_path: str) -> dict[str, Result]:
         return {}
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        found: list[Result] = [
+        results: list[Result] = [
             *map(CaseResult.from_data, data["cases"]),
             *(ResultTable.from_data(each) for each in data["tables"] if not each["title"].startswith(FAILED)),
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StateError(f"{json_path} is not a report that can be resumed: {type(error).__name__}: {error}") from None
-    return {each.name: each for each in found}
+    return {each.name: each for each in results}
 
 
 def _write(report: Report, json_path: str) -> None:

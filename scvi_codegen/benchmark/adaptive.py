@@ -77,8 +77,8 @@ def _ours(chosen: Case, *, quick: bool) -> list[Contender]:
     return made if quick or "kepler" not in chosen.name else [*made, *_transformed(chosen, momenta, seconds)]
 
 
-def _tolerance(given: float | None) -> str:
-    return f"tol={given:.0e}" if given else "tol=default"
+def _tolerance(tolerance: float | None) -> str:
+    return f"tol={tolerance:.0e}" if tolerance else "tol=default"
 
 
 def _transformed(chosen: Case, momenta: Array, seconds: float) -> list[Contender]:
@@ -185,8 +185,8 @@ def _shortest(runs: Sequence[Array]) -> Extended:
     """Return common steps for all runs from the times of each: the smallest that any of them takes at that time."""
     times, end = [float(runs[0][0])], float(runs[0][-1])
     while times[-1] < end:
-        places = [np.searchsorted(run[1:-1], times[-1], side="right") for run in runs]
-        times.append(min(end, times[-1] + min(run[k + 1] - run[k] for run, k in zip(runs, places, strict=True))))
+        indices = [np.searchsorted(run[1:-1], times[-1], side="right") for run in runs]
+        times.append(min(end, times[-1] + min(run[k + 1] - run[k] for run, k in zip(runs, indices, strict=True))))
     return np.diff(np.array(times, dtype=np.longdouble))
 
 

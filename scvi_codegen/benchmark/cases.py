@@ -222,7 +222,7 @@ def rotated(vector: Sequence[float], axes: int) -> Array:
 def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Case:
     """Return a problem of the catalogue with its own state (or another one), spread by 5 %."""
     entry = problem(name)
-    own = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
+    fields = {field: changes.pop(field) for field in ("span", "fine", "loops") if field in changes}
     q, velocity = changes.pop("q", entry.q), changes.pop("velocity", entry.velocity)
     step = changes.pop("step", entry.step)
     return Case(
@@ -232,7 +232,7 @@ def _small_case(name: str, rates: tuple[Formulation, ...], **changes: Any) -> Ca
         q=scaled(q, 0.05),
         velocity=scaled(velocity, 0.05),
         step=step,
-        **own,
+        **fields,
     )
 
 

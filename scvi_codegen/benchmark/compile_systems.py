@@ -161,5 +161,5 @@ def _distance(a: str, b: str) -> str:
 def _grid(n: int) -> tuple[float, ...]:
     """Return positions in space, at least 1.2 apart, slightly irregular."""
     side = int(np.ceil(n ** (1 / 3)))
-    places = np.array([(i, j, k) for i in range(side) for j in range(side) for k in range(side)][:n])
-    return tuple(float(x) for x in (1.3 * places + 0.04 * np.sin(1.0 + 5.0 * np.arange(3 * n).reshape(n, 3))).ravel())
+    points = np.array([(i, j, k) for i in range(side) for j in range(side) for k in range(side)][:n])
+    return tuple(float(x) for x in (1.3 * points + 0.04 * np.sin(1.0 + 5.0 * np.arange(3 * n).reshape(n, 3))).ravel())

@@ -91,10 +91,10 @@ def run_compile_times(plan: Plan, report_activity: ReportActivity) -> ResultTabl
 
 
 def _first_step(written: SystemText, method: str) -> dict[str, Any]:
-    given = asdict(written)
-    start = given.pop("start")
+    keywords = asdict(written)
+    start = keywords.pop("start")
     name, _, arguments = method.rstrip(")").partition("(")
-    text = json.dumps([given, start, [name, [int(argument) for argument in arguments.split(",") if argument]]])
+    text = json.dumps([keywords, start, [name, [int(argument) for argument in arguments.split(",") if argument]]])
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
         environment = os.environ | {building.CACHE_VARIABLE: folder}
         run = subprocess.run(

@@ -65,10 +65,10 @@ def _builds() -> dict[str, tuple[str, tuple[str, ...]]]:
     builds: dict[str, tuple[str, tuple[str, ...]]] = {}
     for title, command in result.items():
         builds[f"{title}, this processor"] = (command, TUNED_FLAGS)
-        for level in _levels():
-            flags = tuple(f"-march={level}" if flag == "-march=native" else flag for flag in TUNED_FLAGS)
+        for architecture in _levels():
+            flags = tuple(f"-march={architecture}" if flag == "-march=native" else flag for flag in TUNED_FLAGS)
             if title != "ziglang":  # a clang with other names of processors
-                builds[f"{title}, {LEVELS[level][0]}"] = (command, flags)
+                builds[f"{title}, {LEVELS[architecture][0]}"] = (command, flags)
         builds[f"{title}, portable"] = (command, PORTABLE_FLAGS)
     return builds
 
@@ -79,7 +79,7 @@ def _levels() -> Iterator[str]:
         return
     description = Path("/proc/cpuinfo")
     has = description.read_text(encoding="utf-8").split() if description.exists() else []
-    yield from (level for level, (_, flag) in LEVELS.items() if not flag or flag in has)
+    yield from (architecture for architecture, (_, flag) in LEVELS.items() if not flag or flag in has)
 
 
 def _runner(name: str, degree: int, steps: int, command: str, flags: tuple[str, ...]) -> Step:

@@ -40,15 +40,15 @@ def run_constrained_bodies(plan: Plan, report_activity: ReportActivity) -> Resul
     """Measure all rows; those of MuJoCo state the reason if it is not installed."""
     rows: list[dict[str, Any]] = []
     for name, make in LINKAGES.items():
-        linkage, own = make(), []
+        linkage, constrained = make(), []
         for method in METHODS[: 1 if plan.quick else None]:
             report_activity(f"held: {name} by {method}")
-            own += list(_rows(linkage, f"{OURS} {method}", our_motion(linkage, method), OUR_STEPS, plan))
+            constrained += list(_rows(linkage, f"{OURS} {method}", our_motion(linkage, method), OUR_STEPS, plan))
         angles = [] if linkage.closed else list(_angles(linkage, plan))
         theirs = [row for label, move in _others(linkage) for row in _rows(linkage, label, move, STEPS, plan)]
-        curves = {"energy": _points(own), "angles": _points(angles)}
+        curves = {"energy": _points(constrained), "angles": _points(angles)}
         result = [row | _beside(row, curves) for row in theirs] or [{"by": "MuJoCo", "why_not": "pip install mujoco"}]
-        rows += [{"bodies": name} | row for row in (*own, *angles, *result)]
+        rows += [{"bodies": name} | row for row in (*constrained, *angles, *result)]
     return ResultTable(
         name="constrained-bodies",
         title="constrained bodies: errors of energy and rod lengths over ten seconds",

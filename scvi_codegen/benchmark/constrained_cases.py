@@ -47,9 +47,9 @@ class ConstrainedCase:
 def constrained_contenders(both: ConstrainedCase, *, quick: bool) -> list[Contender]:
     """Return contenders with constraints and, for few rods, in angles."""
     methods = [as_method(name, both.positions.system) for name in both.methods[: 1 if quick else None]]
-    held = [_converted_to_angles(each) for each in our_contenders(both.positions, methods=methods, quick=quick)]
+    constrained = [_converted_to_angles(each) for each in our_contenders(both.positions, methods=methods, quick=quick)]
     few = both.angles.dimension <= LARGEST_IN_ANGLES
-    return [*held, *(_named_angles(each) for each in our_contenders(both.angles, quick=quick) if few)]
+    return [*constrained, *(_named_angles(each) for each in our_contenders(both.angles, quick=quick) if few)]
 
 
 def _converted_to_angles(contender: Contender) -> Contender:

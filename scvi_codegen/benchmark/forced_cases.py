@@ -68,7 +68,7 @@ def driven_rods(q: Vector, v: Vector, of: Mapping[str, Any], functions: Any) -> 
     turns = [v[0], *(after - before for before, after in pairwise(v))]
     joints = [-of["c"] * turn for turn in turns]
     joints[0] = joints[0] + of["F"] * functions.cos(of["w"] * functions.time)
-    couples = [own - after for own, after in zip(joints, [*joints[1:], 0.0], strict=True)]
+    couples = [torque - after for torque, after in zip(joints, [*joints[1:], 0.0], strict=True)]
     return rod_accelerations(q, v, of, functions, couples)
 
 

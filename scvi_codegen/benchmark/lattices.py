@@ -81,20 +81,20 @@ def run_lattices(plan: Plan, report_activity: ReportActivity) -> ResultTable:
 
 def _row(each: Lattice, error: float, curves: Mapping[str, list[Point]], doubt: float) -> dict[str, Any]:
     times = {name: time_at(points, error) for name, points in curves.items()}
-    own = {name: seconds for name in METHODS if (seconds := times.get(name)) is not None}
+    ours = {name: seconds for name in METHODS if (seconds := times.get(name)) is not None}
     result: dict[str, Any] = {"problem": each.name, "coordinates": each.q.size, "error": error, "doubt": doubt}
-    if not own:
+    if not ours:
         return result
-    best = min(own, key=own.__getitem__)
-    ratios = {name: seconds / own[best] for name, seconds in times.items() if name not in METHODS and seconds}
-    return result | {"ours_ms": 1e3 * own[best], "by": best} | ratios
+    best = min(ours, key=ours.__getitem__)
+    ratios = {name: seconds / ours[best] for name, seconds in times.items() if name not in METHODS and seconds}
+    return result | {"ours_ms": 1e3 * ours[best], "by": best} | ratios
 
 
 def reference_of(each: Lattice) -> tuple[Array, float]:
     """Return the final state by SVI(10), and its distance from a composition of order 10."""
-    own = _ours(each, "svi:10", _count(each, each.longest / 8))()
+    result = _ours(each, "svi:10", _count(each, each.longest / 8))()
     other = _ours(each, Composition(10), _count(each, each.longest / 32))()
-    return own, rms(other, own)
+    return result, rms(other, result)
 
 
 def _curves(

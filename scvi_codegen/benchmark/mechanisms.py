@@ -73,12 +73,15 @@ def _measured(name: str, links: int) -> dict[str, Any]:
 
 def _row(name: str, result: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the times of a contender, with errors relative to another contender's most accurate run."""
-    own, other = result[name], result["lambdify" if name == OURS else OURS]
-    if "why_not" in own or "why_not" in other:
-        return {"first_step_s": own.get("first_step"), "why_not": own.get("why_not") or "no reference to compare with"}
+    ours, other = result[name], result["lambdify" if name == OURS else OURS]
+    if "why_not" in ours or "why_not" in other:
+        return {
+            "first_step_s": ours.get("first_step"),
+            "why_not": ours.get("why_not") or "no reference to compare with",
+        }
     exact = np.array(other["runs"][-1]["q"])
-    errors = [float(np.abs(np.array(run["q"]) - exact).max()) for run in own["runs"]]
-    points = [Point(seconds=run["seconds"], error=error) for run, error in zip(own["runs"], errors, strict=True)]
+    errors = [float(np.abs(np.array(run["q"]) - exact).max()) for run in ours["runs"]]
+    points = [Point(seconds=run["seconds"], error=error) for run, error in zip(ours["runs"], errors, strict=True)]
     seconds = time_at(points, ERROR)
     spent = {} if seconds is None else {"second_ms": 1e3 * seconds}
-    return {"first_step_s": own["first_step"], "least_error": min(errors)} | spent
+    return {"first_step_s": ours["first_step"], "least_error": min(errors)} | spent

@@ -94,11 +94,11 @@ def reference(case: Case, momenta: Array | None = None) -> Reference:
 def remembered(case: Case, velocity: Extended, compute: Callable[[Case, Extended], Reference]) -> Reference:
     """Return a result for a case and (k, m) velocities, from the user's cache folder if it is there."""
     path = building.cache_folder() / "references" / f"{_key(case, velocity, compute.__qualname__)}.npz"
-    found = _read(path)
-    if found is None:
-        found = compute(case, velocity)
-        _write(path, found)
-    return found
+    states = _read(path)
+    if states is None:
+        states = compute(case, velocity)
+        _write(path, states)
+    return states
 
 
 def _key(case: Case, velocity: Extended, kind: str) -> str:

@@ -46,7 +46,7 @@ class CaseResult:
     @classmethod
     def from_data(cls, data: Mapping[str, Any]) -> CaseResult:
         """Return the result that :meth:`data` describes; null becomes NaN."""
-        found: list[dict[str, Any]] = [
+        measurements: list[dict[str, Any]] = [
             {key: math.nan if value is None else value for key, value in each.items()} for each in data["measurements"]
         ]
         return cls(
@@ -54,7 +54,7 @@ class CaseResult:
             span=data["span"],
             dimension=data["dimension"],
             accuracy=data["reference_accuracy"],
-            measurements=tuple(Measurement(**entries) for entries in found),
+            measurements=tuple(Measurement(**entries) for entries in measurements),
             skipped=data["skipped"],
         )
 
@@ -66,7 +66,7 @@ class CaseResult:
             "dimension": self.dimension,
             "reference_accuracy": self.accuracy,
             "skipped": dict(self.skipped),
-            "measurements": [finite(asdict(found)) for found in self.measurements],
+            "measurements": [finite(asdict(each)) for each in self.measurements],
             "rows": [_row_data(row) for row in rows(self)],
         }
 
@@ -102,17 +102,17 @@ def rows(result: CaseResult) -> list[ReportRow]:
 
 
 def _row(result: CaseResult, method: str) -> ReportRow | None:
-    good = [found for found in result.measurements if not found.failure]
-    own = [found for found in good if found.method == method]
-    if not own:
+    good = [each for each in result.measurements if not each.failure]
+    ours = [each for each in good if each.method == method]
+    if not ours:
         return None
-    peers = [found for found in good if not found.method.startswith(OURS)]
-    best = [found for found in peers if found.method.startswith(BASELINE)]
-    default = [found for found in best if FAST not in found.method and found.setting == DEFAULT]
-    points = [found.point for found in own]
-    error = common_error(points, [found.point for found in best or own]) or math.inf
-    reaching = [found for found in own if max(found.error, FLOOR) <= error]
-    shown = min(reaching, key=lambda found: found.seconds) if reaching else min(own, key=lambda found: found.error)
+    peers = [each for each in good if not each.method.startswith(OURS)]
+    best = [each for each in peers if each.method.startswith(BASELINE)]
+    default = [each for each in best if FAST not in each.method and each.setting == DEFAULT]
+    points = [each.point for each in ours]
+    error = common_error(points, [each.point for each in best or ours]) or math.inf
+    reaching = [each for each in ours if max(each.error, FLOOR) <= error]
+    shown = min(reaching, key=lambda each: each.seconds) if reaching else min(ours, key=lambda each: each.error)
     return ReportRow(
         method=method,
         measurement=shown,
@@ -121,20 +121,20 @@ def _row(result: CaseResult, method: str) -> ReportRow | None:
         default=_ratio(_points(default), points),
         best=_ratio(_points(best), points),
         peer=_ratio(_points(peers), points),
-        best_by_minima=_ratio([found.fastest_point for found in best], [found.fastest_point for found in own]),
+        best_by_minima=_ratio([each.fastest_point for each in best], [each.fastest_point for each in ours]),
     )
 
 
-def _points(found: Sequence[Measurement]) -> list[Point]:
-    return [one.point for one in found]
+def _points(measurements: Sequence[Measurement]) -> list[Point]:
+    return [one.point for one in measurements]
 
 
 def _ratio(reference: Sequence[Point], points: Sequence[Point]) -> float | None:
     error = common_error(points, reference)
     if error is None:
         return None
-    theirs, own = time_at(reference, error), time_at(points, error)
-    return None if theirs is None or own is None else theirs / own
+    theirs, ours = time_at(reference, error), time_at(points, error)
+    return None if theirs is None or ours is None else theirs / ours
 
 
 HEADER = ["", "setting", "time", "error", "compile", "default", "best", "peer", "at error", "options"]
@@ -158,22 +158,22 @@ def _block(result: CaseResult) -> str:
     title = f"{result.name}, T = {result.span:g}, m = {result.dimension} (reference accurate to {result.accuracy:.0e})"
     good = {row.method: _cells(row) for row in rows(result)}
     text = lines_of([HEADER, *(good.get(method, [method, *_FAILED]) for method in result.methods())])
-    failures = [f"{found.method} {found.setting}: {found.failure}" for found in result.measurements if found.failure]
+    failures = [f"{each.method} {each.setting}: {each.failure}" for each in result.measurements if each.failure]
     notes = [f"skipped {name}: {why}" for name, why in result.skipped.items()]
     return "\n  ".join([title, *text, *failures, *notes])
 
 
 def _cells(row: ReportRow) -> list[str]:
-    found = row.measurement
+    measurement = row.measurement
     return [
         row.method,
-        found.setting,
-        f"{1e3 * found.seconds:.3g} ms",
-        f"{found.error:.1e}",
-        f"{found.compile_seconds:.2f} s",
+        measurement.setting,
+        f"{1e3 * measurement.seconds:.3g} ms",
+        f"{measurement.error:.1e}",
+        f"{measurement.compile_seconds:.2f} s",
         *("-" if ratio is None else f"{ratio:.2f}" for ratio in (row.default, row.best, row.peer)),
         f"{row.at_error:.1e}",
-        "" if row.method.startswith(OURS) else found.options,
+        "" if row.method.startswith(OURS) else measurement.options,
     ]
 
 

@@ -33,12 +33,12 @@ def frontier(points: Iterable[Point]) -> list[Point]:
     >>> [point.seconds for point in frontier(points)]
     [1, 2, 4]
     """
-    kept: list[Point] = []
+    points_on: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, point.error)):
-        last = kept[-1].error if kept else math.inf
+        last = points_on[-1].error if points_on else math.inf
         if last > FLOOR and point.error < last:
-            kept.append(point)
-    return kept
+            points_on.append(point)
+    return points_on
 
 
 def time_at(points: Iterable[Point], error: float) -> float | None:

@@ -89,14 +89,14 @@ def exposed(path: Path) -> str:
     if os.name != "posix":
         return ""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return ""
-    if found.st_uid not in (os.geteuid(), 0):
-        return f"it belongs to the user number {found.st_uid}, not to you ({os.geteuid()}) or root"
-    if found.st_mode & stat.S_IWOTH:
+    if status.st_uid not in (os.geteuid(), 0):
+        return f"it belongs to the user number {status.st_uid}, not to you ({os.geteuid()}) or root"
+    if status.st_mode & stat.S_IWOTH:
         return "every user of this machine may write to it"
-    return "every user of its group may write to it" if found.st_mode & stat.S_IWGRP else ""
+    return "every user of its group may write to it" if status.st_mode & stat.S_IWGRP else ""
 
 
 def size_limit() -> int:
@@ -105,12 +105,12 @@ def size_limit() -> int:
     Raises:
         BuildError: if ``$SCVI_CODEGEN_CACHE_SIZE`` is not a size.
     """
-    given = os.environ.get(SIZE_VARIABLE) or DEFAULT_SIZE
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", given.strip(), re.IGNORECASE)
+    setting = os.environ.get(SIZE_VARIABLE) or DEFAULT_SIZE
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?", setting.strip(), re.IGNORECASE)
     if match is None:
         raise BuildError(
-            f"the environment variable {SIZE_VARIABLE} is {given!r}: it must be a size, as in 500M or 2G, or 0 for no "
-            "limit"
+            f"the environment variable {SIZE_VARIABLE} is {setting!r}: it must be a size, as in 500M or 2G, or 0 for "
+            "no limit"
         )
     return int(float(match[1]) * UNITS[match[2].upper()])
 
@@ -191,9 +191,9 @@ def make_room(folder: Path, newest: Path) -> None:
 
 def _fit(folder: Path, newest: Path, limit: int) -> int:
     """Remove entries until all fit; return the bytes of the remaining ones."""
-    found = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
-    total = _size(newest) + sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+    entries = [(_last_use(path), _size(path), path) for path in _entries(folder) if path != newest]
+    total = _size(newest) + sum(size for _, size, _ in entries)
+    for _, size, path in sorted(entries):
         if total <= limit:
             break
         discard(path)

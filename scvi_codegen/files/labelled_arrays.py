@@ -71,10 +71,10 @@ class Labelled:
 
     def sizes(self) -> dict[str, int]:
         """Return the length of each dimension."""
-        found = {"t": self.count}
+        sizes = {"t": self.count}
         for name, array in self.whole.items():
-            found |= dict(zip(self.dimensions[name], array.shape, strict=True))
-        return found
+            sizes |= dict(zip(self.dimensions[name], array.shape, strict=True))
+        return sizes
 
     def about(self, name: str) -> dict[str, str]:
         """Return the attributes of an array."""
@@ -102,13 +102,13 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
     Raises:
         StateError: for an unknown name, or a value that is not text.
     """
-    found = dict(units or {})
-    for name, unit in found.items():
+    result = dict(units or {})
+    for name, unit in result.items():
         if name not in MEASURED or not isinstance(unit, str):
             raise StateError(f"units must be texts for {', '.join(MEASURED)}, not {unit!r} for {name!r}")
-    if "q" in found and "t" in found:
-        found.setdefault("velocity", f"{found['q']} {found['t']}-1")
-    return found
+    if "q" in result and "t" in result:
+        result.setdefault("velocity", f"{result['q']} {result['t']}-1")
+    return result
 
 
 def to_dataset(labelled: Labelled) -> xarray.Dataset:
@@ -154,8 +154,8 @@ def write_zarr(labelled: Labelled, path: Path) -> None:
         kind = _kind(name) if whole is None else whole.dtype
         row = int(np.prod(shape[1:])) * kind.itemsize
         rows = max(1, min(labelled.count, CHUNK_BYTES // max(row, 1))) if whole is None else shape[0]
-        given = {"chunks": (max(1, rows), *shape[1:]), "fill_value": None}
-        made = group.create_array(name, shape=shape, dtype=kind, **given)
+        options = {"chunks": (max(1, rows), *shape[1:]), "fill_value": None}
+        made = group.create_array(name, shape=shape, dtype=kind, **options)
         made.attrs.update({"_ARRAY_DIMENSIONS": list(dimensions), **labelled.about(name)})
         if whole is not None:
             made[...] = whole

@@ -20,12 +20,12 @@ def loaded(file: Any | IO[bytes]) -> Iterator[Any]:
         ValueError: for any failure on a damaged file: of zipfile, zlib, the header parser, or memory.
     """
     try:
-        found = np.load(file, allow_pickle=False)
+        content = np.load(file, allow_pickle=False)
         try:
-            yield found
+            yield content
         finally:
-            if hasattr(found, "close"):
-                found.close()
+            if hasattr(content, "close"):
+                content.close()
     except (OSError, ValueError):
         raise
     except Exception as error:

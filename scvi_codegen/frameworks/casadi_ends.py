@@ -46,10 +46,10 @@ class EndConditions:
             MethodError: if it contains an input, at whose jumps it would be discontinuous.
         """
         forms, system = forms_of(self.system), self.system
-        bound = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
-        if any(each.free_symbols - {*self.symbols} for each in bound):
+        conditions = forms.constitutive or tuple(map(sympy.Add, system.momentum_symbols, (-p for p in forms.momentum)))
+        if any(each.free_symbols - {*self.symbols} for each in conditions):
             raise MethodError("momenta depend on an input and would jump with it: use inputs only in forces")
-        return self._function(bound)
+        return self._function(conditions)
 
     @cached_property
     def constraint_residual(self) -> Any:
@@ -81,7 +81,7 @@ class EndConditions:
         """Residual of :attr:`legendre`, and its derivatives with respect to v and p."""
         arguments = self.legendre.sx_in()
         residual = self.legendre(*arguments)
-        results = [residual, *(self.ca.jacobian(residual, arguments[place]) for place in (1, 2))]
+        results = [residual, *(self.ca.jacobian(residual, arguments[k]) for k in (1, 2))]
         return self.ca.Function("partials", arguments, results, self.legendre.name_in(), ["residual", "by_v", "by_p"])
 
     def _function(self, expressions: Sequence[Expr]) -> Any:

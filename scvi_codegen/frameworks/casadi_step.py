@@ -75,8 +75,8 @@ def casadi_step(
     written = _StageExpressions(ca, system, stages, degree)
     *rows, p1 = written.rows()
     values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))
-    found = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
-    step = ca.Function("step", written.given, found, [*ARGUMENTS], [*RESULTS])
+    results = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
+    step = ca.Function("step", written.given, results, [*ARGUMENTS], [*RESULTS])
     return _solved(ca, EndConditions(ca, system), stages, step) if solved else step
 
 
@@ -95,13 +95,13 @@ def _solved(ca: Any, ends: EndConditions, stages: StageSystem, step: Any) -> Any
     symbols = dict(zip(ARGUMENTS, step.sx_in(), strict=True))
     unknowns = symbols.pop("stages")
     equations = {"x": unknowns, "p": ca.veccat(*symbols.values()), "g": step(**symbols, stages=unknowns)["residual"]}
-    given = {name: ca.MX.sym(name, *each.shape) for name, each in symbols.items()}
-    q, p, t, h, parameters = (given[name] for name in ("q", "p", "t", "h", "parameters"))
+    symbols_of = {name: ca.MX.sym(name, *each.shape) for name, each in symbols.items()}
+    q, p, t, h, parameters = (symbols_of[name] for name in ("q", "p", "t", "h", "parameters"))
     guess = ca.veccat(*straight(stages, q, ends.velocity(q, p, t, parameters), p, h))
-    found = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*given.values()))
-    results = step(**given, stages=found)
+    solution = ca.rootfinder("stages", "newton", equations)(guess, ca.veccat(*symbols_of.values()))
+    results = step(**symbols_of, stages=solution)
     names = [name for name in RESULTS if name != "residual"]
-    return ca.Function("step", [*given.values()], [results[name] for name in names], [*given], names)
+    return ca.Function("step", [*symbols_of.values()], [results[name] for name in names], [*symbols_of], names)
 
 
 class _StageExpressions:
@@ -169,8 +169,8 @@ class _StageExpressions:
             values = numeric(self.ca, formulas, (*group.arguments, *around))
             for n, (c, weight) in enumerate(zip(group.abscissae, group.weights, strict=True)):
                 pushed = [parts[0] for parts in self._input_parts(float(c))]
-                own = (*self._arguments(group, n), self._time(c), *self.ca.vertsplit(self.parameters), *pushed)
-                columns.append(self.ca.vertcat(*values(*own)))
+                arguments = (*self._arguments(group, n), self._time(c), *self.ca.vertsplit(self.parameters), *pushed)
+                columns.append(self.ca.vertcat(*values(*arguments)))
                 weights.append(float(weight))
         return self.ca.horzcat(*columns), self.ca.SX(weights)
 
@@ -188,8 +188,8 @@ class _StageExpressions:
     def _gathered(self, table: Table, n: int, *, power: int, scale: float) -> Any:
         """Return the product of a row of a table with q and the stages."""
         terms = [
-            scale * float(entry) * self.h ** (power + own) * values
-            for entry, (own, values) in zip(table.entries[n], self.columns, strict=True)
+            scale * float(entry) * self.h ** (power + shift) * values
+            for entry, (shift, values) in zip(table.entries[n], self.columns, strict=True)
             if entry
         ]
         return sum(terms[1:], terms[0])
@@ -207,11 +207,11 @@ class _StageExpressions:
 
     def _input_parts(self, c: float) -> list[list[Any]]:
         """Return the coefficients of each input in powers of the time since the point c."""
-        degree, differences, found = self.inputs.shape[1] - 1, self.inputs, []
+        degree, differences, columns = self.inputs.shape[1] - 1, self.inputs, []
         for power in range(HIGHEST + 1):
             left, values = degree - power, self.ca.SX.zeros(self.inputs.shape[0], 1)
             for j in range(left + 1):
                 values += comb(degree, power) * comb(left, j) * c**j * (1 - c) ** (left - j) * differences[:, j]
-            found.append(self.ca.vertsplit(values * self.h**-power))
+            columns.append(self.ca.vertsplit(values * self.h**-power))
             differences = differences[:, 1:] - differences[:, :-1] if left > 0 else differences
-        return [list(parts) for parts in zip(*found, strict=True)]
+        return [list(parts) for parts in zip(*columns, strict=True)]

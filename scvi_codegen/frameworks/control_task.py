@@ -58,17 +58,17 @@ class Task:
 
     def program(self) -> NonlinearProgram:
         """Return the nonlinear program; the step equations come first, as their multipliers are the costates."""
-        ca, m, n, own = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
+        ca, m, n, count = self.ca, self.system.dimension, self.steps, len(self.system.inputs)
         step = casadi_step(self.system, self.method, degree=self.degree, along=[self.cost, *self.between])
         self._check_degree(step.size2_out("along"))
         states, stages = ca.MX.sym("states", 2 * m, n + 1), ca.MX.sym("stages", step.size1_in("stages"), n)
-        inputs, ends = ca.MX.sym("inputs", own, n * (self.degree + 1)), ca.MX.sym("velocities", m, 2)
+        inputs, ends = ca.MX.sym("inputs", count, n * (self.degree + 1)), ca.MX.sym("velocities", m, 2)
         duration = ca.MX.sym("duration")
         q, p, parameters = states[:m, :], states[m:, :], self.parameters
         times = self.t + ca.DM(range(n)).T * duration / n
         repeated = ca.repmat(ca.vertcat(parameters, duration / n), 1, n)
-        given = (q[:, :-1], p[:, :-1], stages, inputs, repeated[:-1, :], times, repeated[-1, :])
-        q1, p1, residual, along, integrals = step.map(n)(*given)
+        arguments = (q[:, :-1], p[:, :-1], stages, inputs, repeated[:-1, :], times, repeated[-1, :])
+        q1, p1, residual, along, integrals = step.map(n)(*arguments)
         first = (q[:, 0], ends[:, 0], p[:, 0], self.t, parameters)
         last = (q[:, -1], ends[:, 1], p[:, -1], self.t + duration, parameters)
         return NonlinearProgram(
@@ -180,16 +180,16 @@ def interval(name: str, value: Any) -> tuple[float, float]:
     return least, largest
 
 
-def check_known(given: Mapping[str, Any], known: Sequence[str], what: str) -> None:
+def check_known(values: Mapping[str, Any], known: Sequence[str], what: str) -> None:
     """Raise :class:`StateError` for a name that is not known."""
-    for name in given:
+    for name in values:
         if name not in known:
             raise StateError(f"there is no {what} '{name}'{closest(name, known)} There are: {', '.join(known)}")
 
 
 def _resampled(name: str, values: Any, at: Array) -> Array:
     """Return values at equidistant points of [0, 1], or one number, interpolated linearly at ``at``."""
-    own = np.atleast_1d(real_array(values, f"the guess of {name}"))
-    if own.ndim != 1 or not np.isfinite(own).all():
+    array = np.atleast_1d(real_array(values, f"the guess of {name}"))
+    if array.ndim != 1 or not np.isfinite(array).all():
         raise StateError(f"the guess of {name} must be a finite number, or a list of them from start to end")
-    return np.interp(at, np.linspace(0.0, 1.0, len(own)), own) if len(own) > 1 else np.full(len(at), own[0])
+    return np.interp(at, np.linspace(0.0, 1.0, len(array)), array) if len(array) > 1 else np.full(len(at), array[0])

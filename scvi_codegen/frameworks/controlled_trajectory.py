@@ -52,13 +52,16 @@ class ControlledMotion:
         """Inputs as functions of time, in the form that :meth:`Stepper.integrate` takes."""
         from scipy.interpolate import BPoly, PPoly  # here: slow to import
 
-        return {name: PPoly.from_bernstein_basis(BPoly(own.T, self.t)) for name, own in self.coefficients.items()}
+        return {
+            name: PPoly.from_bernstein_basis(BPoly(coefficients.T, self.t))
+            for name, coefficients in self.coefficients.items()
+        }
 
     @property
     def guess(self) -> dict[str, Any]:
         """Positions, mean inputs of the steps and duration: an initial guess for a further problem."""
         result: dict[str, Any] = dict(zip(self.coordinates, self.q.T, strict=True))
-        result |= {name: own.mean(axis=1) for name, own in self.coefficients.items()}
+        result |= {name: coefficients.mean(axis=1) for name, coefficients in self.coefficients.items()}
         return {**result, "duration": float(self.t[-1] - self.t[0])}
 
     def __repr__(self) -> str:

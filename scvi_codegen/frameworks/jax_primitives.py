@@ -67,15 +67,15 @@ def _linear_batched(primitive: Callable[[], Primitive]) -> Callable[..., tuple[A
         count = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
         axis_index = arguments[0].ndim - 1 if axes[0] is None else 0
         x = arguments[0] if axes[0] is None else jnp.moveaxis(arguments[0], axes[0], 0)
-        given = [
+        aligned = [
             _repeated(each, count, axis_index) if axis is None else jnp.moveaxis(each, axis, axis_index)
             for each, axis in zip(arguments[1:], axes[1:], strict=True)
         ]
         if axes[0] is not None:
-            return primitive().bind(x, *given, **static), 0
-        stacked = [each.reshape(*each.shape[:axis_index], -1, *each.shape[axis_index + 2 :]) for each in given]
-        found = primitive().bind(x, *stacked, **static)
-        return found.reshape(*given[0].shape[: axis_index + 2], *found.shape[axis_index + 1 :]), axis_index
+            return primitive().bind(x, *aligned, **static), 0
+        stacked = [each.reshape(*each.shape[:axis_index], -1, *each.shape[axis_index + 2 :]) for each in aligned]
+        result = primitive().bind(x, *stacked, **static)
+        return result.reshape(*aligned[0].shape[: axis_index + 2], *result.shape[axis_index + 1 :]), axis_index
 
     return batched
 
@@ -94,11 +94,11 @@ VJP_DERIVATIVE: Primitive = _primitive("vjp_derivative", lambda x, w, v, *_: v, 
 
 
 def _states_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
-    found = STATES.bind(*primals, **static)
+    states = STATES.bind(*primals, **static)
     if type(tangents[0]) is ad.Zero:
-        return found, ad.Zero.from_primal_value(found)
+        return states, ad.Zero.from_primal_value(states)
     pushed = JVP.bind(primals[0], jnp.expand_dims(tangents[0], -2), **static)
-    return found, jnp.squeeze(pushed, -3)
+    return states, jnp.squeeze(pushed, -3)
 
 
 def _jvp_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
@@ -125,12 +125,12 @@ def _vjp_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> 
 def _vjp_derivative_jvp(primals: Sequence[Any], tangents: Sequence[Any], **static: Any) -> tuple[Any, Any]:
     if type(tangents[0]) is not ad.Zero:
         raise MethodError("a flow has no third derivatives")
-    (x, cotangents, moved), (_, of_cotangents, of_moved), found = primals, tangents, []
+    (x, cotangents, moved), (_, of_cotangents, of_moved), parts = primals, tangents, []
     if type(of_cotangents) is not ad.Zero:
-        found.append(VJP_DERIVATIVE.bind(x, of_cotangents, moved, **static))
+        parts.append(VJP_DERIVATIVE.bind(x, of_cotangents, moved, **static))
     if type(of_moved) is not ad.Zero:
-        found.append(VJP_DERIVATIVE.bind(x, cotangents, of_moved, **static))
-    return VJP_DERIVATIVE.bind(*primals, **static), sum(found[1:], found[0])
+        parts.append(VJP_DERIVATIVE.bind(x, cotangents, of_moved, **static))
+    return VJP_DERIVATIVE.bind(*primals, **static), sum(parts[1:], parts[0])
 
 
 def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
@@ -142,13 +142,15 @@ def _transposed(other: Primitive) -> Callable[..., tuple[None, Any]]:
     return transpose
 
 
-def _vjp_derivative_transposed(cotangents: Any, x: Any, own: Any, moved: Any, **static: Any) -> tuple[Any, ...]:
+def _vjp_derivative_transposed(
+    cotangents: Any, x: Any, primal_cotangents: Any, moved: Any, **static: Any
+) -> tuple[Any, ...]:
     """Return the transpose with respect to tangents: itself, as second derivatives are symmetric."""
-    if ad.is_undefined_primal(own):
+    if ad.is_undefined_primal(primal_cotangents):
         raise MethodError("a flow has no forward-over-forward second derivatives: use jacfwd or jacrev of jacrev")
     if type(cotangents) is ad.Zero:
         return None, None, ad.Zero(moved.aval)
-    return None, None, VJP_DERIVATIVE.bind(x, own, cotangents, **static)
+    return None, None, VJP_DERIVATIVE.bind(x, primal_cotangents, cotangents, **static)
 
 
 ad.primitive_jvps[STATES] = _states_jvp

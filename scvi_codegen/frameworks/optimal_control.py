@@ -123,15 +123,15 @@ def _check_controllable(system: MechanicalSystem) -> None:
         raise MethodError(f"'{system.name}' has no inputs: define it with inputs=[..] that its forces contain")
 
 
-def _checked_duration(given: float | tuple[float, float]) -> tuple[float, float]:
+def _checked_duration(duration: float | tuple[float, float]) -> tuple[float, float]:
     """Return the least and the largest duration."""
-    shortest, longest = interval("duration", given)
+    shortest, longest = interval("duration", duration)
     if not 0 < shortest <= longest < np.inf:
-        raise StateError(f"duration must be a positive number, or two numbers (least, largest), not {given}")
+        raise StateError(f"duration must be a positive number, or two numbers (least, largest), not {duration}")
     return shortest, longest
 
 
-def _parameter_values(system: MechanicalSystem, given: Mapping[str, float]) -> Array:
+def _parameter_values(system: MechanicalSystem, chosen: Mapping[str, float]) -> Array:
     values = {name.name: value for name, value in own_parameters(system).items()}
-    check_known(given, tuple(values), "parameter")
-    return np.array([checked_number(value, name) for name, value in {**values, **given}.items()])
+    check_known(chosen, tuple(values), "parameter")
+    return np.array([checked_number(value, name) for name, value in {**values, **chosen}.items()])

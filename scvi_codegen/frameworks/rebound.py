@@ -98,9 +98,9 @@ def to_rebound(system: LagrangianSystem, q: ArrayLike, *, velocity: ArrayLike, t
     states = [_padded(value, name, len(masses), axes) for name, value in (("q", q), ("velocity", velocity))]
     simulation = rebound.Simulation()
     simulation.G, simulation.t = G, checked_number(t, "t")
-    for mass, place, motion in zip(masses, *states, strict=True):
+    for mass, position, motion in zip(masses, *states, strict=True):
         simulation.add(
-            m=mass, **dict(zip(AXES, place, strict=True)), **dict(zip(("vx", "vy", "vz"), motion, strict=True))
+            m=mass, **dict(zip(AXES, position, strict=True)), **dict(zip(("vx", "vy", "vz"), motion, strict=True))
         )
     return simulation
 

@@ -59,10 +59,10 @@ class Binding:
     def function(self, name: str, memory: Any = None) -> Callable[..., Any]:
         """Return ``<prefix>_<name>``, bound to this memory if one is given; it releases the GIL while it runs."""
         function: Callable[..., Any] = getattr(self._lib, f"{self._prefix}_{name}")
-        own = () if memory is None else (memory,)
+        leading = () if memory is None else (memory,)
         if self._fallback_missing and name not in WITHOUT_STEPS:
-            return self._with_fallback(function, *own)
-        return partial(function, *own) if own else function
+            return self._with_fallback(function, *leading)
+        return partial(function, *leading) if leading else function
 
     def with_function(self, name: str) -> Self:
         """Return this binding, or that of the fallback if only it has the function; MethodError if neither has it."""
@@ -95,18 +95,18 @@ class Binding:
         """Return whether the library has the function ``<prefix>_<name>``."""
         return hasattr(self._lib, f"{self._prefix}_{name}")
 
-    def _with_fallback(self, function: Callable[..., Any], *own: Any) -> Callable[..., Any]:
+    def _with_fallback(self, function: Callable[..., Any], *leading: Any) -> Callable[..., Any]:
         """Return the function; a call that requests the fallback is repeated with it, on the initial memory."""
-        memory = self._ffi.buffer(*own) if own else bytearray()
+        memory = self._ffi.buffer(*leading) if leading else bytearray()
 
         def call(*arguments: Any) -> Any:
             before = bytes(memory)
-            status = function(*own, *arguments)
+            status = function(*leading, *arguments)
             if status != FALLBACK_REQUIRED:
                 return status
             self.set_fallback()
             memory[:] = before
-            return function(*own, *arguments)
+            return function(*leading, *arguments)
 
         return call
 
@@ -135,8 +135,8 @@ class Binding:
             "offsets": [field.offset for _, field in item.fields],
             "itemsize": self._ffi.sizeof(item),
         }
-        found: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)
-        return found
+        records: NDArray[np.void] = np.frombuffer(self._ffi.buffer(structs), dtype=layout)
+        return records
 
     def pointer(self, array: NDArray[Any]) -> Any:
         """Return a pointer to the first element of a contiguous float64 or int32 array; NULL for an empty one."""

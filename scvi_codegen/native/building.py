@@ -176,10 +176,10 @@ def _is_intact(entry: Path) -> bool:
     """Return whether library and binding exist, match the recorded checksum, and are not writable by others."""
     try:
         recorded = json.loads((entry / "manifest.json").read_text())
-        found = _checksum(entry)
+        checksum = _checksum(entry)
     except (OSError, ValueError):
         return False
-    matches = isinstance(recorded, dict) and recorded.get("sha256") == found
+    matches = isinstance(recorded, dict) and recorded.get("sha256") == checksum
     return matches and not any(exposed(path) for path in (entry, _library(entry), _binding(entry)))
 
 
@@ -216,8 +216,8 @@ def _publish(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...], 
 
 
 def _work(source: Source, compiler: tuple[str, ...], flags: tuple[str, ...]) -> str:
-    level = [flag for flag in flags if flag.startswith("-O")]
-    command = " ".join([Path(compiler[0]).name, *compiler[1:], *level])
+    optimisation = [flag for flag in flags if flag.startswith("-O")]
+    command = " ".join([Path(compiler[0]).name, *compiler[1:], *optimisation])
     first = ", whose first use takes longest" if from_wheel(compiler) else ""
     return f"compiling {source.code.count(chr(10)):,} lines of C with {command}{first}"
 
@@ -257,12 +257,12 @@ def _declarations(source: Source, command: list[str], folder: Path) -> str:
     text = "".join(each.declarations for each in source.sources)
     if not DIRECTIVE.search(text):
         return text
-    declarations_file, found = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
+    declarations_file, preprocessed = folder / DECLARATIONS, folder / f"{DECLARATIONS}.i"
     declarations_file.write_text(text, encoding="utf-8")
-    run_compiler([*command, "-E", "-P", declarations_file.name, "-o", found.name], folder)
-    text = found.read_text(encoding="utf-8")
+    run_compiler([*command, "-E", "-P", declarations_file.name, "-o", preprocessed.name], folder)
+    text = preprocessed.read_text(encoding="utf-8")
     declarations_file.unlink()
-    found.unlink()
+    preprocessed.unlink()
     return text
 
 

@@ -105,10 +105,10 @@ def verify(
         MethodError: if the method does not apply to the system, or has no such solver.
         StateError: if only one of q and p is passed, or no state is found.
     """
-    own: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
+    more: dict[str, Any] = {"velocity": velocity, "parameters": parameters, "tables": tables}
     if isinstance(system, ArraySystem):
-        return _of_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **own)
-    for name, value in own.items():
+        return _of_arrays(system, method, q, p, h=h, t=t, stepper=stepper, tolerance=tolerance, flags=flags, **more)
+    for name, value in more.items():
         if value is not None:
             raise StateError(
                 f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
@@ -119,11 +119,11 @@ def verify(
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)
     flags = tuple(flags if stepper is None else stepper.flags)
     stepper = stepper or compile_stepper(system, method, solver=solver, flags=flags)
-    given = _given(system, stepper, q, p, h, t)
-    steps, single = stepper, at_fixed_energy(system, stepper.energy(given.q, given.p, given.t))
+    start = _given(system, stepper, q, p, h, t)
+    steps, single = stepper, at_fixed_energy(system, stepper.energy(start.q, start.p, start.t))
     if single is not system or stepper.interface.time_transformation:
         steps = compile_stepper(single, method, solver=solver, flags=flags)
-    tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), given)
+    tested = SystemUnderTest(single, method, steps, _newton(single, method, steps, solver, flags), start)
     paced = steps is not stepper or tolerance is not None
     runs_tested = VariableSteps(tested, stepper, _in_transformed_time(system), system, tolerance)
     checks = (
@@ -144,10 +144,10 @@ def verify(
         system=single.name,
         method=method.name,
         flags=stepper.flags,
-        q=given.q,
-        p=given.p,
-        t=given.t,
-        h=given.h,
+        q=start.q,
+        p=start.p,
+        t=start.t,
+        h=start.h,
         parameters={name.name: value for name, value in single.constants.items()},
         checks=checks,
         seconds=time.perf_counter() - began,

@@ -67,12 +67,12 @@ def convergence_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 def _known_properties(method: Method) -> Finding | None:
     """Compare the properties that the method computes from its coefficients with the known ones."""
-    expected, own = _expected(method), (method.order, method.symplectic, method.symmetric)
+    expected, actual = _expected(method), (method.order, method.symplectic, method.symmetric)
     if expected is None:
         return None
-    if own != expected:
-        raise ViolationError(f"(order, symplectic, symmetric) is {own}, in the literature {expected}")
-    return Finding(0.0, 0.0, f"order {own[0]}")
+    if actual != expected:
+        raise ViolationError(f"(order, symplectic, symmetric) is {actual}, in the literature {expected}")
+    return Finding(0.0, 0.0, f"order {actual[0]}")
 
 
 def _expected(method: Method) -> tuple[int | None, bool, bool] | None:

@@ -78,9 +78,9 @@ def identity_checks(tested: SystemUnderTest) -> Iterator[Check]:
 
 
 def _compared(tested: SystemUnderTest, system: MechanicalSystem, method: Method, bound: float) -> Finding:
-    state, own = tested.states[0], tested.solved(0)
+    state, solution = tested.states[0], tested.solved(0)
     other = tested.derived(method, system)(state.q, state.p, state.h, state.t)
-    difference = np.abs(np.array([*own.q, *own.p]) - np.array([*other.q, *other.p])) / tested.scales(state)
+    difference = np.abs(np.array([*solution.q, *solution.p]) - np.array([*other.q, *other.p])) / tested.scales(state)
     return Finding(float(max(difference)), bound, method.name)
 
 

@@ -104,12 +104,12 @@ def _advanced(
 def _sums(tested: SystemUnderTest) -> Finding:
     first = tested.states[0]
     m, worst = len(first.q), 0.0
-    kept = slice(None) if _compensated(tested) else slice(m)
+    selected = slice(None) if _compensated(tested) else slice(m)
     for stepper in _steppers(tested):
         short = State(first.q, first.p, first.t, first.h * SHORT)
         whole = State(first.q, first.p, first.t, short.h * SHORT_STEPS)
         ways = [_advanced(tested, stepper, *way) for way in ((short, SHORT_STEPS), (whole, 1))]
-        moved, expected = ((end - first.z + carry)[kept] for end, carry in ways)
+        moved, expected = ((end - first.z + carry)[selected] for end, carry in ways)
         for part in (slice(m), slice(m, None)):
             size = np.abs(expected[part]).max(initial=0.0)
             if size > 0.0:
@@ -213,7 +213,7 @@ def _invariants(tested: SystemUnderTest) -> list[_Invariant]:
         return values, np.abs(values)
 
     described = stepper.interface
-    exact = [k for k, kept in enumerate(described.map_exact) if kept]
+    exact = [k for k, conserved in enumerate(described.map_exact) if conserved]
     result = [_Invariant(described.map_names[k], partial(map_values, k)) for k in exact]
     return [*result, _Invariant("energy", energies)] if _keeps_energy(tested) else result
 
@@ -283,9 +283,9 @@ def _runs(
     ends = []
     arguments: dict[str, Any] = {"h": tested.initial.h, "t": tested.initial.t, "parameters": tested.parameters}
     for start in zip(q, p, strict=True):
-        own = tested.stepper.start(*start, **arguments, options=options)
-        own.advance(steps)
-        ends.append((own.q, own.p))
+        run = tested.stepper.start(*start, **arguments, options=options)
+        run.advance(steps)
+        ends.append((run.q, run.p))
     return np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
 
 

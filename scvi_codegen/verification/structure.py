@@ -68,8 +68,8 @@ def _symplecticity(tested: SystemUnderTest) -> Finding:
             defect, noise = _on_constraint_manifold(tested.tangents(state), around, shrunk)
         if noise.max() > TOO_ROUGH:
             raise StateError(f"finite differences have noise {noise.max():.1g}: use a smaller step size")
-        place = np.unravel_index(np.argmax(defect / noise), defect.shape)
-        result = Finding(float(defect[place]), float(noise[place]), "the bound is the noise of the differences")
+        index = np.unravel_index(np.argmax(defect / noise), defect.shape)
+        result = Finding(float(defect[index]), float(noise[index]), "the bound is the noise of the differences")
         worst = max(worst, result, key=lambda finding: finding.measured / finding.bound)
     return worst
 

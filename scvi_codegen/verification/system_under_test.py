@@ -81,8 +81,8 @@ class SystemUnderTest:
             else PARAMETER_PERTURBATION * np.cos(k + 1.0)
             for k, (name, value) in enumerate(self.system.constants.items())
         }
-        kept = {name: float(moved[name] if value else 0.0) for name, value in self._defaults.items()}
-        for values in (moved, kept):
+        at_zero = {name: float(moved[name] if value else 0.0) for name, value in self._defaults.items()}
+        for values in (moved, at_zero):
             if self._works(values):
                 return {name: float(value) for name, value in values.items()}
         return dict(self._defaults)
@@ -210,8 +210,8 @@ class SystemUnderTest:
             changes = [self.stepper.momentum(state.q, v + unit, state.t) - state.p for unit in moved]
         except StateError:
             return np.full(m, size)
-        own: Array = 10.0 * np.abs(np.diag(np.array(changes)))
-        return np.where(own > 0.0, own, size)
+        sizes: Array = 10.0 * np.abs(np.diag(np.array(changes)))
+        return np.where(sizes > 0.0, sizes, size)
 
     def linearised(self, state: State) -> Jacobian | None:
         """Return the Jacobian of the step at a state, by finite differences."""

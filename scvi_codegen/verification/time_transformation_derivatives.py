@@ -56,11 +56,11 @@ def _energy_derivative(runs_tested: VariableSteps) -> Finding:
     state, direction, m = _first(runs_tested), _direction(runs_tested), len(_first(runs_tested).q)
     values = np.array(list(runs_tested.at_energy(state).values()))
     terms = runs_tested.stepper._energy_gradient(state.q, state.p, values) * direction
-    motion, own = exact_motion(runs_tested.system), len(runs_tested.system.parameters)
+    motion, count = exact_motion(runs_tested.system), len(runs_tested.system.parameters)
     energies = []
     for sign in (1, -1):
         moved = _arguments(runs_tested) + direction * (sign * WIDTH)
-        at = motion.with_parameters(moved[2 * m : 2 * m + own].tolist())
+        at = motion.with_parameters(moved[2 * m : 2 * m + count].tolist())
         energies.append(at.energy(moved[:m], moved[m : 2 * m], mp.zero))
     exact = float((energies[0] - energies[1]) / (2 * WIDTH))
     return Finding(abs(float(terms.sum()) - exact) / float(np.abs(terms).max()), BOUND, "relative, along one direction")

@@ -64,13 +64,13 @@ class VariableSteps:
     @cached_property
     def parameters(self) -> dict[str, float]:
         """Parameters without the energy of the time transformation, which depends on the state."""
-        own = {parameter.name for parameter in self.system.parameters}
-        return {name: value for name, value in self.tested.parameters.items() if name in own}
+        names = {parameter.name for parameter in self.system.parameters}
+        return {name: value for name, value in self.tested.parameters.items() if name in names}
 
     def at_energy(self, state: State) -> dict[str, float]:
         """Return the parameters with the energy of a state."""
-        level = self.stepper.energy(state.q, state.p, state.t, self.parameters)
-        return {**self.parameters, self.stepper.interface.energy_parameter: level}
+        energy = self.stepper.energy(state.q, state.p, state.t, self.parameters)
+        return {**self.parameters, self.stepper.interface.energy_parameter: energy}
 
     @property
     def tau(self) -> float:

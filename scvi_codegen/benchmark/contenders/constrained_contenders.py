@@ -64,11 +64,11 @@ class Linkage:
 def hanging_chain(n: int) -> Linkage:
     """Return a chain of n rods."""
     angles = np.linspace(0.6, 0.3, n)
-    places = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]) / n, axis=0)
+    positions = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]) / n, axis=0)
     return Linkage(
         name="chain",
         masses=(1.0 / n,) * n,
-        start=tuple(map(tuple, places.tolist())),
+        start=tuple(map(tuple, positions.tolist())),
         rods=tuple((i - 1, i) for i in range(n)),
     )
 
@@ -132,10 +132,10 @@ def motion_in_angles(linkage: Linkage, method: str) -> Callable[[float, int], Co
     lengths, angles = [linkage.length(i, j) for i, j in linkage.rods], [f"a{k}" for k in range(n)]
     kinetic, height = [], []
     for mass, last in zip(linkage.masses, range(1, n + 1), strict=True):
-        own = list(zip(lengths[:last], angles[:last], strict=True))
-        speeds = [" + ".join(f"{length!r}*{turn}({a})*{a}_dot" for length, a in own) for turn in ("cos", "sin")]
+        pairs = list(zip(lengths[:last], angles[:last], strict=True))
+        speeds = [" + ".join(f"{length!r}*{turn}({a})*{a}_dot" for length, a in pairs) for turn in ("cos", "sin")]
         kinetic.append(f"{mass!r}/2*(({speeds[0]})**2 + ({speeds[1]})**2)")
-        height += [f"{mass * GRAVITY * length!r}*cos({a})" for length, a in own]
+        height += [f"{mass * GRAVITY * length!r}*cos({a})" for length, a in pairs]
     system = LagrangianSystem.from_text(
         name=f"{linkage.name} in angles", coordinates=angles, lagrangian=" + ".join([*kinetic, *height])
     )
@@ -163,11 +163,11 @@ def _by(
     return move
 
 
-def _length_error(linkage: Linkage, places: Array) -> float:
+def _length_error(linkage: Linkage, positions: Array) -> float:
     """Return the largest relative error of a rod length."""
     result = 0.0
     for i, j in linkage.rods:
-        ends = [np.array(linkage.anchors[-1 - k]) if k < 0 else places[k] for k in (i, j)]
+        ends = [np.array(linkage.anchors[-1 - k]) if k < 0 else positions[k] for k in (i, j)]
         length = linkage.length(i, j)
         result = max(result, abs(float(np.linalg.norm(ends[1] - ends[0])) - length) / length)
     return result
@@ -195,8 +195,8 @@ def mujoco_motion(linkage: Linkage, integrator: str, *, stiff: bool = False) -> 
                 seconds += time.process_time() - began
                 mujoco.mj_forward(model, data)
                 energies.append(float(data.energy.sum()))
-                places = data.site_xpos[:, [0, 2]]
-                length_error = max(length_error, _length_error(linkage, places[: len(linkage.masses)]))
+                positions = data.site_xpos[:, [0, 2]]
+                length_error = max(length_error, _length_error(linkage, positions[: len(linkage.masses)]))
         if warnings_seen:
             raise ArithmeticError(warnings_seen[0])
         return ContenderRun(seconds, float(np.ptp(energies)), length_error)
@@ -246,8 +246,8 @@ def _document(linkage: Linkage, integrator: str, h: float, *, stiff: bool) -> st
 
 def _body(name: str, before: Array, rod: Array, mass: float, site: str) -> str:
     """Return the opening of a body: a hinge at a position of its parent, with a mass at the end of a rod."""
-    place, end = (" ".join(map(repr, (float(x), 0.0, float(y)))) for x, y in (before, rod))
+    position, end = (" ".join(map(repr, (float(x), 0.0, float(y)))) for x, y in (before, rod))
     return (
-        f'<body name="{name}" pos="{place}"><joint type="hinge" axis="0 1 0"/>'
+        f'<body name="{name}" pos="{position}"><joint type="hinge" axis="0 1 0"/>'
         f'<inertial pos="{end}" mass="{mass!r}" diaginertia="1e-12 1e-12 1e-12"/><site name="{site}" pos="{end}"/>'
     )

@@ -48,12 +48,12 @@ class Column:
         """Return the entry at point n, with ``index`` instead of the column's own; constants do not depend on it."""
         if self.kind in ("constant", "single", "leading"):
             return self.factor
-        own = [] if self.index is None else [str(index)]
+        suffix = [] if self.index is None else [str(index)]
         point = ANY_POINT if self.points > 1 else "1"
         if self.prefix in CARDINAL:
-            return self.factor * sympy.Function("_".join([CARDINAL[self.prefix], *own]))(Symbol(f"tau_{point}"))
+            return self.factor * sympy.Function("_".join([CARDINAL[self.prefix], *suffix]))(Symbol(f"tau_{point}"))
         row = [] if self.points == 1 and self.prefix in LINES else [point]
-        indices = [*own, *row] if self.transposed else [*row, *own]
+        indices = [*suffix, *row] if self.transposed else [*row, *suffix]
         return self.factor * Symbol("_".join([self.prefix, *indices]))
 
 
@@ -62,14 +62,14 @@ def column_of(table: Table, number: int) -> Column:
     names = [line[number] for line in table.names]
     values = [line[number] for line in table.entries]
     points, transposed = len(values), _is_transposed(table)
-    found = {_parts(name, points, transposed=transposed) for name in names if name}
-    if len(found) == 1:
-        prefix, index, divisor = found.pop()
+    parsed = {_parts(name, points, transposed=transposed) for name in names if name}
+    if len(parsed) == 1:
+        prefix, index, divisor = parsed.pop()
         return Column("named", points, sympy.Rational(1, divisor), prefix, index, transposed and index is not None)
     indices = [point for point, value in enumerate(values) if value != 0]
     if not indices:
         return Column("zero", points)
-    if found or len({values[point] for point in indices}) > 1:
+    if parsed or len({values[point] for point in indices}) > 1:
         return Column("other", points, prefix="G", index=number)
     factor = sympy.Integer(int(values[indices[0]]))
     if len(indices) == points:

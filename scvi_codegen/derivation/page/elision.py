@@ -58,8 +58,8 @@ def lines(text: str) -> Code:
     all_formulas = text.splitlines()
     if len(all_formulas) <= MOST_LINES:
         return Code(text)
-    kept = "\n".join(all_formulas[:MOST_LINES])
-    return Code(f"{kept}\n/* .. {len(all_formulas) - MOST_LINES} more lines */")
+    shown = "\n".join(all_formulas[:MOST_LINES])
+    return Code(f"{shown}\n/* .. {len(all_formulas) - MOST_LINES} more lines */")
 
 
 def _counted(count: int, what: str) -> str:

@@ -28,10 +28,10 @@ def system_section(system: MechanicalSystem) -> Section:
         *formulas([Formula(system.formula, Symbol(letter))], "formula"),
     ]
     if system.forces:
-        acting = [Formula(f, Symbol(f"f_{q.name}")) for q, f in zip(system.coordinates, system.forces, strict=True)]
+        applied = [Formula(f, Symbol(f"f_{q.name}")) for q, f in zip(system.coordinates, system.forces, strict=True)]
         contents += [
             Paragraph("Generalised forces f; below, L_q means L_q + f:"),
-            *formulas(acting, "force"),
+            *formulas(applied, "force"),
         ]
     if system.damping != 0:
         contents += [

@@ -90,13 +90,13 @@ def entry_numbers(derived: StepEquations, start: Start) -> dict[tuple[int, int],
     values |= {derived.step: sympy.Float(start.h), derived.time: sympy.Float(start.t)}
     q, p = derived.state
     rates = [Symbol(f"{symbol.name.removesuffix('_k')}_dot_k") for symbol in q]
-    for symbols, given in ((q, start.q), (p, start.p), (rates, start.velocity)):
-        values |= dict(zip(symbols, map(sympy.Float, given), strict=True)) if given is not None else {}
+    for symbols, numbers in ((q, start.q), (p, start.p), (rates, start.velocity)):
+        values |= dict(zip(symbols, map(sympy.Float, numbers), strict=True)) if numbers is not None else {}
     named = {symbol.name: value for symbol, value in values.items()}
     for unknown, guess in derived.initial_guess.items():
         values[unknown] = guess.xreplace({s: named[s.name] for s in guess.free_symbols if s.name in named})
-    found = {index: entry.xreplace(values).evalf() for index, entry in derived.jacobian.todok().items()}
-    return {index: float(value) for index, value in found.items() if value.is_Float}
+    evaluated = {index: entry.xreplace(values).evalf() for index, entry in derived.jacobian.todok().items()}
+    return {index: float(value) for index, value in evaluated.items() if value.is_Float}
 
 
 def _titles(

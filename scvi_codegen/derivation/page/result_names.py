@@ -34,24 +34,24 @@ def point_index(group: StageGroup, point: object = "n") -> str:
     return PLACES.get(group.name, str(point if len(group.abscissae) > 1 else 1))
 
 
-def argument_symbol(system: MechanicalSystem, gather: Gather, place: str) -> Symbol:
+def argument_symbol(system: MechanicalSystem, gather: Gather, suffix: str) -> Symbol:
     """Return the symbol of the arguments of a gather at a point."""
     name = argument_name(system, gather)
-    return Symbol(f"{ARGUMENTS.get(name, name)}_{place}")
+    return Symbol(f"{ARGUMENTS.get(name, name)}_{suffix}")
 
 
-def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, place: str) -> Symbol:
+def result_symbol(system: MechanicalSystem, group: StageGroup, scatter: Scatter, suffix: str) -> Symbol:
     """Return the symbol of the results of a scatter at a point; for gradients, scatters are parallel to gathers."""
     if system.constraints and scatter.results == holonomic_expressions(system):
-        return Symbol(f"g_{place}")
+        return Symbol(f"g_{suffix}")
     if system.constraints and scatter.results in (nonholonomic_expressions(system), constraint_rates(system)):
-        return Symbol(f"g_dot_{place}")
+        return Symbol(f"g_dot_{suffix}")
     if group.scalar is None:
         forms = forms_of(system)
         known = {forms.force: "L_q", forms.momentum: "L_v", forms.euler_lagrange: "E", forms.constitutive: "L_p"}
-        return Symbol(f"{known[scatter.results]}_{place}")
+        return Symbol(f"{known[scatter.results]}_{suffix}")
     name = argument_name(system, group.gathers[group.scatters.index(scatter)])
-    return Symbol(f"E_{place}" if name == "lambda" else f"{scalar_name(group)}_{name}_{place}")
+    return Symbol(f"E_{suffix}" if name == "lambda" else f"{scalar_name(group)}_{name}_{suffix}")
 
 
 def scalar_name(group: StageGroup) -> str:

@@ -36,15 +36,15 @@ def jacobian_pattern(stages: StageSystem, dimension: int) -> Pattern:
     """Return the pattern of the residuals with respect to the unknowns, in the order of the equations, by blocks."""
     offsets = [0, *accumulate(stages.block_sizes(dimension))]
     lines = [0, *accumulate(stages.row_sizes(dimension))]
-    found: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
+    columns: list[set[int]] = [set() for _ in range(lines[len(stages.rows)])]
     for group in stages.stage_groups:
         for scatter in group.scatters:
             for gather in group.gathers:
                 pairs = jacobian(scatter.results, gather.arguments)
                 for r, b in _coupled_pairs(scatter.table.entries, gather.table.entries, len(stages.rows)):
                     for i, j in pairs:
-                        found[lines[r] + i].add(offsets[b] + j)
-    return Pattern(len(found), tuple(tuple(sorted(row)) for row in found))
+                        columns[lines[r] + i].add(offsets[b] + j)
+    return Pattern(len(columns), tuple(tuple(sorted(row)) for row in columns))
 
 
 def _coupled_pairs(
@@ -88,8 +88,8 @@ def pattern_drawing(pattern: Pattern, titles: Mapping[tuple[int, int], str] | No
 def _tooltips(titles: Mapping[tuple[int, int], str], cell: float) -> Iterator[str]:
     """Yield the tooltips of entries."""
     for (i, j), title in titles.items():
-        place = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
-        yield f'<rect class="entry" {place}><title>{escape(title)}</title></rect>'
+        geometry = f'x="{j * cell:.2f}" y="{i * cell:.2f}" width="{cell:.2f}" height="{cell:.2f}"'
+        yield f'<rect class="entry" {geometry}><title>{escape(title)}</title></rect>'
 
 
 def _runs(columns: tuple[int, ...]) -> list[tuple[int, int]]:

@@ -72,10 +72,10 @@ def stage_group_contents(system: MechanicalSystem, stages: StageSystem) -> Itera
     """Yield the arguments of each stage group, and the names of its results."""
     meanings: dict[str, None] = {}
     for group in stages.stage_groups:
-        given = list(gather_formulas(system, stages, group))
-        if given:
+        gathered = list(gather_formulas(system, stages, group))
+        if gathered:
             yield Paragraph(f"{_place(group)}:")
-            yield from given
+            yield from gathered
         meanings[meaning(group)] = None
     yield Paragraph(f"{'; '.join(meanings)}.")
 

@@ -127,9 +127,9 @@ class _Part:
 
     def product(self, index: object) -> sympy.Expr:
         """Return the entry times the result, without weight: at point n, or at the single point of the entry."""
-        place = point_index(self.group, index if self.column.kind == "single" else n)
+        point = point_index(self.group, index if self.column.kind == "single" else n)
         factor = sympy.Rational(str(self.scatter.scale)) * h**self.power
-        return factor * self.column.entry(index) * result_symbol(self.system, self.group, self.scatter, place)
+        return factor * self.column.entry(index) * result_symbol(self.system, self.group, self.scatter, point)
 
     def weight(self, index: object) -> sympy.Expr:
         """Return the weight of a point, 1 if weights have no names."""
@@ -165,9 +165,9 @@ class _Line:
         )
         indices = [part.index for part in parts if part.index is not None and part.column.points > 1]
         number = row.number if row else ""
-        if own := re.search(r"_(\d+)$", number):
-            indices.insert(0, int(own[1]))
-        kind = (number.removesuffix(own[0]) if own else number, row.kind if row else "end")
+        if suffix := re.search(r"_(\d+)$", number):
+            indices.insert(0, int(suffix[1]))
+        kind = (number.removesuffix(suffix[0]) if suffix else number, row.kind if row else "end")
         return cls(_momentum(stages, r), parts, kind, indices[0] if indices else None)
 
     @property
@@ -194,12 +194,12 @@ class _Line:
     def _shift(self, index: int | None) -> int | None:
         return None if index is None or self.base is None else index - self.base
 
-    def summed(self, own: object) -> sympy.Expr:
-        """Return the right side, with ``own`` instead of the line's own index."""
+    def summed(self, value: object) -> sympy.Expr:
+        """Return the right side, with ``value`` instead of the line's own index."""
 
         def placed(index: int | None) -> object:
             shift = self._shift(index)
-            return index if shift is None or own == self.base else own if shift == 0 else f"{own}{shift:+d}"
+            return index if shift is None or value == self.base else value if shift == 0 else f"{value}{shift:+d}"
 
         momentum = self.momentum
         factor = momentum.entry(placed(momentum.index)) if isinstance(momentum, Column) else momentum

@@ -53,20 +53,20 @@ def _order_bound(points: int, gauss: int) -> int:
 
 
 def _correction(_: Mapping[str, Result]) -> Result:
-    found = {row: _both(*row) for row in ROWS}
+    results = {row: _both(*row) for row in ROWS}
     return Result(
         name="correction",
         title="Why (34d) needs the chain-rule term",
         setting=SETTING,
         checks=(
             _check_derivation(),
-            *(_check_structure(found, variational) for variational in (False, True)),
-            *(_check_theorem(found, variational) for variational in (False, True)),
-            _check_orders(found),
-            _check_two_points(found[ROWS[0]][0]),
+            *(_check_structure(results, variational) for variational in (False, True)),
+            *(_check_theorem(results, variational) for variational in (False, True)),
+            _check_orders(results),
+            _check_two_points(results[ROWS[0]][0]),
         ),
-        tables=(_table(found),),
-        picture=Picture(draw=partial(_draw, found=found), width=12.0, height=4.2),
+        tables=(_table(results),),
+        picture=Picture(draw=partial(_draw, results=results), width=12.0, height=4.2),
         body=body(),
     )
 
@@ -86,8 +86,8 @@ def _check_derivation() -> Comparison:
     )
 
 
-def _check_structure(found: Found, variational: bool) -> Comparison:
-    several = {row: pair[variational] for row, pair in found.items() if row[0] > 2}
+def _check_structure(results: Found, variational: bool) -> Comparison:
+    several = {row: pair[variational] for row, pair in results.items() if row[0] > 2}
     defects = [structure.defect for structure in several.values()]
     momenta = [abs(structure.momentum) for structure in several.values()]
     return Comparison(
@@ -101,8 +101,8 @@ def _check_structure(found: Found, variational: bool) -> Comparison:
     )
 
 
-def _check_theorem(found: Found, variational: bool) -> Comparison:
-    orders = {row: pair[variational].order for row, pair in found.items()}
+def _check_theorem(results: Found, variational: bool) -> Comparison:
+    orders = {row: pair[variational].order for row, pair in results.items()}
     parts = [f"{order:.1f} ({_order_bound(*row)})" for row, order in orders.items()]
     return Comparison(
         claim=f"The order is at least min(p, q), Theorem 4.1 ({'in full' if variational else 'as printed'}).",
@@ -112,8 +112,8 @@ def _check_theorem(found: Found, variational: bool) -> Comparison:
     )
 
 
-def _check_orders(found: Found) -> Comparison:
-    settled = {points - 1: pair for (points, _), pair in found.items() if 2 < points <= SETTLED}
+def _check_orders(results: Found) -> Comparison:
+    settled = {points - 1: pair for (points, _), pair in results.items() if 2 < points <= SETTLED}
     printed = ", ".join(f"{pair[0].order:.1f}" for pair in settled.values())
     full = ", ".join(f"{pair[1].order:.1f}" for pair in settled.values())
     as_derived = all(
@@ -140,14 +140,14 @@ def _check_two_points(printed: Structure) -> Comparison:
     )
 
 
-def _table(found: Found) -> TableBlock:
+def _table(results: Found) -> TableBlock:
     names = ("defect", "change of momentum", "order")
     columns = ("points", "Gauss points", *(f"{n}, {form}" for form in ("as printed", "in full") for n in names))
     return TableBlock(
         columns=(*columns, "min(p, q)"),
         rows=tuple(
             (*row, *(v for s in pair for v in (s.defect, s.momentum, s.order)), _order_bound(*row))
-            for row, pair in found.items()
+            for row, pair in results.items()
         ),
         formats={"points": "d", "Gauss points": "d", "order, as printed": ".1f", "order, in full": ".1f"}
         | {"min(p, q)": "d"}
@@ -155,11 +155,11 @@ def _table(found: Found) -> TableBlock:
     )
 
 
-def _draw(figure: Figure, found: Found) -> None:
+def _draw(figure: Figure, results: Found) -> None:
     defect, momentum, order = panels(figure, 1, 3)
-    s = np.array([points - 1 for points, _ in found])
+    s = np.array([points - 1 for points, _ in results])
     for form, scheme, label in ((0, "printed", "as printed"), (1, "SCVI", "in full")):
-        chosen = [pair[form] for pair in found.values()]
+        chosen = [pair[form] for pair in results.values()]
         style: dict[str, Any] = {"color": COLORS[scheme], "label": label, "markersize": 4}
         changes = np.abs([structure.momentum for structure in chosen])
         defect.plot(s, [structure.defect for structure in chosen], "o-", **style)

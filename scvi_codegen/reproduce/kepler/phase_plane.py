@@ -95,11 +95,11 @@ def _kept_check(orbits: Mapping[str, Orbit], names: list[str], more: str = "") -
         energy, momentum = orbits[name].largest
         lost = f", lost at t = {orbits[name].lost:.1f}" if orbits[name].lost < orbits[name].end else ""
         parts.append(f"{name}: energy {energy:.1e}, momentum {momentum:.1e}{lost}")
-    kept = [not orbits[name].failed and orbits[name].largest[0] < PRESERVED for name in names]
+    preserved = [not orbits[name].failed and orbits[name].largest[0] < PRESERVED for name in names]
     return Comparison(
         claim=f"The phase trajectories are preserved by {', '.join(names)}.",
         measured=f"Largest errors: {'; '.join(parts)}.{more}",
-        verdict=Verdict.PARTLY if any(kept) and not all(kept) else holds(all(kept)),
+        verdict=Verdict.PARTLY if any(preserved) and not all(preserved) else holds(all(preserved)),
         bears_on=("scvi-structure",) if any("SCVI" in name for name in names) else (),
     )
 

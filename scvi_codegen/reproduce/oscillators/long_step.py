@@ -198,8 +198,8 @@ def _ahead(curves: Curves) -> Comparison:
 
 
 def _draw(curves: Curves, figure: Figure) -> None:
-    places = [(reading, what) for reading in READINGS for what in QUANTITIES]
-    for axes, (reading, what) in zip(panels(figure, 2, 2), places, strict=True):
+    panels_shown = [(reading, what) for reading in READINGS for what in QUANTITIES]
+    for axes, (reading, what) in zip(panels(figure, 2, 2), panels_shown, strict=True):
         for scheme in SCHEMES:
             curve, (constant, base) = curves[reading, scheme], PRINTED[scheme]
             errors = getattr(curve, what)

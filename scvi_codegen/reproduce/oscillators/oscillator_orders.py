@@ -232,7 +232,7 @@ def _factors(what: str, variant: Variant) -> list[float]:
 def _constants(what: str) -> Comparison:
     """Return the check of the constants of lines of equal power, which indicates what N counts."""
     ours = _factors(what, POINTS)
-    beside = [
+    others = [
         f"{min(f):.1f} to {max(f):.0f} ({variant.title})"
         for variant in SHOWN[what][1:]
         if (f := _factors(what, variant))
@@ -240,7 +240,7 @@ def _constants(what: str) -> Comparison:
     return Comparison(
         claim="The lines run along the errors.",
         measured=f"The constants of {len(ours)} curves whose power is printed are off by factors from "
-        f"{min(ours):.1f} to {max(ours):.1f} with N points; otherwise by {', by '.join(beside)}. "
+        f"{min(ours):.1f} to {max(ours):.1f} with N points; otherwise by {', by '.join(others)}. "
         f"Below {ALIKE:g} counts as along.",
         verdict=holds(max(ours) < ALIKE),
     )

@@ -195,12 +195,12 @@ def _order_check(printed: Exact, exact: Exact, s: int) -> Comparison:
 
 def _symplectic_check(printed: Exact, exact: Exact) -> Comparison:
     residuals = list(symplectic_residuals(exact))
-    zero, kept = sum(residual == 0 for residual in residuals), _numeric(printed, "printed").is_symplectic
+    zero, satisfied = sum(residual == 0 for residual in residuals), _numeric(printed, "printed").is_symplectic
     return Comparison(
         claim="Gauss methods are symplectic.",
         measured=f"{zero} of the {len(residuals)} conditions b_i a_ij + b_j a_ji = b_i b_j hold exactly for the closed "
-        f"form; the entries as printed {'satisfy' if kept else 'do not satisfy'} them.",
-        verdict=_common(zero == len(residuals), kept),
+        f"form; the entries as printed {'satisfy' if satisfied else 'do not satisfy'} them.",
+        verdict=_common(zero == len(residuals), satisfied),
     )
 
 

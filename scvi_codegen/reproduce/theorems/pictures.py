@@ -57,8 +57,8 @@ def draw_panels(figure: Figure, *, rows: int, columns: int, content: tuple[Panel
         axes.set_ylim(max(bottom, floor / 100), min(top, 10.0))
         axes.axhspan(floor / 1e9, floor, color=COLORS["exact"], alpha=0.15, linewidth=0)
         if axes.get_ylim()[0] < floor / 10:
-            place = {"x": 0.98, "ha": "right"} if panel.steps else {"x": 0.02}
-            axes.text(y=0.02, s="round-off", transform=axes.transAxes, fontsize=7, color=COLORS["exact"], **place)
+            alignment = {"x": 0.98, "ha": "right"} if panel.steps else {"x": 0.02}
+            axes.text(y=0.02, s="round-off", transform=axes.transAxes, fontsize=7, color=COLORS["exact"], **alignment)
         if panel.steps:
             axes.set_xscale("log")
             left, right = axes.get_xlim()

@@ -78,14 +78,14 @@ def _geometric_check(rates: Rates, label: str) -> Comparison:
 
 def _printed_check(rates: Rates) -> Comparison:
     printed = {name: rates[name, PRINTED, "map"][1] for name in TITLES}
-    own = {name: rates[name, FULL, "map"][1] for name in TITLES}
-    listed = " and ".join(f"{printed[name]:.2f} against {own[name]:.3f} ({TITLES[name]})" for name in TITLES)
-    exponents = ", ".join(f"{math.log(own[name]) / math.log(printed[name]):.2f}" for name in TITLES)
+    measured = {name: rates[name, FULL, "map"][1] for name in TITLES}
+    listed = " and ".join(f"{printed[name]:.2f} against {measured[name]:.3f} ({TITLES[name]})" for name in TITLES)
+    exponents = ", ".join(f"{math.log(measured[name]) / math.log(printed[name]):.2f}" for name in TITLES)
     return Comparison(
         claim="(34) as printed is the map of the discrete Lagrangian (33), to which Theorem 4.2 applies.",
         measured=f"It is another map. It converges geometrically, but K = {listed} for the map of (33), which is the "
         f"printed one's K to the power {exponents}: its error is linear in that of the curve, not quadratic.",
-        verdict=holds(all(printed[name] < 1.5 * own[name] for name in TITLES)),
+        verdict=holds(all(printed[name] < 1.5 * measured[name] for name in TITLES)),
         bears_on=("scvi-structure",),
     )
 

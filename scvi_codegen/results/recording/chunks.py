@@ -89,9 +89,9 @@ def read_chunk(path: Path, dimension: int | None = None, rows: int | None = None
     try:
         with path.open("rb") as file, loaded(file) as arrays:
             t, q, p, iterations = (arrays[name] for name in COLUMNS)
-            found = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
-            _check_shapes(found, q.shape[-1] if dimension is None else dimension, rows)
-            return found
+            chunk = Chunk((t, q, p, iterations), int(arrays["step"]), arrays["memory"].tobytes())
+            _check_shapes(chunk, q.shape[-1] if dimension is None else dimension, rows)
+            return chunk
     except (OSError, ValueError) as error:
         raise RecordingError(f"'{path}' cannot be read: {error}") from error
 

@@ -171,7 +171,7 @@ class Manifest:
             document["model"] = document["model"] and re.sub(r"(?m)^every\b", "save_every", document["model"])
         plain = {field: document[field] for field in PLAIN}
         options, plan = document["options"], document["plan"] if document["format"] == FORMAT_TO_A_TIME else None
-        found = cls(
+        manifest = cls(
             **plain | {field: tuple(plain[field]) for field in ("flags", "parameters")},
             options=None if options is None else SolverOptions(**options),
             plan=None if plan is None else StepPlan(**plan),
@@ -180,8 +180,8 @@ class Manifest:
             source=Source.from_record(document["source"]),
             fallback=Source.from_record(document["fallback"]) if "fallback" in document else None,
         )
-        found.check()
-        return found
+        manifest.check()
+        return manifest
 
 
 PLAIN = ("flags", "parameters", "h", "t", "save_every", "steps", "rows", "model", "certificate")

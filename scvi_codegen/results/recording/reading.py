@@ -191,9 +191,9 @@ class RecordedRun:
         order = np.argsort(rows, kind="stable")
         files = rows[order] // self.manifest.rows
         for some in np.split(order, np.flatnonzero(np.diff(files)) + 1) if len(rows) else ():
-            number, places = int(rows[some[0]]) // self.manifest.rows, rows[some] % self.manifest.rows
+            number, offsets = int(rows[some[0]]) // self.manifest.rows, rows[some] % self.manifest.rows
             for result, column in zip(results, columns, strict=True):
-                result[some] = self.piece(number)[column][places]
+                result[some] = self.piece(number)[column][offsets]
         return results
 
     def energy(self) -> Array:
@@ -253,8 +253,8 @@ class RecordedRun:
         """Return (n,) sizes of the steps after the states; NaN for an adaptive step whose end is not saved."""
         if self.manifest.plan is None:
             return np.broadcast_to(self.manifest.h, t.shape)
-        found = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
-        return np.append(found, np.nan)[: len(t)]
+        sizes = np.where((np.diff(rows) == 1) & (self.manifest.save_every == 1), np.diff(t), np.nan)
+        return np.append(sizes, np.nan)[: len(t)]
 
 
 class LazyArray:
@@ -306,5 +306,5 @@ class LazyArray:
     def __getitem__(self, index: Any) -> Any:
         rows, *rest = index if isinstance(index, tuple) else (index,)
         wanted = self._run.rows(rows)
-        (found,) = self._run.gather(np.atleast_1d(wanted), [self._column])
-        return found[(slice(None), *rest)] if wanted.ndim else found[(0, *rest)]
+        (values,) = self._run.gather(np.atleast_1d(wanted), [self._column])
+        return values[(slice(None), *rest)] if wanted.ndim else values[(0, *rest)]

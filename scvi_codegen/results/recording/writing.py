@@ -357,9 +357,9 @@ def _prepare(folder: Path) -> None:
             f"'{folder}' already contains a run: continue it ('scvi-codegen run --resume "
             f"{shlex.quote(str(folder))}', resume_run), or choose another folder"
         )
-    own = {*chunk_paths(folder), *unfinished(folder), folder / LOCK}
+    run_files = {*chunk_paths(folder), *unfinished(folder), folder / LOCK}
     for path in folder.iterdir():
-        if path not in own:
+        if path not in run_files:
             raise RecordingError(f"'{folder}' is not empty (it has '{path.name}'): choose another folder")
 
 

@@ -99,17 +99,17 @@ def verify_arrays(
         *convergence_checks(tested),
         *whole_checks(start),
     )
-    given = tested.initial
+    initial = tested.initial
     return issued(
         stepper.source.files,
         title=stepper.interface.title,
         system=system.name,
         method=chosen.name,
         flags=stepper.flags,
-        q=given.q,
-        p=given.p,
-        t=given.t,
-        h=given.h,
+        q=initial.q,
+        p=initial.p,
+        t=initial.t,
+        h=initial.h,
         parameters=dict(zip(stepper.interface.parameters, arrays.numbers, strict=True)),
         checks=checks,
         seconds=time.perf_counter() - began,
@@ -119,11 +119,11 @@ def verify_arrays(
 def _subject(start: WholeStart) -> SystemUnderTest:
     """Return the loops on a few indices as an integrator of the unrolled system."""
     small = small_start(start.stepper.interface, start.arrays, start.p)
-    given = small.given
+    arrays = small.given
     names = [parameter.name for parameter in start.system.parameters]
-    numbers = dict(zip(names, given.numbers, strict=True))
-    written = unroll_sums(start.system, given.sizes, tables=given.places, parameters={**numbers, **given.fields})
-    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (given.state, small.p))
+    numbers = dict(zip(names, arrays.numbers, strict=True))
+    written = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters={**numbers, **arrays.fields})
+    q, p = (np.concatenate([values.reshape(-1) for values in state.values()]) for state in (arrays.state, small.p))
     stepper = SmallStepper(start.stepper, small, written)
     return SystemUnderTest(written, start.method, cast(Stepper, stepper), None, State(q, p, start.t, start.h))
 
@@ -133,6 +133,6 @@ def _compared_with_unrolled(start: WholeStart, tested: SystemUnderTest) -> Findi
     first = tested.states[0]
     other = compile_stepper(tested.system, start.method, flags=start.stepper.flags)
     run: dict[str, Any] = {"h": first.h, "t": first.t, "steps": SMALL_STEPS, "parameters": tested.parameters}
-    own, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
-    difference = np.abs(np.concatenate([own.q - expected.q, own.p - expected.p], axis=1)) / tested.rounding(first)
+    rolled, expected = (each.integrate(first.q, first.p, **run) for each in (tested.stepper, other))
+    difference = np.abs(np.concatenate([rolled.q - expected.q, rolled.p - expected.p], axis=1)) / tested.rounding(first)
     return Finding(float(difference.max()), ROUNDINGS, "in units of rounding of a step")

@@ -37,7 +37,7 @@ class SmallStart:
     p: dict[str, Numbers]
 
 
-def small_start(interface: Interface, given: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
+def small_start(interface: Interface, arrays: RunArrays, p: Mapping[str, Numbers]) -> SmallStart:
     """Cut out a few indices where the arrays are largest, and table rows with the indices that occur in them.
 
     Raises:
@@ -45,7 +45,7 @@ def small_start(interface: Interface, given: RunArrays, p: Mapping[str, Numbers]
     """
     result = None
     for window, rows in CUT_SIZES:
-        start = _cut(interface, given, p, _indices_to_keep(interface, given, p, window, rows))
+        start = _cut(interface, arrays, p, _indices_to_keep(interface, arrays, p, window, rows))
         try:
             check_accesses(interface.layout, start.given.sizes, start.given.places)
         except StateError:
@@ -60,65 +60,67 @@ def small_start(interface: Interface, given: RunArrays, p: Mapping[str, Numbers]
 
 
 def _indices_to_keep(
-    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
+    interface: Interface, arrays: RunArrays, p: Mapping[str, Numbers], window: int, rows: int
 ) -> dict[str, NDArray[np.int64]]:
     """Return the indices to keep for each size."""
     tables = {table.axes[0].name for table in interface.layout.tables}
-    kept = {name: np.arange(min(given.sizes[name], rows)) for name in tables}
+    chosen = {name: np.arange(min(arrays.sizes[name], rows)) for name in tables}
     for name in interface.layout.sizes:
-        if name in kept:
+        if name in chosen:
             continue
-        used = [given.places[table][kept[row], column] for table, row, column, of in _columns(interface) if of == name]
+        used = [
+            arrays.places[table][chosen[row], column] for table, row, column, of in _columns(interface) if of == name
+        ]
         known = np.unique(np.concatenate([*used, np.empty(0, dtype=np.int64)]))
-        others = np.setdiff1d(_around(interface, given, p, name, window), known)
-        kept[name] = np.union1d(known, others[: max(0, window - len(known))])
-    return kept
+        others = np.setdiff1d(_around(interface, arrays, p, name, window), known)
+        chosen[name] = np.union1d(known, others[: max(0, window - len(known))])
+    return chosen
 
 
 def _columns(interface: Interface) -> Iterator[tuple[str, str, int, str]]:
     """Yield table, row size and column of each table access, and the size that its indices refer to."""
     rows = {table.name: table.axes[0].name for table in interface.layout.tables}
     for access, _ in interface.layout.accesses:
-        for place, axis in zip(access.places, access.array.axes, strict=True):
-            if place.table and axis.name:
-                yield place.table, rows[place.table], place.column, axis.name
+        for subscript, axis in zip(access.places, access.array.axes, strict=True):
+            if subscript.table and axis.name:
+                yield subscript.table, rows[subscript.table], subscript.column, axis.name
 
 
 def _around(
-    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], size: str, window: int
+    interface: Interface, arrays: RunArrays, p: Mapping[str, Numbers], size: str, window: int
 ) -> NDArray[np.int64]:
     """Return consecutive indices around the maximum of the first array of that size."""
-    length, centre = given.sizes[size], 0
+    length, centre = arrays.sizes[size], 0
     for array in interface.layout.coordinates:
         axes = [k for k, axis in enumerate(array.axes) if axis.name == size]
         if axes:
             others = tuple(k for k in range(len(array.axes)) if k != axes[0])
-            centre = int(np.argmax((np.abs(given.state[array.name]) + np.abs(p[array.name])).max(axis=others)))
+            centre = int(np.argmax((np.abs(arrays.state[array.name]) + np.abs(p[array.name])).max(axis=others)))
             break
     first = max(0, min(centre - window // 2, length - window))
     return np.arange(first, min(length, first + window))
 
 
 def _cut(
-    interface: Interface, given: RunArrays, p: Mapping[str, Numbers], kept: Mapping[str, NDArray[np.int64]]
+    interface: Interface, arrays: RunArrays, p: Mapping[str, Numbers], indices: Mapping[str, NDArray[np.int64]]
 ) -> SmallStart:
     def part(array: Array, values: Numbers) -> Numbers:
         return np.ascontiguousarray(
-            values[np.ix_(*(kept[axis.name] if axis.name else np.arange(axis.number) for axis in array.axes))]
+            values[np.ix_(*(indices[axis.name] if axis.name else np.arange(axis.number) for axis in array.axes))]
         )
 
-    places = {table.name: given.places[table.name][kept[table.axes[0].name]] for table in interface.layout.tables}
+    tables = {table.name: arrays.places[table.name][indices[table.axes[0].name]] for table in interface.layout.tables}
     for table, _, column, size in _columns(interface):
-        old = given.places[table][kept[_row_size(interface, table)], column]
-        new = np.minimum(np.searchsorted(kept[size], old), len(kept[size]) - 1)
-        places[table][:, column] = np.where(kept[size][new] == old, new, old % len(kept[size]))
+        old = arrays.places[table][indices[_row_size(interface, table)], column]
+        new = np.minimum(np.searchsorted(indices[size], old), len(indices[size]) - 1)
+        tables[table][:, column] = np.where(indices[size][new] == old, new, old % len(indices[size]))
     return SmallStart(
         RunArrays(
-            sizes={name: len(kept[name]) for name in interface.layout.sizes},
-            state={array.name: part(array, given.state[array.name]) for array in interface.layout.coordinates},
-            numbers=given.numbers,
-            fields={array.name: part(array, given.fields[array.name]) for array in interface.layout.fields},
-            places=places,
+            sizes={name: len(indices[name]) for name in interface.layout.sizes},
+            state={array.name: part(array, arrays.state[array.name]) for array in interface.layout.coordinates},
+            numbers=arrays.numbers,
+            fields={array.name: part(array, arrays.fields[array.name]) for array in interface.layout.fields},
+            places=tables,
         ),
         {array.name: part(array, p[array.name]) for array in interface.layout.coordinates},
     )
@@ -213,12 +215,12 @@ class SmallStepper:
     def _values(self, parameters: Any) -> dict[str, Any]:
         """Return numbers and fields from the parameters of the unrolled system, by name or in order."""
         names = [parameter.name for parameter in self.unrolled.parameters]
-        given = self.defaults if parameters is None else parameters
-        known = dict(given) if isinstance(given, Mapping) else dict(zip(names, given, strict=True))
+        values = self.defaults if parameters is None else parameters
+        known = dict(values) if isinstance(values, Mapping) else dict(zip(names, values, strict=True))
         result: dict[str, Any] = {name: known[name] for name in self.stepper.interface.parameters}
         for array in self.stepper.interface.layout.fields:
             shape = array.shape(self.arrays.sizes)
-            entries = ["_".join([array.name, *map(str, place)]) for place in np.ndindex(*shape)]
+            entries = ["_".join([array.name, *map(str, index)]) for index in np.ndindex(*shape)]
             result[array.name] = np.array([known[name] for name in entries]).reshape(shape)
         return result
 
