@@ -11,7 +11,7 @@
                                    plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
       -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration is
                                    added when a fixed point first fails (:mod:`scvi_codegen.rendering.fallback`)
-      -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.stepper`)
+      -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
 paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them in 60-digit arithmetic.
@@ -73,10 +73,10 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
-from scvi_codegen.runtime.compiled_method import Variants
-from scvi_codegen.runtime.events import EventLike, as_events
-from scvi_codegen.runtime.indexed_stepper import IndexedStepper
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import EventLike, as_events
+from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.validation.argument_types import MAPPING, SWITCH, TEXT, TEXTS, checks_arguments
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_array_source", "generate_source", "program_of"]

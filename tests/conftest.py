@@ -19,7 +19,7 @@ from tiers import DEFAULT, long_ones_first, mark_the_rest_full
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import FLAGS_VARIABLE
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 UNOPTIMISED = "-O0"
 

@@ -24,7 +24,7 @@ def _resolve(
     reference: pending_xref,
     content: nodes.Element,
 ) -> nodes.reference | None:
-    """Return the link for ``scvi_codegen.runtime.stepper.Stepper.step`` or ``Stepper.step``; None for other targets."""
+    """Return the link for a full name of a method, or ``Stepper.step``; None for other targets."""
     if reference.get("refdomain") != "py":
         return None
     parts = reference["reftarget"].split(".")

@@ -28,8 +28,8 @@ from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
 
 __all__ = ["Advice", "Evidence", "advise"]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.methods import Method
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["Pilot", "PilotRun", "run_pilot"]
 

@@ -18,9 +18,9 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import default_method
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["SECOND_RUN", "Known", "known_digits"]
 

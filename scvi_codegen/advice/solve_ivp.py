@@ -21,12 +21,12 @@ from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary
-from scvi_codegen.runtime.dense_output import times_of_run
-from scvi_codegen.runtime.events import EventLike
-from scvi_codegen.runtime.global_error import checked_error
-from scvi_codegen.runtime.largest_step import accuracy_message, largest_step
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import EventLike
+from scvi_codegen.runtime.run.global_error import checked_error
+from scvi_codegen.runtime.run.largest_step import accuracy_message, largest_step
+from scvi_codegen.runtime.trajectory.dense_output import times_of_run
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import SWITCH, checks_arguments, of
 
 __all__ = ["OdeResult", "solve_ivp"]
@@ -51,7 +51,7 @@ class OdeResult:
         y_events: (k, 2 m) states at these times.
         status: 0 end of the span, 1 terminal event, -1 a step failed, -2 the tolerance was missed.
         message: description of the status.
-        trajectory: states as a :class:`~scvi_codegen.runtime.trajectory.Trajectory`, with energies; its ``steps``,
+        trajectory: states as a :class:`~scvi_codegen.Trajectory`, with energies; its ``steps``,
             ``rejected_steps`` and ``iterations`` take the place of SciPy's ``nfev``, ``njev`` and ``nlu``.
     """
 

@@ -9,8 +9,8 @@ import numpy as np
 from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["missed_tolerance"]
 

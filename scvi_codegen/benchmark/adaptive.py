@@ -36,8 +36,8 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["adaptive_reference", "kepler_ends", "run_adaptive"]
 

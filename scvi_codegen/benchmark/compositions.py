@@ -26,7 +26,7 @@ from scvi_codegen.methods import StoermerVerlet
 from scvi_codegen.methods.composition import Composition
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["run_compositions"]
 

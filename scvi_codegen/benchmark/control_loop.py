@@ -12,7 +12,7 @@ from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper, generate_source
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["Sampling", "run_control_loop"]
 

@@ -16,8 +16,8 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
 from scvi_codegen.tables.precision import Matrix, mp
 from scvi_codegen.tables.quadrature import gauss_legendre

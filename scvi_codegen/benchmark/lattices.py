@@ -27,7 +27,7 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["reference_of", "rms", "run_growth", "run_lattices"]
 

@@ -25,8 +25,8 @@ from scvi_codegen.methods import Gauss, SpectralCollocation
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["run_paper_tables"]
 

@@ -13,7 +13,7 @@ from scvi_codegen.benchmark.lattices import reference_of, rms
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["run_thousand_bodies"]
 

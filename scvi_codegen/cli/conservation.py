@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodWarning, ScviCodegenError, StateError, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["Balance", "energy_balance", "energy_report", "momentum_report"]
 

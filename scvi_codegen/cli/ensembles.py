@@ -17,11 +17,11 @@ from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.models.ensemble_file import EnsembleStates
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import FAILURES, SolverOptions
-from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
-from scvi_codegen.runtime.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble_selection import ensemble_work
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.selection import ensemble_work
 
 __all__ = ["EnsembleOutcome", "ensemble_summary", "integrate_states"]
 

@@ -16,9 +16,9 @@ from scvi_codegen.cli.running import RunOutcome
 from scvi_codegen.errors import StateError
 from scvi_codegen.models.model import Model
 from scvi_codegen.results.recording import RecordedRun
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["ensemble_numbers", "failure_text", "recorded_numbers", "run_numbers"]
 

@@ -23,7 +23,7 @@ from scvi_codegen.models.model import Model, whole_steps_in
 from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
-from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.run.run import Run
 
 __all__ = ["RecordedOutcome", "Recording", "check_format", "check_resumed", "describe_progress", "is_run_folder"]
 

@@ -18,16 +18,16 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model, allowed_error
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
-from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
-from scvi_codegen.runtime.inputs import Array
-from scvi_codegen.runtime.largest_step import accuracy_message
-from scvi_codegen.runtime.observation import Observation
-from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.run_loop import record
-from scvi_codegen.runtime.runs_with_inputs import with_final_state
-from scvi_codegen.runtime.trajectory import Trajectory
-from scvi_codegen.runtime.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
+from scvi_codegen.runtime.inputs.segments import with_final_state
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings
+from scvi_codegen.runtime.run.largest_step import accuracy_message
+from scvi_codegen.runtime.run.observation import Observation
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = [
     "RunOutcome",

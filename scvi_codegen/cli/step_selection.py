@@ -16,7 +16,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.global_error import GlobalError
+from scvi_codegen.runtime.run.global_error import GlobalError
 from scvi_codegen.validation.counts import check_tolerance
 
 __all__ = ["model_with_adaptive_steps", "model_with_advised_step", "model_with_global_error"]

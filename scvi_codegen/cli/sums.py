@@ -21,10 +21,10 @@ from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.model import allowed_error
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
-from scvi_codegen.runtime.indexed_interface import Numbers
-from scvi_codegen.runtime.indexed_run import IndexedRun
-from scvi_codegen.runtime.indexed_stepper import IndexedStepper
-from scvi_codegen.runtime.indexed_trajectory import IndexedRecord, IndexedTrajectory, check_npz
+from scvi_codegen.runtime.indexed.interface import Numbers
+from scvi_codegen.runtime.indexed.run import IndexedRun
+from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+from scvi_codegen.runtime.indexed.trajectory import IndexedRecord, IndexedTrajectory, check_npz
 
 __all__ = ["reject_options", "run_indexed", "with_solver"]
 

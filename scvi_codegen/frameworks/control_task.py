@@ -22,7 +22,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, real_array
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.core.validation import Array
 
 __all__ = ["Conditions", "Task", "check_known", "interval"]
 

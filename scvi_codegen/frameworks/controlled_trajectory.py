@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.core.validation import Array
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly

@@ -10,8 +10,8 @@ from typing import Any, Self
 from scvi_codegen.errors import MissingLibraryError, StateError
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.representation import LONGEST, clipped
-from scvi_codegen.runtime.inputs import check_inputs_given, parameter_index
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import check_inputs_given, parameter_index
 from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["Flow", "imported"]

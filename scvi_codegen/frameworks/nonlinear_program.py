@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.runtime.inputs import Array
+from scvi_codegen.runtime.core.validation import Array
 
 __all__ = ["NonlinearProgram"]
 

@@ -37,7 +37,7 @@ from scvi_codegen.models.model import Model, real
 from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
-    from scvi_codegen.runtime.stepper import Stepper
+    from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["EnsembleStates", "load_ensemble"]
 

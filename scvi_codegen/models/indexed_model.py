@@ -28,10 +28,10 @@ from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.global_error import GlobalError
-    from scvi_codegen.runtime.indexed_run import IndexedRun
-    from scvi_codegen.runtime.indexed_stepper import IndexedStepper
-    from scvi_codegen.runtime.indexed_trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.indexed.run import IndexedRun
+    from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+    from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.run.global_error import GlobalError
 
 __all__ = ["IndexedModel"]
 
@@ -139,7 +139,7 @@ class IndexedModel:
         if not self.has_shorter_last_step:
             yield None if run.plan else self.step_count
             return
-        from scvi_codegen.runtime.runs_with_inputs import planned_segments  # imported here: not needed for reading
+        from scvi_codegen.runtime.inputs.segments import planned_segments  # imported here: not needed for reading
 
         for segment in planned_segments(run.t, self.t + self.covered, run.h, {}):
             run.update(h=segment.h)

@@ -10,7 +10,7 @@ import numpy as np
 from scvi_codegen.errors import ModelFileError, StateError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.rendering.program_source import ExampleInput
-from scvi_codegen.runtime.runs_with_inputs import POWERS, first_inner_time, input_of, parameters_at
+from scvi_codegen.runtime.inputs.segments import POWERS, first_inner_time, input_of, parameters_at
 
 __all__ = ["InputTable", "checked_tables", "tables_of_example"]
 

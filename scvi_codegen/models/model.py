@@ -21,12 +21,12 @@ from scvi_codegen.validation.counts import LARGEST_COUNT, check_tolerance, check
 if TYPE_CHECKING:
     from scvi_codegen.models.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.global_error import GlobalError
-    from scvi_codegen.runtime.inputs import Array
-    from scvi_codegen.runtime.integrator import Integrator
-    from scvi_codegen.runtime.run import Run
-    from scvi_codegen.runtime.runs_with_inputs import Input
-    from scvi_codegen.runtime.stepper import Stepper
+    from scvi_codegen.runtime.core.integrator import Integrator
+    from scvi_codegen.runtime.core.stepper import Stepper
+    from scvi_codegen.runtime.core.validation import Array
+    from scvi_codegen.runtime.inputs.segments import Input
+    from scvi_codegen.runtime.run.global_error import GlobalError
+    from scvi_codegen.runtime.run.run import Run
 
 __all__ = [
     "DEFAULT_METHOD",
@@ -220,7 +220,7 @@ class Model:
         """Return the initial parameters, including components of inputs if these are given."""
         if not self.inputs:
             return self.parameters
-        from scvi_codegen.runtime.runs_with_inputs import first_inner_time
+        from scvi_codegen.runtime.inputs.segments import first_inner_time
 
         return self._inputs_and_parameters(stepper)[1](first_inner_time(self.t, self.end))
 
@@ -236,7 +236,7 @@ class Model:
         if not (self.system.inputs or self.has_shorter_last_step):
             yield None if run.plan else self.step_count
             return
-        from scvi_codegen.runtime.runs_with_inputs import prepared_segments  # imported here, as NumPy above
+        from scvi_codegen.runtime.inputs.segments import prepared_segments  # imported here, as NumPy above
 
         inputs, values = self._inputs_and_parameters(run.stepper)
         yield from prepared_segments(run, inputs, self.end, values)
@@ -244,7 +244,7 @@ class Model:
     @property
     def end(self) -> float:
         """Final time."""
-        from scvi_codegen.runtime.runs_with_inputs import final_time
+        from scvi_codegen.runtime.inputs.segments import final_time
 
         return final_time(self.t, self.h, self.steps, None if self.span is None else self.t + self.covered)
 
@@ -258,7 +258,7 @@ class Model:
 
     def _inputs_and_parameters(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
         """Return the inputs, and the parameters as a function of time."""
-        from scvi_codegen.runtime.runs_with_inputs import checked_inputs, parameters_of
+        from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of
 
         found = checked_inputs(stepper.interface, self.all_inputs())
         return found, parameters_of(stepper, self.parameters, found)
@@ -267,7 +267,7 @@ class Model:
         """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end."""
         p, h = self.momenta(stepper), self.h
         if h is None and self.has_time_transformation:
-            from scvi_codegen.runtime.largest_step import largest_step  # imported here: not needed for reading
+            from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
 
             if self.system.inputs:
                 raise ModelFileError(
@@ -346,7 +346,7 @@ def check_adaptive(tolerance: float | None, span: float | None) -> None:
 
 def is_whole(span: float, h: float) -> bool:
     """Return True if a span is a whole number of steps, up to rounding."""
-    from scvi_codegen.runtime.times import WHOLE  # imported here: not needed for reading a model
+    from scvi_codegen.runtime.run.times import WHOLE  # imported here: not needed for reading a model
 
     steps = span / abs(h)
     return round(steps) > 0 and abs(steps - round(steps)) <= WHOLE * max(1.0, steps)

@@ -25,8 +25,8 @@ from scvi_codegen.errors import MethodError, ModelFileError, PackageError, State
 from scvi_codegen.models.folders import CERTIFICATE_FILE, INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.generated_folders import damaged, prefix_of, read_record, source_in
 from scvi_codegen.rendering.source import Interface, Source, check_interface
-from scvi_codegen.runtime.compiled_method import Variants
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentType, checks_arguments
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from typing import TypeAlias
 
 from scvi_codegen.errors import MethodWarning, StateError, closest
 from scvi_codegen.reproduce.laboratory.experiment import Experiment, Result
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["CATALOGUE", "Failure", "Outcome", "catalogue", "run_experiments", "with_needs"]
 

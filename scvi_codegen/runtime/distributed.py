@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
-from scvi_codegen.runtime.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble_selection import ensemble_work
-from scvi_codegen.runtime.ensemble_states import EnsembleParameters
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
+from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.selection import ensemble_work
 from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.stepper import Stepper
+    from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["integrate_ensemble"]
 

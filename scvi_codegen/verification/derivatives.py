@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.runtime.linearised import Starts
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest

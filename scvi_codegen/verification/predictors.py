@@ -17,7 +17,7 @@ import numpy as np
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification.certificate import Check, Finding, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest
 

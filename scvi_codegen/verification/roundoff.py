@@ -24,8 +24,8 @@ from scvi_codegen.exact.solution import numbers
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.methods import SCVI
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble, LaneBlock
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.system_under_test import EPSILON, State, SystemUnderTest

@@ -13,7 +13,7 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.solution import Numbers, numbers
 from scvi_codegen.exact.step import SolvedStep, compiled_equations
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, ViolationError, checked
 from scvi_codegen.verification.linearisation import WEIGHTS

@@ -16,7 +16,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.announcements import tell
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification.linearisation import Jacobian, linearised
 
 __all__ = ["EPSILON", "State", "SystemUnderTest"]

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scvi_codegen import compile_stepper, load_model
 from scvi_codegen.cli import main
 from scvi_codegen.cli.running import integrate_model
-from scvi_codegen.runtime.run import Run
+from scvi_codegen.runtime.run.run import Run
 
 MODEL = """
 [system]

@@ -9,7 +9,7 @@ from faults import function, here, text
 from sabotage import changed_result
 
 from scvi_codegen.lowering import derivatives as lowered_derivatives
-from scvi_codegen.runtime.integrator import Integrator
+from scvi_codegen.runtime.core.integrator import Integrator
 
 __all__ = ["STEP_SIZE_FAULTS"]
 

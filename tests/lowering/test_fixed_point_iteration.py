@@ -20,7 +20,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 H, T, STATES = 0.1, 0.7, 20
 ONE_ITERATION = SolverOptions(tolerance=1e300)

@@ -16,8 +16,8 @@ from samples import QUICK_FLAGS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble, LaneBlock
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble, LaneBlock
 
 STEPS = 100
 ROUNDING = 0.02

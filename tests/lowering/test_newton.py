@@ -25,7 +25,7 @@ from scvi_codegen.lowering.unknown_layout import layout_of
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.program_source import workspace_size
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 SIZE = 12
 

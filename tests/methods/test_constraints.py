@@ -29,7 +29,7 @@ from scvi_codegen import (
     symmetries,
 )
 from scvi_codegen.models.model_file import parse_model
-from scvi_codegen.runtime.ensemble import Ensemble
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble
 
 G = 9.81
 

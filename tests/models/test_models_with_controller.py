@@ -17,7 +17,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.errors import ModelFileError, StateError, SystemDefinitionError
 from scvi_codegen.models.model_file import catalogue_model, dump_model, parse_model
 from scvi_codegen.models.package import generate_package, load_package
-from scvi_codegen.runtime.largest_step import REFINEMENTS, largest_step
+from scvi_codegen.runtime.run.largest_step import REFINEMENTS, largest_step
 
 SHAKEN = """
 [system]

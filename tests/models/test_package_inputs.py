@@ -12,7 +12,7 @@ from style import check_style
 from scvi_codegen import SVI, Gauss, LagrangianSystem, Model, StoermerVerlet, compile_stepper, load_model, load_package
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.runtime.runs_with_inputs import checked_inputs, parameters_of, prepared_segments
+from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of, prepared_segments
 
 KNOTS, VALUES = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
 STRICT = "-O1 -std=c99 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -ffp-contract=off"

@@ -22,8 +22,8 @@ from scvi_codegen.pictures.conserved import largest_in_bins, plot_energy, plot_m
 from scvi_codegen.pictures.overview import plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion, plot_phase
 from scvi_codegen.pictures.section import plot_section
-from scvi_codegen.runtime.events import Event
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.events.event import Event
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 def trajectory_of(name: str, steps: int = 300, h: float | None = None) -> Trajectory:

@@ -25,7 +25,7 @@ from scvi_codegen.methods import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.results.recording import RecordedRun, record_run
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 PROCESSES = 16
 FAST = ("-O0",)

@@ -20,7 +20,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation, StoermerVerlet
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 Q, P = np.array([1.0, 0.25]), np.array([0.0, 1.0])
 REFUSED = (StateError, StepFailedError)

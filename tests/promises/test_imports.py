@@ -132,6 +132,13 @@ def test_root_contains_only_the_tour_and_shared_modules():
     assert len([*PACKAGE.glob("*.py")]) <= 12
 
 
+def test_folders_of_the_runtime_have_at_most_16_files():
+    assert {path.name for path in (PACKAGE / "runtime").glob("*.py")} == {"__init__.py", "distributed.py"}
+    folders = [path for path in (PACKAGE / "runtime").iterdir() if path.is_dir() and path.name != "__pycache__"]
+    assert folders
+    assert [path.name for path in folders if len([*path.glob("*.py")]) > 16] == []
+
+
 @pytest.mark.parametrize("room", FLOOR_OF)
 def test_imports_point_to_lower_layers_only(room):
     used = [(m, other) for m in MODULES if room_of(m) == room for other in USED[m] if room_of(other) != room]
@@ -237,7 +244,7 @@ def test_mypy_checks_public_names_and_code_of_the_pages(tmp_path):
     words = [*command, *files]
     lines = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout.splitlines()
     assert 'typed.py:3: note: Revealed type is "scvi_codegen.methods.galerkin.SVI"' in lines
-    assert any(line.startswith("typed.py:4") and "scvi_codegen.runtime.stepper.Stepper" in line for line in lines)
+    assert any(line.startswith("typed.py:4") and "scvi_codegen.runtime.core.stepper.Stepper" in line for line in lines)
     assert [line for line in lines if "error" in line] == [
         'typed.py:5: error: Module has no attribute "no_such_name"  [attr-defined]',
         f"Found 1 error in 1 file (checked {len(files)} source files)",

@@ -8,7 +8,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import ArgumentError, StateError
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.validation.keywords import EXPLANATIONS, keyword_hint
 from scvi_codegen.validation.synonyms import SYNONYMS
 

@@ -13,7 +13,7 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.models.systems import planar_pendulum
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.rendering import unrolled_equations
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 

@@ -17,7 +17,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 END, TOLERANCE = 60.0, 1e-10
 MODEL = f"""

@@ -22,7 +22,7 @@ from scvi_codegen.cli import main
 from scvi_codegen.errors import RecordingError, StepFailedError
 from scvi_codegen.methods import SVI
 from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 
 @pytest.fixture(scope="session")

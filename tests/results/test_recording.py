@@ -26,10 +26,10 @@ from scvi_codegen.models.model_file import dump_model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, manifest, record_run, resume_run, writing
-from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.run_loop import record
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,9 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.runtime import memory
-from scvi_codegen.runtime.step_plan import StepPlan
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run import memory
+from scvi_codegen.runtime.run.step_plan import StepPlan
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 

@@ -10,7 +10,7 @@ import pytest
 from counting import TooMuchWorkError, at_most
 
 from scvi_codegen import SVI, StateError, StepFailedError, compile_stepper, problem
-from scvi_codegen.runtime import run as runs
+from scvi_codegen.runtime.run import run as runs
 
 Q, P = np.array([0.4, 0.0]), np.array([0.0, 2.0])
 FIXED, ADAPTIVE = {"h": 0.05, "steps": 1}, {"t_end": 0.05, "tolerance": 1e-10}

@@ -25,8 +25,8 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.events import Event
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Event
 
 METHODS = (SVI(3), SpectralCollocation(4), Composition(8), StoermerVerlet())
 MORE_METHODS = (SCVI(3), Gauss(2), RadauIIA(2), ExplicitEuler(), SVI(4, "gauss-lobatto:5"))

@@ -15,7 +15,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.recording import record_run, resume_run
-from scvi_codegen.runtime.step_plan import StepPlan
+from scvi_codegen.runtime.run.step_plan import StepPlan
 
 KEPLER = problem("kepler").system
 E = 0.8

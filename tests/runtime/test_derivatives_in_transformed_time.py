@@ -25,7 +25,7 @@ from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.methods.method import is_symplectic
-from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 
 KEPLER = problem("kepler").system

@@ -21,8 +21,8 @@ from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.distributed import _slices, _stepper, integrate_ensemble
-from scvi_codegen.runtime.stepper import Stepper
 
 COUNT = 70
 

@@ -26,9 +26,9 @@ from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.ensemble import Ensemble
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.ensemble.lockstep import Ensemble
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
@@ -252,7 +252,7 @@ class TestThreadsAndInterruption:
         def fail(*arguments: object) -> None:
             raise RuntimeError("out of order")
 
-        monkeypatch.setattr("scvi_codegen.runtime.ensemble.LaneBlock.advance", fail)
+        monkeypatch.setattr("scvi_codegen.runtime.ensemble.lockstep.LaneBlock.advance", fail)
         with pytest.raises(RuntimeError, match="out of order"):
             kepler.integrate_ensemble(*states("kepler", 20), h=0.05, steps=10)
 

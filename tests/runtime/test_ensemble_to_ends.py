@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from scvi_codegen.cli import main
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods import SVI
-from scvi_codegen.runtime.ensemble_trajectory import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
 
 ECCENTRICITIES = np.array([0.0, 0.3, 0.6, 0.9])
 Q = np.column_stack([1.0 - ECCENTRICITIES, np.zeros(4)])
@@ -91,7 +91,7 @@ def test_interrupt_returns_completed_states(kepler):
     class Enough(Exception):  # noqa: N818
         pass
 
-    from scvi_codegen.runtime.adaptive_ensemble import AdaptiveEnsemble
+    from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
 
     work = AdaptiveEnsemble(kepler, Q, P, t_end=[5.0, 5.0, 5.0, 1e7], tolerance=TOLERANCE)
 

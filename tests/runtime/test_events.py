@@ -32,9 +32,9 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime import compiled_method
-from scvi_codegen.runtime.events import Event
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core import compiled_method
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.events.event import Event
 
 METHODS = (SVI(3), SpectralCollocation(6), Composition(8))
 MORE_METHODS = (SCVI(3), Gauss(3), RadauIIA(2), LobattoIIIA(3), StoermerVerlet(), SVI(4), SVI(4, "gauss-lobatto:5"))

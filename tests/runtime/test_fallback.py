@@ -17,7 +17,7 @@ from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.results.recording import record_run, resume_run
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 

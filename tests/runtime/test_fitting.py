@@ -23,7 +23,7 @@ from scvi_codegen import (
     compile_stepper,
     fit,
 )
-from scvi_codegen.runtime.segments import _bounded_update, _equality_constrained_update
+from scvi_codegen.runtime.estimation.multiple_shooting import _bounded_update, _equality_constrained_update
 
 TRUE = {"m": 1.3, "alpha": -1.0, "beta": 0.8, "delta": 0.2, "gamma": 0.3, "omega": 1.2}
 NOISE = 0.01

@@ -16,7 +16,7 @@ from extrapolation import Real, integrated
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.runtime.global_error import _nudged as perturbed
+from scvi_codegen.runtime.run.global_error import _nudged as perturbed
 
 MASSES = np.array([3, 4, 5], dtype=Real)
 

@@ -11,7 +11,7 @@ from random_steps import FAMILIES, WANTED, compiled, displaced, outcome, trials
 
 import scvi_codegen as sc
 from scvi_codegen.mechanics.indexed.system import ArraySystem
-from scvi_codegen.runtime.compiled_method import Variants
+from scvi_codegen.runtime.core.compiled_method import Variants
 
 QUICK = {
     "duffing": ("scvi:3", "auto"),

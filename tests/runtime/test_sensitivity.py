@@ -13,7 +13,7 @@ from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, pro
 from scvi_codegen.exact.step import DerivedStep
 from scvi_codegen.methods.discretise import paper_equations
 from scvi_codegen.methods.method import is_symplectic
-from scvi_codegen.runtime.linearised import Starts
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 
 

@@ -13,8 +13,8 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native.building import PORTABLE_FLAGS
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.times import steps_within, times_after
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.times import steps_within, times_after
 
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 

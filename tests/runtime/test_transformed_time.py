@@ -13,7 +13,7 @@ import scvi_codegen as sc
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.exact.solution import ExactMotion
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.runtime.time_transformation import part_of_step
+from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
 from scvi_codegen.tables.precision import mp
 
 KEPLER = sc.LagrangianSystem.from_text(

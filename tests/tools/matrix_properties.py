@@ -28,7 +28,8 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.frameworks.flow_of_rows import FlowOfRows
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import load_run, record_run, resume_run
-from scvi_codegen.runtime import gradients, memory, run_loop
+from scvi_codegen.runtime.run import memory, run_loop
+from scvi_codegen.runtime.sensitivity import gradients
 
 __all__ = ["PROPERTIES", "SITUATIONS", "Case"]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from scvi_codegen.results.recording import RecordedRun, record_run
-from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 COLUMNS = ("t", "q", "p", "iterations")
 STATE = {"q": [0.5, 0.0], "p": [0.0, 1.7]}

@@ -22,7 +22,7 @@ from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.building import FLAGS_VARIABLE, TUNED_FLAGS
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 
 def lowered(system: MechanicalSystem, method: Method) -> Program:

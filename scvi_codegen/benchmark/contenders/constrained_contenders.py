@@ -22,7 +22,7 @@ import numpy as np
 from scvi_codegen.benchmark.cases import Array
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["LINKAGES", "PARTS", "ContenderRun", "Linkage", "motion_in_angles", "mujoco_motion", "our_motion"]
 

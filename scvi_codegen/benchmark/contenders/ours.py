@@ -19,7 +19,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
 

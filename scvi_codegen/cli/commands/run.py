@@ -24,7 +24,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.overview import plot_trajectory
-from scvi_codegen.runtime.global_error import GlobalError
+from scvi_codegen.runtime.run.global_error import GlobalError
 
 __all__ = ["run"]
 

@@ -18,8 +18,8 @@ from scvi_codegen.models.indexed_package import load_sums
 from scvi_codegen.models.model import Model, allowed_error
 from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
-from scvi_codegen.runtime.indexed_stepper import IndexedStepper
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.verification import Certificate
 
 __all__ = ["verify"]

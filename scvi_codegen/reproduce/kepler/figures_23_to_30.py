@@ -23,7 +23,7 @@ from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, p
 from scvi_codegen.reproduce.laboratory.drawing import COLORS, draw_error, panels
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, Experiment, Picture, Result, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, stepper_of, trajectory
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,7 +20,7 @@ from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, p
 from scvi_codegen.reproduce.kepler.step import structure_of
 from scvi_codegen.reproduce.laboratory.experiment import Comparison, TableBlock, holds
 from scvi_codegen.reproduce.laboratory.running import SECTION_4, trajectory
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = [
     "ECCENTRICITY",

@@ -28,7 +28,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
 )
 from scvi_codegen.reproduce.laboratory.running import stepper_of, trajectory
 from scvi_codegen.reproduce.oscillators.one_degree import drift, largest
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.basis import cardinal_values
 from scvi_codegen.tables.nodes import chebyshev_lobatto, equispaced, legendre_lobatto
 from scvi_codegen.tables.precision import Vector

@@ -13,7 +13,7 @@ from scvi_codegen.errors import StepFailedError
 from scvi_codegen.methods.method import Method
 from scvi_codegen.reproduce.kepler.exact_flow import SYSTEM, angular_momentum, exact_flow
 from scvi_codegen.reproduce.laboratory.running import stepper_of
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 __all__ = ["STATE", "STEP", "Structure", "structure_of", "symplecticity_defect"]
 

@@ -15,8 +15,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import PORTABLE_FLAGS
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["ROUNDOFF", "SECTION_3", "SECTION_4", "stepper_of", "steps_in", "trajectory"]
 

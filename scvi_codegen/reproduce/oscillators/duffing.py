@@ -34,7 +34,7 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     largest,
     offset_from_curve,
 )
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

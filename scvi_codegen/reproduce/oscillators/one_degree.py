@@ -12,8 +12,8 @@ from scvi_codegen.errors import MethodWarning
 from scvi_codegen.methods import SVI
 from scvi_codegen.reproduce.laboratory.drawing import largest_in_bins
 from scvi_codegen.reproduce.laboratory.experiment import Cell, TableBlock
-from scvi_codegen.runtime.stepper import Stepper
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = [
     "NO_DRIFT",

@@ -31,7 +31,7 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     largest,
     svi_with_points,
 )
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,7 +26,7 @@ from scvi_codegen.reproduce.oscillators.one_degree import (
     energy_table,
     largest,
 )
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,7 +25,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, stepper_of
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.tables.basis import differentiation_matrix
 from scvi_codegen.tables.closed_forms import exact_points, exact_rule
 from scvi_codegen.tables.nodes import chebyshev_lobatto

@@ -30,7 +30,7 @@ from scvi_codegen.reproduce.laboratory.experiment import (
     holds,
 )
 from scvi_codegen.reproduce.laboratory.running import ROUNDOFF, SECTION_3, steps_in
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

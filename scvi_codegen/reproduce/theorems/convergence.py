@@ -22,7 +22,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.tables.quadrature import Quadrature, gauss_legendre
 
 __all__ = [

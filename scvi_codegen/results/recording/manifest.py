@@ -18,11 +18,11 @@ from scvi_codegen.native.fingerprint import fingerprint
 from scvi_codegen.native.flags import check_flags
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source, check_interface
-from scvi_codegen.runtime.compiled_method import Variants
-from scvi_codegen.runtime.integrator import Integrator
-from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.step_plan import StepPlan
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation.counts import checked_count
 from scvi_codegen.version import __version__
 

@@ -18,16 +18,16 @@ from scvi_codegen.files.labelled_arrays import checked_units
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk
 from scvi_codegen.results.recording.manifest import read_manifest
-from scvi_codegen.runtime.quantities import quantities
-from scvi_codegen.runtime.run_loop import first_step_size
-from scvi_codegen.runtime.saved_states import checked_row
-from scvi_codegen.runtime.times import times_after
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.run.run_loop import first_step_size
+from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.runtime.trajectory.quantities import quantities
+from scvi_codegen.runtime.trajectory.saved_states import checked_row
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
 
 if TYPE_CHECKING:
-    from scvi_codegen.runtime.run import Run
-    from scvi_codegen.runtime.stepper import Stepper
+    from scvi_codegen.runtime.core.stepper import Stepper
+    from scvi_codegen.runtime.run.run import Run
 
 __all__ = ["LazyArray", "RecordedRun", "load_run"]
 

@@ -23,10 +23,10 @@ from scvi_codegen.native.flags import check_flags
 from scvi_codegen.results.recording.chunks import Chunk, chunk_paths, no_states, read_chunk, unfinished, write_chunk
 from scvi_codegen.results.recording.manifest import MANIFEST, Build, Manifest, read_manifest, write_manifest
 from scvi_codegen.results.recording.reading import RecordedRun, load_run
-from scvi_codegen.runtime.run import Run
-from scvi_codegen.runtime.run_loop import drive, record
-from scvi_codegen.runtime.step_plan import StepPlan
-from scvi_codegen.runtime.trajectory import Trajectory
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.run_loop import drive, record
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.validation.argument_types import FUNCTION, PATH, REAL, TEXT, checks_arguments, of
 from scvi_codegen.validation.counts import checked_count
 

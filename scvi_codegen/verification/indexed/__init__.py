@@ -23,10 +23,10 @@ from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.runtime.accuracy import without_accuracy_warnings
-from scvi_codegen.runtime.indexed_interface import read_arrays
-from scvi_codegen.runtime.indexed_stepper import IndexedStepper
-from scvi_codegen.runtime.stepper import Stepper
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.indexed.interface import read_arrays
+from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued
 from scvi_codegen.verification.convergence import convergence_checks

@@ -17,9 +17,9 @@ from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runtime.indexed_interface import RunArrays
-from scvi_codegen.runtime.indexed_run import IndexedRun
-from scvi_codegen.runtime.indexed_stepper import IndexedStepper
+from scvi_codegen.runtime.indexed.interface import RunArrays
+from scvi_codegen.runtime.indexed.run import IndexedRun
+from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
 __all__ = ["WholeStart", "whole_checks"]

@@ -1,0 +1,1 @@
+"""Chaos indicators: growth of tangent vectors."""

@@ -1,0 +1,205 @@
+"""Propagation of tangent vectors along chains of steps with QR factorisations.
+
+Within a chunk the derivatives of the steps act on an orthonormal frame; the length of chunks is adapted so that the
+images remain well conditioned. The initial frame is orthogonal and symplectic with ordered columns, so that R is
+symplectic if the derivatives are (Iwasawa decomposition); Lyapunov exponents then occur in pairs of opposite sign to
+round-off, at all times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native.arguments import real_array
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.chaos.growth import Growth, ill_conditioned, r_factors
+from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.sensitivity.gradients import pieces, propagate, starts_of
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+from scvi_codegen.validation.counts import checked_count
+
+__all__ = ["InitialTangents", "ahead", "along"]
+
+FIRST, MOST = 8, 1024
+"""Number of steps of the first and of the largest chunk."""
+SEED = 1892
+"""Random seed of the initial directions, for reproducibility."""
+FORBIDDEN = 1e-8
+"""Singular values below this fraction of the largest are directions forbidden by constraints."""
+INADMISSIBLE = 1e-6
+"""Largest component of given directions outside those admissible for the constraints."""
+
+StepSegment = tuple[Starts, NDArray[np.intp]]
+"""Consecutive steps, and (steps + 1,) indices of saved states at their ends, -1 if not saved."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialTangents:
+    """Initial tangent vectors, (2m, k) of length 1: the first of a random frame, or given directions.
+
+    With constraints the frame spans the admissible directions, the range of the derivative of a step.
+    """
+
+    stepper: Integrator
+    count: int | None
+    directions: Array | None
+
+    @classmethod
+    def checked(cls, stepper: Integrator, count: int | None, directions: ArrayLike | None) -> InitialTangents:
+        """Construct from user arguments; raise :class:`StateError` for invalid numbers or directions."""
+        size = 2 * stepper.dimension
+        if directions is None:
+            wanted = None if count is None else checked_count(count, "count", least=1, most=size)
+            return cls(stepper, wanted, None)
+        given = real_array(directions, "directions")
+        columns = given[:, np.newaxis] if given.ndim == 1 else given
+        if columns.ndim != 2 or len(columns) != size or not 0 < columns.shape[1] <= size:
+            raise StateError(f"directions must have shape ({size},) or ({size}, k), k <= {size}, not {given.shape}")
+        if count is not None:
+            raise StateError("give either count or directions, not both")
+        lengths = np.linalg.norm(columns, axis=0)
+        if not np.isfinite(lengths).all() or not lengths.all():
+            raise StateError("directions must be finite and not 0")
+        return cls(stepper, None, columns / lengths)
+
+    def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
+        """Return the tangent vectors at (q, p) for a first step of h."""
+        given = self.directions
+        if not self.stepper.interface.constraints:
+            return _frame(self.stepper.dimension)[:, : self.count] if given is None else given
+        before = self.stepper.step(q, p, -h, t, parameters, options=options)
+        ends = self.stepper.jacobian(*before, h, t - h, parameters, options=options)
+        allowed, sizes, _ = np.linalg.svd(ends)
+        frame = allowed[:, sizes > FORBIDDEN * sizes[0]]
+        if given is not None:
+            if np.abs(given - frame @ (frame.T @ given)).max() > INADMISSIBLE:
+                raise StateError("directions must be tangent to the constraints")
+            return given
+        if self.count is not None and self.count > frame.shape[1]:
+            raise StateError(f"count={self.count} exceeds the {frame.shape[1]} directions that the constraints allow")
+        mixed, _ = np.linalg.qr(np.random.default_rng(SEED).normal(size=2 * frame.shape[1:]))
+        tangents: Array = (frame @ mixed)[:, : self.count]
+        return tangents
+
+
+def _frame(dimension: int) -> Array:
+    """Return a (2m, 2m) orthogonal symplectic matrix from a unitary one, columns ordered q_1, .., q_m, p_m, .., p_1."""
+    real, imaginary = np.random.default_rng(SEED).normal(size=(2, dimension, dimension))
+    unitary = np.linalg.qr(real + 1j * imaginary)[0]
+    first = np.vstack([unitary.real, -unitary.imag])
+    second = np.vstack([unitary.imag, unitary.real])
+    return np.hstack([first, second[:, ::-1]])
+
+
+def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
+    """Return the deviations of a run at its saved states; steps between these are recomputed."""
+
+    def propagate_chunk(steps: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+        propagate(states, steps, numbers, vectors, back=False)
+
+    states.stepper._check_physical_time("the growth of tangent vectors")
+    first = states.q[0], states.p[0], float(states.step_sizes[0]), float(states.t[0])
+    propagation = _TangentPropagation(
+        tangents.at(*first, states.parameters, states.options), states.stepper._input_size, states.t
+    )
+    propagation.follow((starts_of(states, first, last) for first, last in pieces(states)), propagate_chunk)
+    return ChaosIndicators.of(states.t, propagation.growth.found)
+
+
+def ahead(
+    tangents: InitialTangents,
+    q: Array,
+    p: Array,
+    parameters: Array,
+    *,
+    t: Array,
+    h: float,
+    save_every: int,
+    options: SolverOptions | None,
+    check_stop: Callable[[int], None],
+) -> tuple[Array | None, StepFailedError | None]:
+    """Integrate from (q, p) with tangent vectors over (steps + 1,) times t, saving every ``save_every``-th value.
+
+    Args:
+        check_stop: called before each chunk; may raise to stop.
+
+    Returns:
+        The series of :class:`Growth`, NaN after a failed step, ``None`` if the first step fails; and the failure.
+    """
+    stepper, steps = tangents.stepper, len(t) - 1
+
+    def propagate_chunk(part: Starts, numbers: NDArray[np.intp], vectors: Array) -> None:
+        check_stop(int(numbers[-1]))
+        stepper._propagate(part, vectors, parameters, options)
+
+    def step_segments() -> Iterator[StepSegment]:
+        now = q, p
+        for first in range(0, steps, MOST):
+            last = min(first + MOST, steps)
+            starts = Starts.chain(*now, t[first:last], np.full(last - first, h))
+            at = np.arange(first, last + 1)
+            yield starts, np.where(at % save_every, -1, at // save_every)
+            now = starts.q[-1], starts.p[-1]
+
+    propagation = None
+    try:
+        propagation = _TangentPropagation(
+            tangents.at(q, p, h, float(t[0]), parameters, options), stepper._input_size, t[::save_every]
+        )
+        propagation.follow(step_segments(), propagate_chunk)
+    except StepFailedError as failure:
+        return propagation.growth.found if propagation else None, failure
+    return propagation.growth.found, None
+
+
+class _TangentPropagation:
+    """Propagation of tangent vectors.
+
+    Args:
+        tangents: (2m, k) initial vectors of length 1.
+        given: number of variables of a step.
+        t: (n,) times of saved values.
+    """
+
+    def __init__(self, tangents: Array, given: int, t: Array) -> None:
+        self._frame, self._triangle = np.linalg.qr(tangents)
+        self._given, self._size = given, FIRST
+        with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
+            self.growth = Growth(t, np.log(np.abs(np.diag(self._triangle))))
+
+    def follow(
+        self, step_segments: Iterator[StepSegment], propagate_chunk: Callable[[Starts, NDArray[np.intp], Array], None]
+    ) -> None:
+        """Propagate to the end of the last step."""
+        for starts, numbers in step_segments:
+            done, steps = 0, len(starts.h)
+            while done < steps:
+                end = min(done + self._size, steps)
+                part, saved = starts.part(done, end), numbers[done : end + 1]
+                vectors = np.zeros((end - done + 1, self._frame.shape[1], self._given))
+                vectors[0, :, : len(self._frame)] = self._frame.T
+                propagate_chunk(part, saved, vectors)
+                done += self._take(part, saved[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))
+
+    def _take(self, part: Starts, numbers: NDArray[np.intp], images: Array) -> int:
+        """Accumulate as many (2m, k) images as are well conditioned, at least one; return their number."""
+        reduced = r_factors(images)
+        parted = ill_conditioned(reduced)
+        taken = max(1, int(np.argmax(parted))) if parted.any() else len(images)
+        sizes = np.linalg.norm(reduced[:taken] @ self._triangle, axis=1)
+        ends = np.append(part.t[:taken], part.t[taken - 1] + part.h[taken - 1])
+        with np.errstate(divide="ignore"):  # directions forbidden by constraints are mapped to 0
+            diagonals = np.log(np.abs(np.diagonal(reduced[:taken], axis1=1, axis2=2)))
+            self.growth.add(ends, numbers[:taken], np.log(sizes), diagonals)
+        self._frame, last = np.linalg.qr(images[taken - 1])
+        self._triangle = last @ self._triangle / sizes[-1]
+        self._size = taken if taken < len(images) else min(2 * self._size, MOST)
+        return taken

@@ -1,0 +1,1 @@
+"""Constraints: projection, multipliers, rank."""

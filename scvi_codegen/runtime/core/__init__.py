@@ -1,0 +1,1 @@
+"""Compiled methods and steppers: one step, Legendre transforms, checks of states and parameters."""

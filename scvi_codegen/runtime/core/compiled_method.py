@@ -1,0 +1,290 @@
+"""Compiled method: generated C source, its loaded libraries (plain, adaptive, with events) and its interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from scvi_codegen.display.cards import card, listed, plain
+from scvi_codegen.errors import MethodError
+from scvi_codegen.native import building
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.runtime.core.validation import (
+    Array,
+)
+from scvi_codegen.runtime.events.event import Event, EventLike, as_events
+
+__all__ = ["CompiledMethod", "Variants"]
+
+
+MOST_EVENT_SETS = 16
+"""Number of event sets whose compiled integrators are cached, so that repeated calls do not parse formulas again."""
+
+
+class Variants:
+    """C sources of the variants of a method by name, derived on first use.
+
+    The names are ``"ensemble"``, ``"controlled"`` (adaptive steps), ``"fallback"`` (Newton's iteration),
+    ``"derivatives"`` and ``"second_derivatives"`` of steps, and ``"changes K"`` (ensembles with K tangent vectors).
+
+    Args:
+        made: sources by name; ``None`` for a variant that the method lacks.
+        make: derives a source that is not among them.
+    """
+
+    def __init__(
+        self, made: Mapping[str, Source | None] | None = None, make: Callable[[str], Source | None] = lambda _: None
+    ) -> None:
+        self._made, self._make = dict(made or {}), make
+
+    def __getitem__(self, name: str) -> Source | None:
+        if name not in self._made:
+            self._made[name] = self._make(name)
+        return self._made[name]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # second derivatives and tangent-vector variants are slow to derive: included only if already made
+        for name in ("ensemble", "controlled", "fallback", "derivatives"):
+            _ = self[name]
+        return (Variants, (self._made,))
+
+
+class CompiledMethod:
+    """A method compiled for one system.
+
+    Attributes:
+        title: system and method, in one line.
+        coordinates, parameters: names, in order.
+        defaults: (k,) default parameter values.
+        dimension: degrees of freedom m.
+        momentum_map_names: names of the conserved quantities.
+        source: the C source it was compiled from.
+        fallback: source with Newton's iteration, if the main source contains only the fixed-point iteration.
+        events: events that every run records.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        interface: Interface,
+        *,
+        variants: Variants | None = None,
+        flags: tuple[str, ...] = building.TUNED_FLAGS,
+        events: tuple[Event, ...] = (),
+    ) -> None:
+        self.interface, self.flags, self.events = interface, flags, events
+        self._variants = Variants() if variants is None else variants
+        self._with_tangent: Binding | None = None
+        self._with_curvature: Binding | None = None
+        self._with_control: Self | None = None
+        self._event_variants: dict[tuple[Event, ...], Self] = {}
+        self._released_runs: list[Any] = []
+        self._plain = source
+        self.source = _event_variant(source, interface, events) if events else source
+        library = building.load(self.source, flags=flags)
+        self.binding = Binding(library, interface.prefix, interface.workspace, fallback=self._load_fallback)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {clipped(self.title, LONGEST - 20)}>"
+
+    def _repr_html_(self) -> str:
+        interface = self.interface
+        parameters = zip(interface.parameters, interface.defaults, strict=True)
+        return card(
+            interface.title,
+            (
+                ("method", plain(", ".join(interface.notes))),
+                ("coordinates", listed(interface.coordinates)),
+                ("parameters", listed([f"{name} = {value:g}" for name, value in parameters])),
+                ("C", plain(f"{interface.prefix}.c, {len(self.source.code.splitlines())} lines")),
+            ),
+        )
+
+    @property
+    def ensemble(self) -> Source | None:
+        """C source of the ensemble variant, derived on first use; ``None`` if the method has none."""
+        return self._variants["ensemble"]
+
+    @property
+    def fallback(self) -> Source | None:
+        """C source of the fallback library with Newton's iteration, derived on first use; ``None`` if not needed."""
+        return self._variants["fallback"]
+
+    @property
+    def derivatives(self) -> Source | None:
+        """C source with the derivatives of steps, derived on first use."""
+        return self._variants["derivatives"]
+
+    @property
+    def second_derivatives(self) -> Source | None:
+        """C source with second derivatives of steps, derived on first use; ``None`` if unavailable."""
+        return self._variants["second_derivatives"]
+
+    def _variational_source(self, count: int) -> Source | None:
+        """Return the C source of ensembles with ``count`` tangent vectors per trajectory, derived on first use.
+
+        ``None`` if tangent vectors can only be propagated by the derivatives of steps.
+        """
+        return self._variants[f"changes {count}"]
+
+    def prepare(
+        self,
+        *,
+        adaptive: bool = True,
+        tangent: bool = False,
+        second: bool = False,
+        ensemble: bool = False,
+        events: EventLike | Sequence[EventLike] | None = None,
+    ) -> None:
+        """Compile the variants that later calls would compile on first use, so that a run never waits for the compiler.
+
+        The Newton fallback of a fixed-point iteration is always compiled. Variants that the method lacks are skipped.
+
+        Args:
+            adaptive: the variant with adaptive step size, for ``t_end=``.
+            tangent: derivatives of steps, for ``jacobian``, ``tangent``, ``sensitivity``, ``pullback`` and the like.
+            second: second derivatives, for ``hessian_product``.
+            ensemble: the variant for many trajectories at once.
+            events: the formulas that later calls pass as ``events=``, all those of one call together.
+        """
+        for each in (self,) if events is None else (self, self.with_events(events)):
+            each.binding.set_fallback()
+            if adaptive and each._variants["controlled"] is not None:
+                each._adaptive().binding.set_fallback()
+        wanted = {"derivatives": tangent, "second_derivatives": second, "ensemble": ensemble}
+        for source in [self._variants[name] for name, is_wanted in wanted.items() if is_wanted]:
+            if source is not None:
+                building.load(source, flags=self.flags)
+
+    @property
+    def tangent(self) -> Binding:
+        """Library with derivatives of steps, compiled on first use."""
+        if self._with_tangent is None:
+            self._with_tangent = self._linearised(self.derivatives, "derivatives")
+        return self._with_tangent
+
+    @property
+    def _second_derivatives(self) -> Binding:
+        """Library with second derivatives of steps, compiled on first use; raises ``MethodError`` if unavailable."""
+        if self._with_curvature is None:
+            self._with_curvature = self._linearised(self.second_derivatives, "second derivatives")
+        return self._with_curvature
+
+    def _linearised(self, source: Source | None, what: str) -> Binding:
+        if source is None:
+            raise MethodError(f"{what} of the steps are unavailable for '{self.title}'{self._why_not()}")
+        binding = Binding(building.load(source, flags=self.flags), self.interface.prefix)
+        return binding.with_workspace(binding.constant("LINEARISED_WORKSPACE"))
+
+    def _why_not(self) -> str:
+        if not self.interface.energy_parameter:
+            return (
+                ": systems with damping have first derivatives only, and a pickled stepper has second derivatives only "
+                "if stepper.second_derivatives was used before pickling"
+            )
+        return (
+            ": in transformed time only first derivatives are available. Compile the original system with "
+            "time_transformation=..., or integrate it with t_end=..."
+        )
+
+    def _load_fallback(self) -> building.Library:
+        source = self.fallback
+        if source is None:
+            raise MethodError(
+                f"the fallback source with Newton's iteration is missing for '{self.title}': recompile it"
+            )
+        return building.load(source, flags=self.flags)
+
+    @property
+    def title(self) -> str:
+        """System and method, in one line."""
+        return self.interface.title
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Coordinate names."""
+        return self.interface.coordinates
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Parameter names."""
+        return self.interface.parameters
+
+    @property
+    def defaults(self) -> Array:
+        """(k,) default parameter values."""
+        return np.array(self.interface.defaults, dtype=float)
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Formulas g of the constraints g(q, t) = 0, in the order of multipliers."""
+        return self.interface.constraints
+
+    @property
+    def impulse_names(self) -> tuple[str, ...]:
+        """Names of the momentum maps of L alone that forces change, in the order of :meth:`Trajectory.impulses`."""
+        return self.interface.exchange_names[1:]
+
+    @property
+    def momentum_map_names(self) -> tuple[str, ...]:
+        """Names of the conserved quantities of the system: ``"angular momentum"``, ``"boost of x"``."""
+        return self.interface.map_names
+
+    @property
+    def dimension(self) -> int:
+        """Degrees of freedom m."""
+        return self.interface.dimension
+
+    def with_events(self, events: EventLike | Sequence[EventLike]) -> Self:
+        """Return the integrator with these events in place of its own."""
+        wanted = as_events(events)
+        if wanted == self.events:
+            return self
+        if wanted not in self._event_variants:
+            while len(self._event_variants) >= MOST_EVENT_SETS:
+                self._event_variants.pop(next(iter(self._event_variants)), None)
+            self._event_variants[wanted] = self._made_with_events(wanted)
+        return self._event_variants[wanted]
+
+    def _made_with_events(self, wanted: tuple[Event, ...]) -> Self:
+        return type(self)(
+            self._plain,
+            self.interface,
+            variants=self._variants,
+            flags=self.flags,
+            events=wanted,
+        )
+
+    def _adaptive(self) -> Self:
+        """Return the integrator with adaptive steps, loaded once; raise ``MethodError`` if the method has none."""
+        if self._with_control is None:
+            self._with_control = self._loaded_with_control()
+        return self._with_control
+
+    def _loaded_with_control(self) -> Self:
+        source = self._variants["controlled"]
+        if source is None:
+            raise MethodError(
+                f"adaptive steps are unavailable for {self.interface.method} and this system: the error estimate "
+                "requires forces at two or more stages, or velocities that vary along a step; give h and steps (fixed "
+                "step size)"
+            )
+        if source == self._plain:
+            return self
+        return type(self)(
+            source,
+            self.interface,
+            variants=self._variants,
+            flags=self.flags,
+            events=self.events,
+        )
+
+
+def _event_variant(source: Source, interface: Interface, events: tuple[Event, ...]) -> Source:
+    from scvi_codegen.rendering.events import with_events  # here, because it imports SymPy
+
+    return with_events(source, interface, tuple(event.function for event in events))

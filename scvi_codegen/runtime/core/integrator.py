@@ -1,0 +1,404 @@
+"""Compiled method for one system: steps, Legendre transforms and energies as pure functions of their arguments.
+
+All C calls release the GIL and share no state, so one integrator may be used from many threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import MethodError, StateError
+from scvi_codegen.native.arguments import checked_number, checked_step, real_array
+from scvi_codegen.native.binding import Binding
+from scvi_codegen.native.options import REASONS, SolverOptions, step_failure
+from scvi_codegen.runtime.core.named_arrays import flat_state, state_by_name
+from scvi_codegen.runtime.core.validation import (
+    Array,
+    Parameters,
+    check_inputs_given,
+    checked_parameters,
+    checked_states,
+    checked_vector,
+    parameter_index,
+)
+from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod
+
+__all__ = ["Integrator"]
+
+REPORTED = 1e-3
+"""Largest relative difference between a velocity and the velocity recomputed from its momentum."""
+
+
+class Integrator(LinearisedMethod):
+    """Computations of a compiled method."""
+
+    def step(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the state after one step from (q, p) at t to t + h, a pure function of its arguments.
+
+        Args:
+            q, p: (m,) positions and momenta.
+
+            h: step size, negative to integrate backward; step of tau in transformed time.
+            t: time.
+            parameters: values by name (others have their defaults) or all in order.
+            options: convergence criterion of the solver.
+
+        Returns:
+            (q1, p1), each (m,).
+
+        Raises:
+            StateError: if a shape or name is invalid, or a number is not finite.
+            StepFailedError: if the stage equations cannot be solved.
+        """
+        q0, p0 = self._vector(q, "q"), self._vector(p, "p")
+        check_inputs_given(self.interface, parameters)
+        q1, p1 = np.empty_like(q0), np.empty_like(p0)
+        given = (q0, p0, self._parameters_at(q0, p0, parameters))
+        self._solve(self.binding, "step", t, h, given, options, (q1, p1))
+        return q1, p1
+
+    def _solve(
+        self,
+        binding: Binding,
+        name: str,
+        t: float,
+        h: float,
+        given: Sequence[Array],
+        options: SolverOptions | None,
+        found: Sequence[Array],
+    ) -> None:
+        """Solve the equations of a step in C and fill the arrays ``found``; raise ``StepFailedError`` on failure."""
+        report = binding.new("report *")
+        status = binding.function(name)(
+            checked_number(t, "the time t"),
+            checked_step(h),
+            *map(binding.pointer, given),
+            binding.options(options),
+            *map(binding.pointer, found),
+            report,
+            binding.workspace(),
+        )
+        if status:
+            raise step_failure(status, report, step=0, h=h)
+
+    def _parameters_at(self, q: Array, p: Array, parameters: Parameters = None) -> Array:
+        """Return (k,) values in order; in transformed time the energy defaults to that of the state (q, p)."""
+        values = self._parameters(parameters)
+        if not self._has_energy(parameters):
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, p, 0.0, values)
+        return values
+
+    def _has_energy(self, parameters: Mapping[str, Any] | Sequence[Any] | Array | None) -> bool:
+        """Return whether the parameters contain the energy required by transformed time, or none is required."""
+        name = self.interface.energy_parameter
+        return not name or (parameters is not None and (not isinstance(parameters, Mapping) or name in parameters))
+
+    def rates(self, q: ArrayLike, p: ArrayLike, parameters: Parameters = None) -> Array:
+        """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
+        _, positions, momenta = checked_states(self.interface, q, p, 0.0)
+        found = np.ones(positions.size // self.dimension)
+        if not self.interface.energy_parameter:
+            return found
+        values = self.binding.pointer(self._parameters(parameters))
+        pointers = map(self.binding.pointer, (positions, momenta))
+        if self.binding.function("rates")(len(found), *pointers, values, self.binding.pointer(found)):
+            raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
+        return found
+
+    def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
+        return self._transform("momentum", q, v, t, parameters, "v")
+
+    def velocity(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return velocities v with dL/dv(q, v, t) = p, the inverse Legendre transform (Newton's iteration from v = 0).
+
+        Returns:
+            (m,), or (n, m) for (n, m) states with one time or (n,) times.
+        """
+        return self._transform("velocity", q, p, t, parameters, "p")
+
+    def _initial_momenta(
+        self, q: ArrayLike, p: ArrayLike | None, velocity: ArrayLike | None, t: float, parameters: Parameters
+    ) -> ArrayLike:
+        """Return the momenta of a state specified by p or by velocity.
+
+        Raises:
+            StateError: unless exactly one of both is passed.
+        """
+        name, given = self.momentum_or_velocity(p, velocity)
+        return given if name == "p" else self.initial_momentum(q, given, t, parameters)
+
+    def initial_momentum(self, q: ArrayLike, velocity: ArrayLike, t: float, parameters: Parameters) -> Array:
+        """Return the (m,) momentum of the initial state of a run.
+
+        Raises:
+            StateError: if the mass matrix is singular along the velocity, so the momentum does not determine it.
+        """
+        p, v = (
+            self._transform("momentum", q, velocity, t, parameters, "velocity"),
+            np.asarray(flat_state(self.interface, velocity, "velocity"), dtype=float),
+        )
+        dropped = (p == 0.0) & (v != 0.0)
+        if dropped.any():
+            try:
+                back = self.velocity(q, p, t, parameters)
+            except StateError:
+                back = np.full_like(v, np.nan)
+            dropped &= ~(np.abs(back - v) <= REPORTED * np.abs(v).max())
+        if not dropped.any():
+            return p
+        i = int(np.flatnonzero(dropped)[0])
+        name = self.coordinates[i]
+        raise StateError(
+            f"the velocity {name}_dot = {v.ravel()[i]:g} at q = {np.asarray(q)} has no momentum: the mass matrix is "
+            f"singular there in the direction of '{name}', so the motion is undetermined. Start from a state where the "
+            f"kinetic energy depends on {name}_dot, or use coordinates that are regular there (Cartesian instead of "
+            "polar coordinates at the origin)"
+        )
+
+    def momentum_or_velocity(self, p: ArrayLike | None, velocity: ArrayLike | None) -> tuple[str, ArrayLike]:
+        """Return the name and the value of the one of both that is passed.
+
+        Raises:
+            StateError: unless exactly one of both is passed.
+        """
+        if p is not None and velocity is None:
+            return "p", p
+        if velocity is not None and p is None:
+            return "velocity", velocity
+        raise StateError(f"give either p or velocity with q; got {'neither' if p is None else 'both'}")
+
+    def energy(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Any:
+        """Return the energy p.v - L: a float for (m,) states, (n,) for (n, m) with one time or (n,) times."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        result = self._energies_of(times, positions, momenta, self._parameters(parameters))
+        return float(result[0]) if np.ndim(q) == 1 else result
+
+    def _energies_of(self, t: Array, q: Array, p: Array, parameters: Array) -> Array:
+        """Return (n,) energies of unchecked contiguous arrays of shapes (n,), (n, m), (n, m) and (k,).
+
+        Raises:
+            StateError: if a state is outside the domain of L.
+        """
+        result, binding = np.empty(len(t)), self.binding
+        status = binding.function("energies")(
+            len(t), *map(binding.pointer, (t, q, p, parameters, result)), binding.workspace()
+        )
+        if status:
+            raise StateError(f"the energy of a state cannot be computed: {REASONS[status]}")
+        if name := self.interface.energy_parameter:
+            result = parameters[parameter_index(self.interface, name)] + result / self.rates(q, p, parameters)
+        return result
+
+    def momentum_maps(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return the k conserved quantities in the order of ``momentum_map_names``.
+
+        Returns:
+            (k,) for (m,) states, (n, k) for (n, m) states with one time or (n,) times.
+
+        Raises:
+            StateError: if a shape, name or number is invalid.
+        """
+        values = self._momentum_maps_and_sizes(q, p, t, parameters)[0]
+        return values[0] if np.ndim(q) == 1 else values
+
+    def _momentum_maps_and_sizes(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """Return (n, k) momentum maps and the root sum of squares of their terms, the scale of rounding errors."""
+        times, positions, momenta = checked_states(self.interface, q, p, t)
+        values, sizes = np.empty((2, len(times), len(self.momentum_map_names)))
+        if not values.size:
+            return values, sizes
+        status = self.binding.function("momentum_maps")(
+            len(times),
+            self.binding.pointer(times),
+            self.binding.pointer(positions),
+            self.binding.pointer(momenta),
+            self.binding.pointer(self._parameters(parameters)),
+            self.binding.pointer(values),
+            self.binding.pointer(sizes),
+        )
+        if status:
+            raise StateError(f"the momentum maps of a state cannot be computed: {REASONS[status]}")
+        return values, sizes
+
+    def discrete_lagrangian(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> float:
+        """Return L_d(q0, q1), the approximate action of the curve from q0 at t to q1 at t + h; paper (25), (33).
+
+        Raises:
+            MethodError: if the method has no discrete Lagrangian.
+            StepFailedError: if the boundary-value problem is not solved.
+        """
+        return self._discrete_legendre(q0, q1, h, t, parameters, options)[2]
+
+    def discrete_legendre_minus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """Return F-: (q0, q1) -> (q0, p0 = -D1 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q0, "q0"), self._discrete_legendre(q0, q1, h, t, parameters, options)[0]
+
+    def discrete_legendre_plus(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array]:
+        """Return F+: (q0, q1) -> (q1, p1 = D2 L_d(q0, q1)); paper, 1.2. Raises as :meth:`discrete_lagrangian`."""
+        return self._vector(q1, "q1"), self._discrete_legendre(q0, q1, h, t, parameters, options)[1]
+
+    def work_and_impulses(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """Return the state after a step, the work of the forces in it, and their impulses on ``impulse_names``.
+
+        The integrals of f . v and f . xi along the curve of the step use the method's own quadrature. Returned are q1
+        (m,), p1 (m,) and (1 + k,) values. J1 - J0 equals the impulse to round-off for SVI and related methods (forced
+        discrete Noether theorem).
+
+        Raises:
+            MethodError: if no forces act, or the method has no curve of positions.
+            StepFailedError: if Newton's iteration does not converge.
+        """
+        if not self.interface.exchange_names:
+            raise MethodError(
+                f"work and impulses are unavailable for {self.interface.method} and '{self.interface.system}': they "
+                "require forces, and SVI, SCVI, a Gauss method, or StoermerVerlet with solver='newton'"
+            )
+        check_inputs_given(self.interface, parameters)
+        state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
+        q1, p1, given = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
+        name = "work_and_impulses"
+        self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, given))
+        return q1, p1, given
+
+    def step_positions(
+        self,
+        q_previous: ArrayLike,
+        q_current: ArrayLike,
+        h: float,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        *,
+        options: SolverOptions | None = None,
+    ) -> Array:
+        """Solve the discrete Euler-Lagrange equation (4): (q_{k-1} at t, q_k at t + h) -> q_{k+1} at t + 2 h.
+
+        Raises as :meth:`discrete_lagrangian`.
+        """
+        q, p = self.discrete_legendre_plus(q_previous, q_current, h, t, parameters, options=options)
+        return self.step(q, p, h, t + h, parameters, options=options)[0]
+
+    def _discrete_legendre(
+        self,
+        q0: ArrayLike,
+        q1: ArrayLike,
+        h: float,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> tuple[Array, Array, float]:
+        if not self.interface.has_action:
+            raise MethodError(
+                f"{self.interface.method} has no discrete Lagrangian for '{self.interface.system}': this requires SVI, "
+                "SCVI or a Gauss method, and no forces"
+            )
+        check_inputs_given(self.interface, parameters)
+        ends = self._vector(q0, "q0"), self._vector(q1, "q1"), self._parameters(parameters)
+        p0, p1, action = *np.empty((2, self.dimension)), np.empty(1)
+        binding = self.binding.with_function("discrete_legendre")
+        self._solve(binding, "discrete_legendre", t, h, ends, options, (p0, p1, action))
+        return p0, p1, float(action[0])
+
+    def _transform(
+        self, name: str, q: ArrayLike, other: ArrayLike, t: ArrayLike, parameters: Parameters, label: str
+    ) -> Array:
+        if real_array(flat_state(self.interface, q, "q"), "q").ndim == 1:
+            at, values = checked_number(t, "the time t"), self._parameters(parameters)
+            return self._transformed(name, at, self._vector(q, "q"), self._vector(other, label), values)
+        times, positions, others = checked_states(self.interface, q, other, t, second=label)
+        values, result = self._parameters(parameters), np.empty_like(others)
+        for k, (at, position, row) in enumerate(zip(times.tolist(), positions, others, strict=True)):
+            result[k] = self._transformed(name, at, position, row, values)
+        return result
+
+    def _transformed(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        """Transform between p and dq/dt in transformed time, on the energy surface of the state."""
+        if not self.interface.energy_parameter:
+            return self._called(name, t, q, other, values)
+        if name == "velocity":
+            values[parameter_index(self.interface, self.interface.energy_parameter)] = self.energy(q, other, t, values)
+            return self._called(name, t, q, other, values) / self.rates(q, other, values)
+        rate = self.rates(q, np.zeros_like(q), values)
+        p = self._called(name, t, q, other * rate, values)
+        if self.rates(q, p, values) != rate:
+            raise StateError("dt/dtau depends on the momenta, so velocity does not determine them: give p")
+        return p
+
+    def _called(self, name: str, t: float, q: Array, other: Array, values: Array) -> Array:
+        result = np.empty_like(other)
+        status = self.binding.function(name)(
+            t,
+            self.binding.pointer(q),
+            self.binding.pointer(other),
+            self.binding.pointer(values),
+            self.binding.pointer(result),
+            self.binding.workspace(),
+        )
+        if status:
+            hint = "; if the Hamiltonian is singular in p, give p instead of velocity" if name == "momentum" else ""
+            raise StateError(f"the {name} at q = {q} and {other} cannot be computed: {REASONS[status]}{hint}")
+        return result
+
+    def arrays(self, values: Array) -> dict[str, Array]:
+        """Return (.., m) positions, momenta or velocities by the names of coordinates and of arrays of known sizes.
+
+        States are accepted in the same form, ``{"x": 0.0, "q": [..]}`` of ``coordinates=["x", "q[8]"]``.
+        """
+        return state_by_name(self.interface, values)
+
+    def _vector(self, value: ArrayLike, name: str) -> Array:
+        return checked_vector(self.interface, value, name)
+
+    def _parameters(self, parameters: Parameters) -> Array:
+        return checked_parameters(self.interface, parameters)

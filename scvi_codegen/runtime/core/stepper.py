@@ -1,0 +1,498 @@
+"""Compiled integrator for users: :class:`Integrator` with runs, trajectories and ensembles.
+
+``step`` is a pure function. A *run* (:meth:`Stepper.start`, used by :meth:`Stepper.integrate`) has memory: a predictor
+that extrapolates the previous step, and compensation terms of the state. The whole memory is one plain C struct;
+:meth:`Run.checkpoint` returns its bytes and :meth:`Stepper.from_checkpoint` continues from them bitwise equally.
+Neither SymPy nor Jinja is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, TypedDict, Unpack, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.chaos.ensemble import ChaosIndicatorsEnsemble
+from scvi_codegen.runtime.chaos.indicators import ChaosIndicators
+from scvi_codegen.runtime.constraints.projection import consistent, constraint_values, multipliers, projected
+from scvi_codegen.runtime.core.compiled_method import Variants
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array, Parameters
+from scvi_codegen.runtime.ensemble.independent import AdaptiveEnsemble
+from scvi_codegen.runtime.ensemble.initial_states import EnsembleParameters, momenta_of_each
+from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory
+from scvi_codegen.runtime.ensemble.selection import ensemble_work
+from scvi_codegen.runtime.events.event import Event, EventLike
+from scvi_codegen.runtime.inputs.segments import (
+    advance_to,
+    checked_inputs,
+    final_time,
+    first_inner_time,
+    parameters_of,
+    record_pieces,
+)
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_energy_errors, warn_of_large_steps
+from scvi_codegen.runtime.run.error_growth import GrowthCheck
+from scvi_codegen.runtime.run.global_error import checked_error, confirmed_run, warn_of_unconfirmed
+from scvi_codegen.runtime.run.observation import Observation, observed_until
+from scvi_codegen.runtime.run.run import Run
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.times import steps_to, times_after
+from scvi_codegen.runtime.trajectory.dense_output import times_of_run
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
+from scvi_codegen.validation.counts import checked_count
+
+__all__ = ["Stepper"]
+
+
+class Settings(TypedDict, total=False):
+    """Keyword arguments that :meth:`Stepper.integrate` takes with and without inputs."""
+
+    velocity: ArrayLike | None
+    h: float | None
+    steps: int | None
+    t_end: float | None
+    tolerance: float | None
+    save_every: int
+    t: float
+    parameters: Parameters
+    options: SolverOptions | None
+    progress: Callable[[int], None] | None
+    t_eval: ArrayLike | None
+    events: EventLike | Sequence[EventLike] | None
+    error: float | None
+    check_growth: bool | None
+
+
+class Stepper(Integrator):
+    """Compiled integrator of one system: :class:`Integrator` with integrations, runs, ensembles and projections."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_rebuild, (self._plain, self.interface, self._variants, self.flags, self.events))
+
+    @overload
+    def integrate(
+        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: None = None, **settings: Unpack[Settings]
+    ) -> Trajectory: ...
+    @overload
+    def integrate(
+        self, q: ArrayLike, p: ArrayLike | None = None, *, inputs: Mapping[str, Any], **settings: Unpack[Settings]
+    ) -> DrivenTrajectory: ...
+    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
+    def integrate(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: ArrayLike | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        t_eval: ArrayLike | None = None,
+        events: EventLike | Sequence[EventLike] | None = None,
+        error: float | None = None,
+        check_growth: bool | None = None,
+    ) -> Trajectory | DrivenTrajectory:
+        """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
+
+        Args:
+            q, p: (m,) initial positions and momenta.
+            inputs: of a system with inputs, by name: ``(t, values)``, interpolated linearly; ``(t, values, kind)`` with
+                ``"constant"`` (zero-order hold), ``"linear"`` or ``"cubic"`` (SciPy's spline); or a ``CubicSpline`` or
+                ``PPoly`` of degree 3 at most. Steps end at the breakpoints, which preserves the order; states there are
+                saved. Without them inputs need values among the parameters.
+            velocity: (m,) initial velocities, instead of p.
+            h: fixed step size, negative to integrate backward; step of tau in transformed time
+                (:func:`~scvi_codegen.reparametrise`).
+            steps: number of steps.
+            t_end: final time, instead of ``steps``. Without h steps are adaptive and the last ends there exactly. With
+                h (also in transformed time and with ``time_transformation``, :func:`~scvi_codegen.compile_stepper`) the
+                last step is shorter unless t_end - t is a multiple of h (within 1e-9).
+            tolerance: relative local error of an adaptive step; by default round-off.
+            save_every: steps between saved states; the state at t_end is also saved.
+            t: initial time.
+            parameters, options: as in :meth:`step`; in transformed time the energy defaults to that of (q, p).
+            progress: called with the number of completed steps.
+            t_eval: (n,) output times, sorted in the direction of the run, instead of ``save_every``; see
+                :meth:`Trajectory.at`. Not with inputs.
+            events: zero crossings to record in ``events`` of the trajectory; a terminal one ends the run. One or
+                several :class:`~scvi_codegen.runtime.events.event.Event` or functions of (q, v, p, t) as text or SymPy
+                expression, compiled once with the integrator. By default those of :func:`compile_stepper`.
+            error: instead of a tolerance, bound of the relative global error of all saved states up to t_end. Local
+                tolerances are reduced until a second run, with other steps and a perturbed initial state, confirms
+                the bound: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the trajectory. If double
+                precision does not suffice (chaotic motion), an :class:`~scvi_codegen.AccuracyWarning` reports the
+                time until which the bound is confirmed.
+            check_growth: after an adaptive run, repeat up to 2048 of its steps from an initial state perturbed in its
+                last place, unless a coarse run shows that errors grow slowly, and warn if the states differ by more
+                than 1e-7 (relative). ``True``: all steps, without a coarse run; ``False``: no check.
+
+        Returns:
+            A :class:`Trajectory` of steps // save_every + 1 states, fewer if an event ended it; with inputs a
+            :class:`DrivenTrajectory`, whose states at breakpoints are additional. An
+            :class:`~scvi_codegen.AccuracyWarning` reports the worst step if it is too large for the motion.
+
+        Raises:
+            StateError: if a shape, name or number is invalid, or inputs do not cover the run.
+            EventError: if an event function has an unknown symbol or is not finite.
+            StepFailedError: if a step fails; its ``trajectory`` contains the states before.
+        """
+        stepper = self if events is None else self.with_events(events)
+        if t_eval is not None and save_every != 1:
+            raise StateError(f"give either t_eval or save_every={save_every}, not both")
+        data = None if inputs is None else checked_inputs(self.interface, inputs)
+        if data is not None and t_eval is not None:
+            raise StateError("t_eval is not supported with inputs: omit t_eval")
+        if error is not None:
+            return confirmed_run(
+                checked_error(error, {"h": h, "steps": steps, "tolerance": tolerance}, has_tau=self._has_tau),
+                partial(stepper.integrate, inputs=inputs),
+                partial(stepper.with_events(()).integrate, inputs=inputs),
+                (q, p, velocity),
+                {"t": t, "options": options, "parameters": parameters},
+                {"t_end": t_end, "save_every": save_every, "progress": progress, "t_eval": t_eval},
+            )
+        to_end = h is None or bool(self.interface.time_transformation)
+        if data is None:
+            plan = h, t_end if to_end else None, tolerance
+            run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
+            check = GrowthCheck(run, check_growth)
+            found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
+            check.warn(found)
+            run._release()
+            return found
+        end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
+        values = parameters_of(self, parameters, data)
+        plan = h, end if to_end else None, tolerance
+        run = stepper._started(q, p, velocity, plan, t, values(first_inner_time(t, end)), options, reuse=True)
+        check = GrowthCheck(run, check_growth, lambda time: advance_to(run, data, time, values))
+        save_every = checked_count(save_every, "save_every", least=1)
+        driven = record_pieces(run, data, end, save_every=save_every, values=values, progress=progress)
+        check.warn(driven)
+        run._release()
+        return driven
+
+    @property
+    def _has_tau(self) -> bool:
+        """Return whether steps are steps of tau, by a transformed system or the reversible controller."""
+        return bool(self.interface.energy_parameter or self.interface.time_transformation)
+
+    @checks_arguments(StateError)
+    def start(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        velocity: ArrayLike | None = None,
+        h: float | None = None,
+        t: float = 0.0,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+    ) -> Run:
+        """Return a run from (q, p), or q and a velocity, at t, with fixed steps h or adaptive steps to t_end."""
+        return self._started(q, p, velocity, (h, t_end, tolerance), t, parameters, options)
+
+    def _started(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None,
+        velocity: ArrayLike | None,
+        step_plan: tuple[float | None, float | None, float | None],
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+        *,
+        reuse: bool = False,
+    ) -> Run:
+        """Return a run with (h, t_end, tolerance) as of :meth:`start`, in memory of an earlier one if ``reuse``."""
+        p = self._initial_momenta(q, p, velocity, t, parameters)
+        if self.interface.constraints:
+            q, p = consistent(self, q, p, t, parameters)
+        plan = self._checked_plan(*step_plan)
+        stepper = self._adaptive() if isinstance(plan, StepPlan) else self
+        run = Run._reused(stepper) if reuse else Run(stepper)
+        run._start(q, p, h=plan, t=t, parameters=parameters, options=options)
+        return run
+
+    def _checked_plan(self, h: float | None, t_end: float | None, tolerance: float | None) -> StepPlan | float:
+        """Return the step plan of adaptive steps, or h; raise ``StateError`` for other combinations."""
+        if self.interface.time_transformation:
+            return StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
+        if h is None and self.interface.energy_parameter:
+            raise StateError("adaptive steps are unavailable in transformed time: give h (fixed step in tau)")
+        if t_end is not None and h is None:
+            return StepPlan.checked(t_end, tolerance)
+        if t_end is not None or h is None:
+            raise StateError(
+                "give either h (fixed step size) or t_end (adaptive step size); got "
+                f"{'neither' if h is None else 'both'}"
+            )
+        if tolerance is not None:
+            raise StateError("tolerance requires adaptive steps: give t_end without h and steps")
+        return h
+
+    def from_checkpoint(
+        self,
+        saved: bytes,
+        *,
+        t_end: float | None = None,
+        tolerance: float | None = None,
+        h: float | None = None,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+    ) -> Run:
+        """Restore a run saved by :meth:`Run.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
+
+        ``h`` is required with a time transformation and not allowed otherwise.
+        """
+        if self.interface.time_transformation:
+            plan = StepPlan.in_tau(self.interface.time_transformation, h, t_end, tolerance)
+            return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
+        if h is not None:
+            raise StateError("omit h: the saved run contains its step size")
+        if t_end is None:
+            return Run.restored(self, saved, parameters=parameters, options=options)
+        plan = StepPlan.checked(t_end, tolerance)
+        return Run.restored(self._adaptive(), saved, parameters=parameters, options=options, plan=plan)
+
+    @checks_arguments(StateError, progress=FUNCTION, inputs=MAPPING)
+    def integrate_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        velocity: ArrayLike | None = None,
+        h: float | None = None,
+        steps: int | None = None,
+        t_end: ArrayLike | None = None,
+        tolerance: float | None = None,
+        save_every: int = 1,
+        t: float = 0.0,
+        t_eval: ArrayLike | None = None,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+        error: float | None = None,
+    ) -> EnsembleTrajectory:
+        """Run k trajectories on all cores, with common fixed steps (SIMD lanes) or with adaptive steps for each.
+
+        Args:
+            q, p: (k, m) initial positions and momenta.
+            inputs: of a system with inputs, as of :meth:`integrate`, common to all trajectories, or values of shape
+                (k, n), one row per trajectory. Fixed steps are common, end at all breakpoints and lead to one t_end.
+            velocity: (k, m) initial velocities, instead of p.
+            h, steps, save_every, t, options, progress: as in :meth:`integrate`.
+            t_end: final time; with h the last step is shorter unless h divides the time. Without h and steps: final
+                time, or (k,) final times, of adaptive steps; every ``save_every``-th state and the last state of each
+                trajectory are saved, with their times in ``times``, and ``progress`` is called with the number of
+                completed trajectories.
+            tolerance: relative error of an adaptive step; by default round-off.
+            t_eval: (n,) times at which states are saved instead; NaN after the end of a trajectory.
+            parameters: values by name, one number or k each; or an array (k, number of parameters).
+            threads: number of threads, by default one per core.
+            error: as of :meth:`integrate`, a bound of the relative global error of each trajectory, with a local
+                tolerance of its own: ``global_error``, ``confirmed_digits`` and ``confirmed_until`` of the result.
+
+        Returns:
+            An :class:`EnsembleTrajectory`; states equal those of :meth:`integrate` to round-off. A trajectory that
+            fails has NaN after the failure and the reason in ``status``; the others are unaffected.
+
+        Raises:
+            StateError: if a shape, name or number is invalid.
+        """
+        if error is not None:
+            others = {"h": h, "steps": steps, "tolerance": tolerance}
+            tau = self.interface.energy_parameter or self.interface.time_transformation
+            error = checked_error(error, others, has_tau=bool(tau))
+        work = ensemble_work(
+            self,
+            q,
+            p,
+            inputs=inputs,
+            velocity=velocity,
+            h=h,
+            steps=steps,
+            t_end=t_end,
+            tolerance=tolerance,
+            t_eval=t_eval,
+            save_every=save_every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        if error is not None and isinstance(work, AdaptiveEnsemble):
+            work.confirm(self, error, threads=threads)
+        work.run(progress=progress, threads=threads)
+        found = work.result()
+        warn_of_unconfirmed(found.confirmations)
+        warn_of_energy_errors(found)
+        return found
+
+    @checks_arguments(StateError, progress=FUNCTION)
+    def chaos_indicators_ensemble(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        h: float,
+        steps: int,
+        velocity: ArrayLike | None = None,
+        count: int | None = None,
+        directions: ArrayLike | None = None,
+        save_every: int | None = None,
+        t: float = 0.0,
+        parameters: EnsembleParameters = None,
+        options: SolverOptions | None = None,
+        progress: Callable[[int], None] | None = None,
+        threads: int | None = None,
+    ) -> ChaosIndicators:
+        """Return chaos indicators of K initial states over ``steps`` steps of size h.
+
+        For constant diagonal masses and forces of position and time, methods with a fixed-point iteration (SVI,
+        collocation) integrate eight trajectories at a time in SIMD lanes; otherwise the derivatives of single steps are
+        used, about ten times slower. Results agree to round-off.
+
+        Args:
+            q, p, velocity: (K, m) initial states, as of :meth:`integrate_ensemble`.
+            count, directions: tangent vectors, as of :meth:`Trajectory.chaos_indicators`; one suffices for MEGNO.
+            save_every: steps between saved values; by default only the last is saved.
+            t, parameters, options, threads: as of :meth:`integrate_ensemble`.
+            progress: called with the number of completed trajectories.
+
+        Returns:
+            :class:`ChaosIndicators` of shape (n, K, k): ``found.megno()[-1]`` has K values. A trajectory that fails has
+            NaN from at most a thousand steps before the failure on, and the reason in ``status``. An
+            :class:`~scvi_codegen.AccuracyWarning` is issued for too large steps, checked on every 64th trajectory.
+
+        Raises:
+            MethodError: if time is transformed.
+            StateError: if a shape, name or number is invalid.
+        """
+        p = momenta_of_each(self, q, p, velocity, t, parameters)
+        work = ChaosIndicatorsEnsemble(
+            self,
+            q,
+            p,
+            h=h,
+            steps=steps,
+            count=count,
+            directions=directions,
+            save_every=save_every,
+            t=t,
+            parameters=parameters,
+            options=options,
+        )
+        return work.run(progress=progress, threads=threads)
+
+    def project(
+        self,
+        q: ArrayLike,
+        p: ArrayLike | None = None,
+        *,
+        velocity: ArrayLike | None = None,
+        t: float = 0.0,
+        parameters: Parameters = None,
+    ) -> tuple[Array, Array]:
+        """Return the nearest state (q, p) on the constraint manifold, in the metric of the mass matrix.
+
+        Without p and velocity the initial velocity is 0.
+
+        Raises:
+            MethodError: if the system has no constraints.
+            StateError: if the iteration fails, or if the constraints are linearly dependent there.
+        """
+        momenta = self._initial_momenta(
+            q, p, np.zeros(self.dimension) if p is velocity is None else velocity, t, parameters
+        )
+        q1, p1, _ = projected(self, q, momenta, t, parameters)
+        return q1, p1
+
+    def multipliers(self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
+        """Return the Lagrange multipliers lambda of the constraint forces G^T lambda at states: (c,), or (n, c).
+
+        They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
+        l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
+        """
+        found = multipliers(self, q, p, t, parameters)
+        return found[0] if np.ndim(q) == 1 else found
+
+    def constraint_values(
+        self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None
+    ) -> tuple[Array, Array]:
+        """Return the constraint residuals g and their rates g_q v + g_t: (c,) each, or (n, c).
+
+        For a velocity constraint only the rate is defined; its g is 0 if it does not restrict positions.
+        """
+        g, rate = constraint_values(self, q, p, t, parameters)
+        return (g[0], rate[0]) if np.ndim(q) == 1 else (g, rate)
+
+
+def _recorded(
+    run: Run,
+    h: float | None,
+    steps: int | None,
+    t_end: float | None,
+    *,
+    save_every: int,
+    t_eval: ArrayLike | None,
+    progress: Callable[[int], None] | None,
+) -> Trajectory:
+    """Return the states of a run without inputs; arguments as of :meth:`Stepper.integrate`."""
+    interface = run.stepper.interface
+    clocked = bool(interface.energy_parameter)
+    if h is not None and t_end is not None and not interface.time_transformation:
+        whole = None if clocked or steps is not None else steps_to(run.t, t_end, h)
+        if whole is None or whole % checked_count(save_every, "save_every", least=1):
+            return _with_warnings(observed_until(run, t_end, steps, save_every, t_eval, progress))
+        steps = whole
+    _check_number(run, steps)
+    if t_eval is None:
+        return _with_warnings(run._recorded(steps, save_every=save_every, progress=progress))
+    if clocked:
+        raise StateError("t_eval requires t_end instead of steps in transformed time")
+    times = times_of_run(t_eval, run.t, _end_of(run, steps))
+    return _with_warnings(Observation(run, times=times).advance(steps, progress))
+
+
+def _check_number(run: Run, steps: int | None) -> None:
+    """Raise ``StateError`` for fixed steps without their number, and for adaptive steps with one."""
+    if run.plan is None and steps is None:
+        raise StateError("h requires steps or t_end (fixed step size); give t_end without h for adaptive steps")
+    if run.plan is not None and steps is not None:
+        raise StateError(f"adaptive steps end at t_end={run.plan.t_end:g}: omit steps={steps}, or give h and steps")
+
+
+def _with_warnings(trajectory: Trajectory) -> Trajectory:
+    """Return the trajectory after warnings about its step size and its energy."""
+    warn_of_large_steps(trajectory)
+    warn_of_energy_error(trajectory)
+    return trajectory
+
+
+def _end_of(run: Run, steps: int | None) -> float:
+    return run.plan.t_end if run.plan else float(times_after(run.t, run.h, checked_count(steps, "steps", least=0))[0])
+
+
+def _rebuild(
+    source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...], events: tuple[Event, ...]
+) -> Stepper:
+    return Stepper(source, interface, variants=variants, flags=flags, events=events)

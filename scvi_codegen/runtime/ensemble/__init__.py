@@ -1,0 +1,1 @@
+"""Ensembles: many initial states in SIMD lanes and threads."""

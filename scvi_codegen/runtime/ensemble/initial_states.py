@@ -1,0 +1,101 @@
+"""Validation of the initial states and parameters of ensembles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, real_array
+from scvi_codegen.runtime.constraints.projection import consistent
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.named_arrays import entries_by_name, flat_state
+from scvi_codegen.runtime.core.validation import Array, check_inputs_given, parameter_index
+
+__all__ = ["EnsembleParameters", "checked_ensemble", "momenta_of_each", "parameters_of_each", "start_of_ensemble"]
+
+EnsembleParameters = Mapping[str, ArrayLike] | Sequence[Any] | Array | None
+
+
+def checked_ensemble(stepper: Integrator, q: ArrayLike, p: ArrayLike) -> tuple[Array, Array]:
+    """Return validated (k, m) initial positions and momenta."""
+    positions, momenta = _states(stepper, q, "q"), _states(stepper, p, "p")
+    if positions.shape != momenta.shape:
+        raise StateError(f"q and p must have equal shapes, not {positions.shape} and {momenta.shape}")
+    return positions, momenta
+
+
+def momenta_of_each(
+    stepper: Integrator,
+    q: ArrayLike,
+    p: ArrayLike | None,
+    velocity: ArrayLike | None,
+    t: float,
+    parameters: EnsembleParameters,
+) -> ArrayLike:
+    """Return the momenta of states specified by p or by velocity, each with its own parameters."""
+    name, argument = stepper.momentum_or_velocity(p, velocity)
+    if name == "p":
+        return argument
+    at, positions, velocities = (
+        checked_number(t, "the time t"),
+        _states(stepper, q, "q"),
+        _states(stepper, argument, name),
+    )
+    if positions.shape != velocities.shape:
+        raise StateError(f"q and velocity must have equal shapes, not {positions.shape} and {velocities.shape}")
+    values = parameters_of_each(stepper, parameters, len(positions))
+    states = zip(positions, velocities, values, strict=True)
+    return np.array([stepper.initial_momentum(position, v, at, value) for position, v, value in states])
+
+
+def start_of_ensemble(
+    stepper: Integrator, q: ArrayLike, p: ArrayLike, t: float, parameters: EnsembleParameters
+) -> tuple[Array, Array, Array]:
+    """Return (k, m) positions and momenta, projected onto constraints, and (k, number of parameters) parameters."""
+    check_inputs_given(stepper.interface, parameters)
+    positions, momenta = checked_ensemble(stepper, q, p)
+    values = parameters_of_each(stepper, parameters, len(positions))
+    if stepper.interface.constraints:
+        for k, own in enumerate(values):
+            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own, check_rank=k == 0)
+    return positions, momenta, values
+
+
+def _states(stepper: Integrator, value: ArrayLike, name: str) -> Array:
+    """Return a validated (k, m) array of finite numbers."""
+    array = real_array(flat_state(stepper.interface, value, name), name)
+    if array.ndim == 1:
+        array = array[np.newaxis]
+    if array.ndim != 2 or array.shape[1] != stepper.dimension or len(array) == 0:
+        raise StateError(f"{name} must have shape (k, {stepper.dimension}), not {array.shape}")
+    if not np.isfinite(array).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(array)))
+        raise StateError(f"{name}[{j}, {i}] ({stepper.coordinates[i]}) is {array[j, i]}: it must be finite")
+    return array
+
+
+def parameters_of_each(stepper: Integrator, argument: EnsembleParameters, count: int) -> Array:
+    """Return (k, number of parameters) values: defaults overridden by name (one or k numbers each) or by an array."""
+    names = stepper.parameters
+    values = np.tile(stepper.defaults, (count, 1))
+    if isinstance(argument, Mapping):
+        for name, value in entries_by_name(stepper.interface, argument).items():
+            column = real_array(value, f"the parameter {name}")
+            if column.shape not in ((), (count,)):
+                raise StateError(
+                    f"the parameter {name} must be one number or {count} numbers, not of shape {column.shape}"
+                )
+            values[:, parameter_index(stepper.interface, name)] = column
+    elif argument is not None:
+        array = real_array(argument, "parameters")
+        if array.shape not in ((len(names),), (count, len(names))):
+            raise StateError(f"parameters must have shape ({count}, {len(names)}), not {array.shape}")
+        values[:] = array
+    if not np.isfinite(values).all():
+        j, i = (int(index[0]) for index in np.nonzero(~np.isfinite(values)))
+        raise StateError(f"the parameter {names[i]} of trajectory {j} is {values[j, i]}: it must be finite")
+    return values

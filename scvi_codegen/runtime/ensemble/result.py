@@ -1,0 +1,253 @@
+"""Result of an ensemble: states of many trajectories, diagnostics and files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.files.atomic import write_atomically
+from scvi_codegen.files.export import LABELLED, check_format, write_whole
+from scvi_codegen.files.labelled_arrays import Labelled, checked_units, to_dataset
+from scvi_codegen.representation import one_line
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.descriptions import short_title
+from scvi_codegen.runtime.run.global_error import ConfirmedEnsemble, GlobalError
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.quantities import quantities
+from scvi_codegen.runtime.trajectory.trajectory import relative_changes
+from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["INTERRUPTED", "OK", "EnsembleTrajectory", "Span"]
+
+OK, INTERRUPTED = "ok", "interrupted"
+
+Span: TypeAlias = tuple[slice, slice, Callable[[slice], Array]]
+"""Rows of states, a slice of trajectories, and a function returning the parameters of trajectories in these rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EnsembleTrajectory(ConfirmedEnsemble):
+    """States of k trajectories, the initial state first.
+
+    Attributes:
+        t: (n,) common times; tau from 0 in transformed time; row numbers if every trajectory has its own times.
+        q, p: (n, k, m) positions and momenta; NaN after a failure, and after the end of a shorter trajectory.
+        status: (k,) ``"ok"``, or the reason of the end (``"not converged"``, ``"singular"``, ``"not finite"``,
+            ``"step size underflow"``, ``"interrupted"``).
+        steps: (k,) completed steps.
+        h: step size; 0 for adaptive steps.
+        parameters: (k, number of parameters) values; zeros for the parameters of inputs.
+        stepper: the compiled integrator.
+        times: (n, k) times if every trajectory has its own (transformed time, adaptive steps), else ``None``.
+        plans: step plan of each trajectory for adaptive steps, else empty.
+        spans: with inputs, rows of states of a slice of trajectories and their parameters.
+        confirmations: with ``error=``, of each trajectory as of :class:`Trajectory`, ``None`` for one that fails; else
+            empty.
+    """
+
+    t: Array
+    q: Array
+    p: Array
+    status: NDArray[np.str_]
+    steps: NDArray[np.int64]
+    h: float
+    parameters: Array
+    stepper: Integrator = field(repr=False)
+    times: Array | None = None
+    plans: tuple[StepPlan, ...] = ()
+    spans: tuple[Span, ...] = field(default=(), repr=False)
+    confirmations: tuple[GlobalError | None, ...] = field(default=(), repr=False)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __repr__(self) -> str:
+        states = f"{len(self.t)} states of each of {len(self)} trajectories, {np.count_nonzero(self.ok)} of them ok"
+        return one_line(self, short_title(self.stepper.interface), states)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(k,) flags of the trajectories that reached the end."""
+        reached: NDArray[np.bool_] = self.status == OK
+        return reached
+
+    @property
+    def ends(self) -> tuple[Array, Array, Array]:
+        """Time, positions and momenta of the last state of each trajectory: (k,), (k, m), (k, m)."""
+        last = [each[0].size - 1 for each in self.each()]
+        j = np.arange(len(self))
+        return self._times()[last, j], self.q[last, j], self.p[last, j]
+
+    def each(self) -> Iterator[tuple[Array, Array, Array, str, int]]:
+        """Yield the times, positions and momenta of each trajectory, its status and its number of steps."""
+        times = self._times()
+        for j, (status, steps) in enumerate(zip(self.status.tolist(), self.steps.tolist(), strict=True)):
+            good = self._reached(j)
+            yield times[good, j], self.q[good, j], self.p[good, j], status, steps
+
+    def _times(self) -> Array:
+        """Return the (n, k) times."""
+        return np.broadcast_to(self.t[:, np.newaxis], self.q.shape[:2]) if self.times is None else self.times
+
+    def energy(self) -> Array:
+        """Return (n, k) energies p.v - L; NaN after a failure, and for trajectories that leave the domain of L."""
+        energies = np.full(self.q.shape[:2], np.nan)
+        for j, good, parameters in self._with_parameters():
+            try:
+                energies[good, j] = self.stepper.energy(
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                )
+            except StateError:
+                continue
+        return energies
+
+    def momentum_maps(self) -> Array:
+        """Return (n, k, c) values of the momentum maps ``stepper.momentum_map_names``; NaN as for :meth:`energy`."""
+        return self._momentum_maps()[0]
+
+    def momentum_errors(self) -> Array:
+        """Return (n, k, c) changes of the momentum maps since the first state, relative to their largest term."""
+        return relative_changes(*self._momentum_maps())
+
+    def _momentum_maps(self) -> tuple[Array, Array]:
+        values, sizes = np.full((2, *self.q.shape[:2], len(self.stepper.momentum_map_names)), np.nan)
+        for j, good, parameters in self._with_parameters():
+            try:
+                values[good, j], sizes[good, j] = self.stepper._momentum_maps_and_sizes(
+                    self.q[good, j], self.p[good, j], self._times()[good, j], parameters
+                )
+            except StateError:
+                continue
+        return values, sizes
+
+    def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
+        """Yield trajectories with the rows of their states and the parameters in these rows."""
+        for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
+            for j, own in zip(range(*some.indices(len(self))), parameters(some), strict=True):
+                good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
+                if good.size:
+                    yield j, good, own
+
+    @checks_arguments(path=PATH, units=MAPPING)
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write ``.npz``, ``.csv`` (one state a line: trajectory, t, q, p), ``.h5``, ``.nc`` or ``.zarr``, atomically.
+
+        CSV files number trajectories from 0, have columns for parameters that differ between trajectories, and omit
+        states after a failure. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
+
+        Raises:
+            StateError: if the suffix is unknown, or the format has no units.
+            MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
+        """
+        suffix, known = Path(path).suffix.lower(), checked_units(units)
+        self._check_common_times()
+        if suffix in LABELLED:
+            check_format(path)
+            write_whole(path, lambda made: LABELLED[suffix](self._labelled(known), made))
+            return
+        write = {".npz": self._write_npz, ".csv": self._write_csv}.get(suffix)
+        if write is None:
+            raise StateError(f"cannot save an ensemble as {str(path)!r}: use .npz, .csv, {', '.join(LABELLED)}")
+        if known:
+            raise StateError(f"{suffix} files cannot store units: use {', '.join(LABELLED)}, or omit units")
+        write_atomically(path, write)
+
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Return a dataset of q, p, velocity, energy, momentum_map, parameters, status and steps.
+
+        Args:
+            units: as of :meth:`Trajectory.to_xarray`.
+
+        Raises:
+            StateError: if units name an unknown variable.
+            MissingLibraryError: if xarray is not installed (extra ``data``).
+        """
+        self._check_common_times()
+        return to_dataset(self._labelled(checked_units(units)))
+
+    def _check_common_times(self) -> None:
+        if self.stepper.interface.energy_parameter:
+            raise StateError("ensembles in transformed time cannot be saved: their trajectories have no common times")
+
+    def _labelled(self, units: Mapping[str, str]) -> Labelled:
+        """Return the arrays with named dimensions."""
+        interface, each = self.stepper.interface, ("t", "trajectory")
+        dimensions: dict[str, tuple[str, ...]] = {"t": ("t",), "coordinate": ("coordinate",), "energy": each}
+        dimensions |= dict.fromkeys(("q", "p", "velocity"), (*each, "coordinate"))
+        dimensions |= {"status": ("trajectory",), "steps": ("trajectory",)}
+        whole: dict[str, NDArray[Any]] = {
+            "coordinate": np.array(interface.coordinates),
+            "status": self.status,
+            "steps": self.steps,
+        }
+        if interface.parameters:
+            dimensions |= {"parameter": ("parameter",), "parameters": ("trajectory", "parameter")}
+            whole |= {"parameter": np.array(interface.parameters), "parameters": self.parameters}
+        if interface.map_names:
+            dimensions |= {"symmetry": ("symmetry",), "momentum_map": (*each, "symmetry")}
+            whole["symmetry"] = np.array(interface.map_names)
+        states = {"t": self.t, "q": self.q, "p": self.p}
+        if self.times is not None:
+            dimensions["time"], states["time"] = each, self.times
+        return Labelled(
+            dimensions=dimensions,
+            pieces=lambda: iter([states | self._quantities()]),
+            whole=whole,
+            count=len(self.t),
+            units={name: unit for name, unit in units.items() if name in dimensions},
+            attributes={**interface.about(), "h": self.h},
+        )
+
+    def _quantities(self) -> dict[str, Array]:
+        times = np.nan_to_num(self._times())
+        found: dict[str, Array] = {}
+        for j, good, parameters in self._with_parameters():
+            part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
+            for name, values in part.items():
+                shape = (*self.q.shape[:2], *values.shape[1:])
+                found.setdefault(name, np.full(shape, np.nan))[good, j] = values
+        return found
+
+    def _reached(self, j: int) -> NDArray[np.bool_]:
+        """Return (n,) flags of the states that trajectory j reached."""
+        return np.asarray(np.isfinite(self.q[:, j]).all(axis=1), dtype=np.bool_)
+
+    def _write_npz(self, file: IO[bytes]) -> None:
+        times: dict[str, Any] = {} if self.times is None else {"times": self.times}
+        np.savez(
+            file,
+            t=self.t,
+            q=self.q,
+            p=self.p,
+            status=self.status,
+            steps=self.steps,
+            h=self.h,
+            parameters=self.parameters,
+            coordinates=np.array(self.stepper.coordinates),
+            parameter_names=np.array(self.stepper.parameters, dtype=str),
+            title=self.stepper.title,
+            **times,
+        )
+
+    def _write_csv(self, file: IO[bytes]) -> None:
+        names = self.stepper.coordinates
+        varied = [i for i, column in enumerate(self.parameters.T) if (column != column[0]).any()]
+        header = ["trajectory", *(self.stepper.parameters[i] for i in varied), "t", *names, *(f"p_{n}" for n in names)]
+        file.write((",".join(header) + "\n").encode())
+        formats = ["%d"] + ["%.17g"] * (len(header) - 1)
+        for j in range(len(self)):
+            good = self._reached(j)
+            label = np.broadcast_to([j, *self.parameters[j, varied]], (int(good.sum()), 1 + len(varied)))
+            table = np.column_stack([label, self._times()[good, j], self.q[good, j], self.p[good, j]])
+            np.savetxt(file, table, delimiter=",", fmt=formats)

@@ -1,0 +1,1 @@
+"""Parameter estimation: least squares, measurements, multiple shooting."""

@@ -1,0 +1,1 @@
+"""Events: zero crossings of functions along runs."""

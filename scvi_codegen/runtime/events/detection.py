@@ -1,0 +1,135 @@
+"""Event detection: the compiled search for zero crossings along the states of a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import EventError, StateError
+from scvi_codegen.native.options import step_failure
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.events.event import ACCUMULATED, Crossings
+from scvi_codegen.runtime.trajectory.dense_output import grid_tolerance
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+
+__all__ = ["CrossingSearch", "crossings_of"]
+
+INITIAL_CAPACITY = 256
+"""Initial number of crossings that one call can return; doubled when exceeded."""
+
+
+class CrossingSearch:
+    """Crossings of a stepper's events along consecutive parts of one run.
+
+    Args:
+        stepper: the stepper, with its events.
+        crossed: numbers of earlier crossings of each event; none by default.
+
+    Attributes:
+        ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
+        found: structured arrays (t, function, q, p), in the order of the run.
+    """
+
+    def __init__(self, stepper: Integrator, crossed: Sequence[int] = ()) -> None:
+        self.stepper, self.binding = stepper, stepper.binding
+        self.found: list[NDArray[Any]] = []
+        self.watch = self.binding.new("watch *")
+        for number, event in enumerate(stepper.events):
+            self.watch.direction[number] = event.direction
+            self.watch.remaining[number] = int(event.terminal) - (crossed[number] if crossed and event.terminal else 0)
+        m = stepper.dimension
+        numbers = [("t", float), ("fraction", float), ("function", np.int32), ("direction", np.int32)]
+        fields = [*numbers, ("q", float, (m,)), ("p", float, (m,))]
+        self._record = np.dtype(fields, align=True)
+        self._capacity = INITIAL_CAPACITY
+
+    @property
+    def ended(self) -> bool:
+        """Return whether a terminal event occurred."""
+        return bool(self.watch.ended)
+
+    def search(self, part: SavedStates, first: int = 0) -> int:
+        """Search between consecutive states of a trajectory; return the number of steps before the search ended.
+
+        Args:
+            part: the trajectory.
+            first: index of its first state in the run, for messages.
+
+        Raises:
+            EventError: if an event function is not finite.
+            StepFailedError: if a partial step fails.
+        """
+        h, t, q, p = map(np.ascontiguousarray, (part.step_sizes, part.t, part.q, part.p))
+        parameters, options = self.binding.pointer(part.parameters), self.binding.options(part.options)
+        workspace, report = self.binding.workspace(), self.binding.new("report *")
+        done = 0
+        while True:
+            crossings, filled = self.binding.new(f"crossing[{self._capacity}]"), self.binding.numbers("long long *")
+            status = self.binding.function("crossings")(
+                self.watch,
+                len(t) - done,
+                self.binding.pointer(h[done:]),
+                self.binding.pointer(t[done:]),
+                self.binding.pointer(q[done:]),
+                self.binding.pointer(p[done:]),
+                parameters,
+                options,
+                self._capacity,
+                crossings,
+                filled,
+                report,
+                workspace,
+            )
+            count = int(filled[0])
+            self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
+            done += int(report.steps)
+            if status:
+                raise self._failure(status, report, first + done, float(h[done]))
+            if self.ended:
+                return done - 1
+            if done == len(t) - 1:
+                return done
+            self._capacity *= 2
+
+    def _failure(self, status: int, report: Any, step: int, h: float) -> Exception:
+        if self.watch.undefined:
+            function = self.stepper.events[self.watch.undefined - 1].function
+            return EventError(f"the event function '{function}' is not finite in the step from t = {report.t:.17g}")
+        if self.watch.accumulated:
+            function = self.stepper.events[self.watch.accumulated - 1].function
+            return EventError(ACCUMULATED.format(function=function, t=report.t))
+        return step_failure(status, report, step=step, h=h)
+
+    def crossings(self) -> tuple[Crossings, ...]:
+        """Return the crossings by event."""
+        found = np.concatenate([np.empty(0, self._record), *self.found])
+        return tuple(
+            Crossings(event=event, t=mine["t"].copy(), q=mine["q"].copy(), p=mine["p"].copy())
+            for number, event in enumerate(self.stepper.events)
+            for mine in [found[found["function"] == number]]
+        )
+
+
+def crossings_of(stepper: Integrator, states: SavedStates) -> tuple[Crossings, ...]:
+    """Return the crossings of the stepper's events along a trajectory with all states saved; no event is terminal.
+
+    Raises:
+        StateError: if intermediate states were not saved.
+        EventError, StepFailedError: as :meth:`CrossingSearch.search`.
+    """
+    lengths, spans, tolerance = states.step_sizes.copy(), np.diff(states.stepped), grid_tolerance(states)[:-1]
+    short = np.abs(spans) < np.abs(lengths[:-1]) - tolerance
+    if short[:-1].any() or not (np.abs(spans) <= np.abs(lengths[:-1]) + tolerance).all():
+        raise StateError(
+            "events require all states, but this trajectory has save_every > 1 or t_eval: integrate with save_every=1"
+        )
+    lengths[:-1][short] = spans[short]  # an event ended the last step
+    search = CrossingSearch(stepper)
+    for number in range(len(stepper.events)):
+        search.watch.remaining[number] = 0
+    search.search(replace(states, step_sizes=lengths))
+    return search.crossings()

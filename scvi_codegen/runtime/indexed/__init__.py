@@ -1,0 +1,1 @@
+"""Runs of arrays whose sizes are known at run time."""

@@ -1,0 +1,21 @@
+"""Momentum maps of arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scvi_codegen.indices import IndexedMap
+from scvi_codegen.runtime.indexed.interface import Numbers
+
+__all__ = ["momentum_of"]
+
+
+def momentum_of(q: Numbers, p: Numbers, of: IndexedMap) -> float:
+    """Return the value of a momentum map from the positions and momenta of its array."""
+    if of.phase:
+        return float(np.sum(q**2 + p**2) / 2)
+    if of.component is None:
+        return float(np.sum(p))
+    if of.other is None:
+        return float(np.sum(p[..., of.component]))
+    return float(np.sum(q[..., of.component] * p[..., of.other] - q[..., of.other] * p[..., of.component]))

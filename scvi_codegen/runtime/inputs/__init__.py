@@ -1,0 +1,1 @@
+"""Runs with inputs: piecewise polynomials and the segments between their breakpoints."""

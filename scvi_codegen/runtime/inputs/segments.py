@@ -1,0 +1,363 @@
+"""Runs with inputs: integrate from breakpoint to breakpoint of piecewise cubic functions of time.
+
+Steps end at breakpoints; compensated sums continue across them. See :mod:`scvi_codegen.formulas.inputs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.runtime.core.validation import Array, TakesInputs, check_left_to_inputs, no_input
+from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
+from scvi_codegen.runtime.run.accuracy import warn_of_large_steps
+from scvi_codegen.runtime.run.descriptions import DescribedRun
+from scvi_codegen.runtime.run.memory import STEPS_PER_CALL
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.run.times import times_after
+from scvi_codegen.runtime.trajectory.dense_output import checked_times
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+from scvi_codegen.validation.counts import checked_count
+
+if TYPE_CHECKING:
+    from scvi_codegen.runtime.core.integrator import Integrator
+    from scvi_codegen.runtime.run.run import Run
+
+__all__ = [
+    "Input",
+    "Segment",
+    "advance_to",
+    "checked_inputs",
+    "final_time",
+    "first_inner_time",
+    "input_of",
+    "parameters_at",
+    "parameters_of",
+    "planned_segments",
+    "prepared_segments",
+    "record_pieces",
+    "time_after_steps",
+    "with_final_state",
+]
+
+POWERS = 4
+ALL = slice(None)
+NEGLIGIBLE_STEP = 1e-9
+"""Fraction of a step below which the remainder before a breakpoint is skipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """Piecewise cubic function of time.
+
+    Attributes:
+        breakpoints: (n + 1,) ascending times.
+        pieces: (n, 5) C parameters of each piece: ascending coefficients in powers of the time since its breakpoint,
+            and that breakpoint; (n, k, 5) for k trajectories.
+    """
+
+    breakpoints: Array
+    pieces: Array
+
+    def parameters(self, t: float, part: slice = ALL) -> Array:
+        """Return the (5,) parameters of the piece that contains t, or (k, 5) for the trajectories ``part``."""
+        piece = int(self.breakpoints.searchsorted(t, side="right")) - 1
+        found: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
+        return found[part] if found.ndim == 2 else found
+
+
+def checked_inputs(
+    interface: TakesInputs, argument: Mapping[str, Any] | None, trajectories: int | None = None
+) -> dict[str, Input]:
+    """Return validated inputs: (t, values), (t, values, kind) or a piecewise polynomial of SciPy for each name.
+
+    With a number of trajectories, values may have one row for each trajectory.
+
+    Raises:
+        StateError: if a name is no input, an input is missing, or data define no function of time.
+    """
+    names, argument = interface.inputs, dict(argument or {})
+    if interface.energy_parameter:
+        raise StateError("inputs are not supported in transformed time: compile the original system")
+    for name in argument:
+        if name not in names:
+            raise no_input(name, names)
+    if missing := [name for name in names if name not in argument]:
+        raise StateError(f"the input '{missing[0]}' is not set: pass inputs={{'{missing[0]}': (t, values)}}")
+    return {name: input_of(name, value, trajectories) for name, value in argument.items()}
+
+
+def input_of(name: str, argument: Any, trajectories: int | None = None) -> Input:
+    """Return one validated input; raises as :func:`checked_inputs`."""
+    if isinstance(argument, Input):
+        return argument
+    if callable(argument) and not hasattr(argument, "c"):
+        raise StateError(
+            f"the input '{name}' is a Python function, which the C code cannot call: sample it and pass (t, values) or "
+            "scipy.interpolate.CubicSpline(t, values)"
+        )
+    if hasattr(argument, "c") and hasattr(argument, "x"):
+        return _from_pieces(name, *_powers(name, argument), trajectories)
+    if not isinstance(argument, tuple) or len(argument) not in (2, 3):
+        raise StateError(f"the input '{name}' must be (t, values) or (t, values, 'cubic'), not {argument!r:.60}")
+    t, values = (
+        checked_times(part, f"{what} of the input {name}")
+        for part, what in zip(argument, ("t", "values"), strict=False)
+    )
+    kind = argument[2] if len(argument) == 3 else "linear"
+    if kind not in list(KINDS):
+        raise StateError(f"the interpolation of the input '{name}' must be {' or '.join(KINDS)}, not {kind!r}")
+    if t.ndim != 1 or len(t) < 2 or values.shape not in (t.shape, (trajectories, *t.shape)):
+        rows = "" if trajectories is None else f" (or one row of values for each of {trajectories} trajectories)"
+        raise StateError(
+            f"the input '{name}' must have equally many times and values, at least two{rows}; got shapes {t.shape} and "
+            f"{values.shape}"
+        )
+    _check_ascending(name, t)
+    return _from_pieces(name, t, KINDS[kind](t, values), trajectories)
+
+
+def _powers(name: str, argument: Any) -> tuple[Array, Array]:
+    """Return breakpoints and ascending coefficients of a SciPy piecewise polynomial, without pieces of zero length."""
+    from scipy.interpolate import PPoly  # here: slow to import
+
+    if not isinstance(argument, PPoly):
+        raise StateError(
+            f"the input '{name}' is a {type(argument).__name__}: convert it, as by PPoly.from_bernstein_basis"
+        )
+    x, c = (checked_times(argument.x, f"x of the input {name}"), checked_times(argument.c, f"c of the input {name}"))
+    long = np.diff(x) != 0.0
+    breakpoints = np.append(x[:-1][long], x[-1])
+    _check_ascending(name, breakpoints)
+    return breakpoints, np.moveaxis(c[::-1, long], 1, -1)
+
+
+def _check_ascending(name: str, t: Array) -> None:
+    if (late := np.flatnonzero(np.diff(t) <= 0.0)).size:
+        k = int(late[0])
+        raise StateError(f"the times of the input '{name}' must be ascending: {t[k + 1]:g} follows {t[k]:g}")
+
+
+def _constant(t: Array, values: Array) -> Array:
+    return values[np.newaxis, ..., :-1]
+
+
+def _linear(t: Array, values: Array) -> Array:
+    return np.array([values[..., :-1], np.diff(values) / np.diff(t)])
+
+
+def _cubic(t: Array, values: Array) -> Array:
+    from scipy.interpolate import CubicSpline  # here: slow to import
+
+    return np.moveaxis(CubicSpline(t, values, axis=-1).c[::-1], 1, -1)
+
+
+KINDS: dict[str, Callable[[Array, Array], Array]] = {"constant": _constant, "linear": _linear, "cubic": _cubic}
+
+
+def _from_pieces(name: str, breakpoints: Array, ascending: Array, trajectories: int | None) -> Input:
+    shaped = ascending.shape[1:-1] in ((), (trajectories,))
+    if not shaped or len(ascending) > POWERS or not np.isfinite(ascending).all():
+        raise StateError(
+            f"the input '{name}' must be piecewise polynomial, of degree 3 at most, with finite coefficients"
+        )
+    pieces = np.zeros((ascending.shape[-1], *ascending.shape[1:-1], POWERS + 1))
+    pieces[..., : len(ascending)] = ascending.T
+    pieces.T[POWERS] = breakpoints[:-1]
+    return Input(breakpoints, pieces)
+
+
+def inputs_of_slice(inputs: Mapping[str, Input], part: slice) -> dict[str, Input]:
+    """Return the inputs of a slice of the trajectories of an ensemble."""
+    return {
+        name: replace(data, pieces=data.pieces[:, part]) if data.pieces.ndim == 3 else data
+        for name, data in inputs.items()
+    }
+
+
+def record_pieces(
+    run: Run,
+    inputs: Mapping[str, Input],
+    t_end: float,
+    *,
+    save_every: int,
+    values: Callable[[float], Array],
+    progress: Callable[[int], None] | None,
+) -> DrivenTrajectory:
+    """Integrate to t_end, piece by piece.
+
+    Args:
+        run: the run at its start; its ``plan`` is set for adaptive steps.
+        inputs: inputs by name.
+        t_end: final time.
+        save_every: steps between saved states; states at breakpoints are saved as well.
+        values: function that returns the parameters of the piece containing a time.
+        progress: called with the number of completed steps.
+    """
+    pieces: list[Trajectory] = []
+    first, run._crossed = run.steps, (0,) * len(run.stepper.events)
+    report = None if progress is None else lambda _: progress(run.steps - first)
+    for steps in prepared_segments(run, inputs, t_end, values):
+        piece = run.record(steps, save_every=save_every, progress=report)
+        run._crossed = tuple(n + len(found) for n, found in zip(run._crossed, piece.events, strict=True))
+        terminal = [int(found.event.terminal) for found in piece.events]
+        ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))
+        pieces.append(piece if ended else with_final_state(piece, run))
+        if ended:
+            break
+    if run._leaving and pieces:
+        warn_of_large_steps(pieces[-1])
+    return DrivenTrajectory(tuple(pieces or [run.record(0)]))
+
+
+def prepared_segments(
+    run: RunWithInputs, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]
+) -> Iterator[int | None]:
+    """Prepare the run for each segment between breakpoints, in order.
+
+    Yields:
+        The number of steps of the segment; ``None`` for adaptive steps to the target time of the run.
+    """
+    if run.plan is None:
+        for segment in planned_segments(run.t, t_end, run.h, inputs):
+            run.update(parameters=values(segment.middle), h=segment.h)
+            yield segment.steps
+        return
+    for end in breakpoints_until(run.t, t_end, inputs):
+        run.update(parameters=values(run.t + 0.5 * (end - run.t)), plan=replace(run.plan, t_end=end))
+        yield None
+
+
+def advance_to(run: RunWithInputs, inputs: Mapping[str, Input], t_end: float, values: Callable[[float], Array]) -> None:
+    """Advance a run with adaptive steps to a time without saving intermediate states."""
+    for _ in prepared_segments(run, inputs, t_end, values):
+        while not run.arrived:
+            run.advance(STEPS_PER_CALL)
+
+
+class RunWithInputs(DescribedRun, Protocol):
+    """Interface required of a run with inputs."""
+
+    @property
+    def arrived(self) -> bool:
+        """Return whether the run has reached its target time."""
+
+    def advance(self, steps: int) -> None:
+        """Take ``steps`` steps, fewer if the target time is reached."""
+
+    def update(self, *, parameters: Array, h: float | None = None, plan: StepPlan | None = None) -> None:
+        """Set parameters and optionally the step size or the target time."""
+
+
+class Segment(NamedTuple):
+    """Segment of equal steps within one piece of every input.
+
+    Attributes:
+        start: start time as a double-double number.
+        middle: a time inside the piece.
+    """
+
+    steps: int
+    h: float
+    start: tuple[float, float]
+    middle: float
+
+
+def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Segment]:
+    """Return the segments from t to t_end: steps of h, and a shorter one before each breakpoint and the end."""
+    forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
+    for end in breakpoints_until(t, t_end, inputs):
+        middle = now[0] + 0.5 * (end - now[0])
+        if whole := int(np.floor(((end - now[0]) - now[1]) / h + NEGLIGIBLE_STEP)):
+            found.append(Segment(whole, h, now, middle))
+            now = time_after_steps(now, h, whole)
+        rest = (end - now[0]) - now[1]
+        if forward * rest > negligible:
+            found.append(Segment(1, rest, now, middle))
+            now = time_after_steps(now, rest, 1)
+    return found
+
+
+def time_after_steps(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:
+    """Return the double-double time after ``steps`` steps of h."""
+    high, low = map(float, times_after(now[0], h, steps))
+    total = high + (low + now[1])
+    return total, (low + now[1]) - (total - high)
+
+
+def with_final_state(piece: Trajectory, run: Run) -> Trajectory:
+    """Append the final state of a segment if the output stride skipped it."""
+    if piece.t[-1] == run.t:
+        return piece
+    iterations, run.iterations = run.iterations, 0
+    return replace(
+        piece,
+        t=np.append(piece.t, run.t),
+        q=np.append(piece.q, [run.q], axis=0),
+        p=np.append(piece.p, [run.p], axis=0),
+        iterations=np.append(piece.iterations, np.int32(iterations)),
+        step_sizes=np.append(piece.step_sizes, run.h),
+    )
+
+
+def breakpoints_until(t: float, t_end: float, inputs: Mapping[str, Input]) -> list[float]:
+    """Return the breakpoints between t and t_end in the direction of the run, followed by t_end."""
+    low, high = min(t, t_end), max(t, t_end)
+    inner: set[float] = set()
+    for name, data in inputs.items():
+        first, last = data.breakpoints[0], data.breakpoints[-1]
+        slack = NEGLIGIBLE_STEP * (last - first)
+        if low < first - slack or high > last + slack:
+            raise StateError(
+                f"the input '{name}' covers t = {first:g} to {last:g}, but the run goes from {low:g} to {high:g}: "
+                "extend the data, or shorten the run"
+            )
+        inner |= {float(x) for x in data.breakpoints if low < x < high}
+    ends = sorted(inner, reverse=bool(t_end < t))
+    return [*ends, *([t_end] if t_end != t else [])]
+
+
+def final_time(t: float, h: float | None, steps: int | None, t_end: float | None) -> float:
+    """Return the final time of a run with inputs, given by t_end or by h and steps."""
+    t = checked_number(t, "the time t")
+    if (t_end is None) == (steps is None):
+        raise StateError(f"give either t_end or steps with inputs; got {'neither' if steps is None else 'both'}")
+    if t_end is None:
+        if h is None:
+            raise StateError(
+                "steps requires h (fixed step size): give h, or t_end instead of steps (adaptive step size)"
+            )
+        return float(times_after(t, checked_step(h), checked_count(steps, "steps", least=0))[0])
+    end = checked_number(t_end, "t_end")
+    if h is not None and (end - t) * checked_step(h) < 0.0:
+        raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {end:g}: use h = {-h:g}")
+    return end
+
+
+def first_inner_time(t: float, t_end: float) -> float:
+    """Return a time inside the first piece of a run: just after t, or just before it for a run backward."""
+    return float(np.nextafter(t, t_end))
+
+
+def parameters_of(stepper: Integrator, argument: Any, inputs: Mapping[str, Input]) -> Callable[[float], Array]:
+    """Return a function of time that evaluates all parameters, those of inputs by their pieces."""
+    check_left_to_inputs(stepper.interface, argument)
+    return partial(parameters_at, stepper.parameters, stepper._parameters(argument), inputs)
+
+
+def parameters_at(
+    names: Sequence[str], others: Array, inputs: Mapping[str, Input], t: float, part: slice = ALL
+) -> Array:
+    """Return (p,) parameter values at t, or (k, p) for a slice of the trajectories; inputs override ``others``."""
+    values = others[part].copy()
+    for name, data in inputs.items():
+        first = names.index(f"{name}_0")
+        values[..., first : first + POWERS + 1] = data.parameters(t, part)
+    return values

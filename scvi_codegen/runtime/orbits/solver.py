@@ -1,0 +1,416 @@
+"""Periodic orbits: Newton's iteration on the state after one period, with the exact monodromy matrix.
+
+Where tangent vectors grow along the guess, the period is cut into segments first (multiple shooting).
+
+Periodic orbits are not isolated: the initial point is arbitrary, and orbits form one-parameter families (by energy or
+another conserved quantity). Each Newton step is the minimum-norm solution of the linearised equations (Moore-Penrose
+inverse), so the iteration converges to a nearby orbit without phase conditions. Equations implied by conserved
+quantities are projected out (Munoz-Almaraz et al., Physica D 181 (2003) 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import MethodError, OrbitError, StateError, StepFailedError, closest
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.stepper import Stepper
+from scvi_codegen.runtime.core.validation import (
+    Array,
+    Parameters,
+    check_inputs_given,
+    checked_parameters,
+    checked_vector,
+)
+from scvi_codegen.runtime.estimation.measurements import state_names
+from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit
+from scvi_codegen.runtime.run.times import steps_within, times_after
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.validation.argument_types import NAMES, SWITCH, checks_arguments, of
+from scvi_codegen.validation.counts import checked_count
+
+__all__ = ["periodic_orbit"]
+
+MOST_ITERATIONS, MOST_HALVINGS = 50, 12
+EASY, GROWTH = 10.0, 4.0
+"""Growth of tangent vectors in a period up to which one segment is enough, and that in each of more segments."""
+NULL_SINGULAR_VALUE = 1e-9
+"""Singular values below this fraction of the largest count as zero in the pseudoinverse."""
+CLOSED = 1e-11
+"""Largest closing error, relative to the size of the state and the norm of the monodromy matrix."""
+CONSERVED = 1e-3
+"""Relative error of the transported gradient of an integral up to which the integral counts as conserved."""
+DIFFERENCE_INCREMENT = 1e-6
+"""Increment of the finite differences of integrals, relative to the size of the state."""
+SETTLED = 1e-13
+"""Newton step, relative to state and period, below which the iteration ends."""
+MOST_INCREASE = 10.0
+"""Largest factor by which a Newton step may increase the residual."""
+EQUILIBRIUM_MOTION = 1e-6
+"""Motion over a period, relative to the size of the state, below which an orbit counts as an equilibrium."""
+
+
+@checks_arguments(StateError, stepper=of("a compiled stepper", Stepper), fixed=NAMES, fixed_period=SWITCH)
+def periodic_orbit(
+    stepper: Stepper,
+    q: ArrayLike,
+    p: ArrayLike | None = None,
+    *,
+    velocity: ArrayLike | None = None,
+    period: float,
+    steps: int | None = None,
+    h: float | None = None,
+    fixed_period: bool = False,
+    energy: float | None = None,
+    fixed: Sequence[str] = (),
+    gain: ArrayLike | None = None,
+    t: float = 0.0,
+    parameters: Parameters = None,
+    options: SolverOptions | None = None,
+) -> PeriodicOrbit:
+    """Find a periodic orbit near an initial guess, by Newton's iteration with exact derivatives of the steps.
+
+    Where the orbit is unstable, multiple shooting improves the guess first.
+
+    Args:
+        stepper: the compiled stepper.
+        q, p, velocity: (m,) initial guess of a state on the orbit, with one of p and velocity.
+        period: initial guess of the period, positive.
+        steps: number of steps per period.
+        h: instead of ``steps``, the largest step size for the initial period; its sign is ignored.
+        fixed_period: keep the period fixed; required if the system depends on time.
+        energy: prescribed energy of the orbit.
+        fixed: coordinates and momenta (``"p_x"``) that keep their initial values: an amplitude, or a section such as
+            ``["y"]``.
+        gain: (m,) increase of the positions over a period: 2 pi for a rotating angle, by default 0.
+        t, parameters, options: as of :meth:`Stepper.integrate`.
+
+    Returns:
+        A :class:`PeriodicOrbit`.
+
+    Raises:
+        OrbitError: if the iteration does not converge, converges to an equilibrium or to another energy, or if the
+            system is not periodic in time with this period.
+        MethodError: if time is transformed, the stepper has constraints, an energy is prescribed with
+            forces, or the period of a time-dependent system is free.
+        StateError: if a shape, name or number is invalid, or an input is not set.
+        StepFailedError: if a step from the initial guess fails.
+    """
+    search = _OrbitSearch.checked(
+        stepper,
+        period=period,
+        steps=steps,
+        h=h,
+        fixed_period=fixed_period,
+        energy=energy,
+        fixed=fixed,
+        gain=gain,
+        t=t,
+        parameters=parameters,
+        options=options,
+    )
+    momenta = stepper._initial_momenta(q, p, velocity, search.t, search.parameters)
+    start = np.concatenate([checked_vector(stepper.interface, each, name) for each, name in ((q, "q"), (momenta, "p"))])
+    return search.orbit(np.append(start, search.period))
+
+
+@dataclass(frozen=True, eq=False)
+class _OrbitSearch:
+    """Equations of a periodic orbit as a function of z = (q, p, period).
+
+    Attributes:
+        fixed_indices: indices of the fixed entries of z, -1 that of the period.
+    """
+
+    stepper: Stepper
+    period: float
+    steps: int
+    fixed_indices: tuple[int, ...]
+    energy: float | None
+    gain: Array
+    t: float
+    parameters: Array
+    options: SolverOptions | None
+
+    @classmethod
+    def checked(
+        cls,
+        stepper: Stepper,
+        *,
+        period: float,
+        steps: int | None,
+        h: float | None,
+        fixed_period: bool,
+        energy: float | None,
+        fixed: Sequence[str],
+        gain: ArrayLike | None,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> _OrbitSearch:
+        """Construct from validated arguments of :func:`periodic_orbit`."""
+        interface, names = stepper.interface, state_names(stepper)
+        stepper._check_fixed_steps("periodic_orbit")
+        check_inputs_given(interface, parameters)
+        if interface.constraints:
+            raise MethodError("periodic_orbit does not support constraints: use independent coordinates")
+        if energy is not None and interface.exchange_names:
+            raise MethodError(f"energy cannot be prescribed, because forces act on '{interface.system}': omit energy")
+        if (period := checked_number(period, "the period")) <= 0.0:
+            raise StateError(f"the period must be positive, not {period:g}")
+        if (steps is None) == (h is None):
+            raise StateError(
+                f"give either steps (of a period) or h (largest); got {'neither' if h is None else 'both'}"
+            )
+        for name in fixed:
+            if name not in names:
+                raise StateError(f"fixed names '{name}', which is no coordinate or momentum{closest(name, names)}")
+        return cls(
+            stepper=stepper,
+            period=period,
+            steps=checked_count(steps, "steps", least=1) if h is None else int(steps_within(period, checked_step(h))),
+            fixed_indices=(*map(names.index, dict.fromkeys(fixed)), *([-1] if fixed_period else [])),
+            energy=None if energy is None else checked_number(energy, "the energy"),
+            gain=np.zeros(stepper.dimension) if gain is None else checked_vector(interface, gain, "gain"),
+            t=checked_number(t, "the time t"),
+            parameters=checked_parameters(interface, parameters),
+            options=options,
+        )
+
+    def orbit(self, guess: Array) -> PeriodicOrbit:
+        """Return the orbit near a guess."""
+        z, found, iterations = self._iterated(*self._by_segments(guess))
+        m, motion = self.stepper.dimension, found.motion
+        size = float(np.abs([z[:-1], guess[:-1]]).max())
+        allowed = CLOSED * max(1.0, float(np.linalg.norm(motion.monodromy, 2)))
+        if not found.error <= allowed * size:
+            raise OrbitError(
+                f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
+                f"{found.error:.1e}. Give a better initial guess, or more steps"
+            )
+        self._check_energy(found, allowed * size)
+        if np.linalg.norm(motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
+            raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
+        if motion.by_time.any():
+            self._check_repeats(z, found, allowed * size)
+        return PeriodicOrbit(
+            q=z[:m],
+            p=z[m:-1],
+            t=self.t,
+            period=float(z[-1]),
+            steps=self.steps,
+            monodromy=motion.monodromy,
+            residual=found.error,
+            iterations=iterations,
+            parameters=self.parameters,
+            stepper=self.stepper,
+            options=self.options,
+        )
+
+    def _by_segments(self, guess: Array) -> tuple[Array, _ClosingEquations, int]:
+        """Improve a guess by multiple shooting where tangent vectors grow along it; one segment needs no improvement.
+
+        States at the ends of segments are further unknowns, and continuity there further equations (Stoer & Bulirsch,
+        *Introduction to Numerical Analysis*, 7.3.5). The first nodes are those of half a period forward and half a
+        period backward from the guess: an error of the guess grows by the square root of the growth in a period.
+        """
+        half, start = self.steps // 2, guess[:-1]
+        forward = self._segment(start, 0, half, guess[-1])
+        backward = self._segment(start, 0, self.steps - half, -guess[-1])
+        monodromy = np.linalg.solve(backward.monodromy.T, forward.monodromy.T).T
+        growth = float(np.abs(np.linalg.eigvals(monodromy)).max())
+        if growth <= EASY:
+            return guess, self._closing(guess), 0
+        count = min(2 * int(np.ceil(np.log(growth) / np.log(GROWTH) / 2.0)), self.steps)
+        later = backward.states + np.append(self.gain, np.zeros(len(self.gain)))
+        path = np.vstack([start, forward.states, later[-2::-1]])
+        nodes = np.append(path[self._bounds(count)[:-1]], guess[-1])
+        z, _, iterations = self._iterated(nodes, self._closing(nodes), 0)
+        nearer = np.append(z[: len(start)], z[-1])
+        return nearer, self._closing(nearer), iterations
+
+    def _bounds(self, count: int) -> NDArray[np.intp]:
+        """Return the (count + 1,) numbers of the steps at which segments begin and end."""
+        return np.linspace(0, self.steps, count + 1).round().astype(np.intp)
+
+    def _iterated(self, z: Array, found: _ClosingEquations, iterations: int) -> tuple[Array, _ClosingEquations, int]:
+        """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
+        while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, found)) is not None:
+            (z, found), iterations = nearer, iterations + 1
+        return z, found, iterations
+
+    def _check_energy(self, found: _ClosingEquations, allowed: float) -> None:
+        """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
+        away, partials = float(found.defects[-1]), found.partials[-1]
+        if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(partials))):
+            raise OrbitError(
+                f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
+                "fix fewer entries of the state, or give a better initial guess"
+            )
+
+    def _check_repeats(self, z: Array, found: _ClosingEquations, allowed: float) -> None:
+        """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
+        period = float(z[-1])
+        if -1 not in self.fixed_indices:
+            raise MethodError(
+                f"'{self.stepper.interface.system}' depends on time: give the period of this dependence as period, "
+                "with fixed_period=True"
+            )
+        later = replace(self, t=self.t + period)._closing(z)
+        away = max(float(np.abs(later.motion.states[-1] - found.motion.states[-1]).max()), later.error)
+        if not away <= allowed:
+            raise OrbitError(
+                f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
+                f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
+            )
+
+    def _newton_iterate(self, z: Array, found: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
+        """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
+
+        A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
+        natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
+        """
+        free = np.delete(np.arange(len(z)), self.fixed_indices)
+        inverse = np.zeros((len(z), len(found.defects)))
+        inverse[free] = np.linalg.pinv(found.partials[:, free], NULL_SINGULAR_VALUE)
+        change = inverse @ found.defects
+        if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
+            return None
+        for shortened in 0.5 ** np.arange(MOST_HALVINGS):
+            trial = z - shortened * change
+            if trial[-1] <= 0.0:
+                continue
+            with suppress(StepFailedError):
+                at = self._closing(trial)
+                less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
+                if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(found.defects):
+                    return trial, at
+        return None
+
+    def _closing(self, z: Array) -> _ClosingEquations:
+        """Integrate one period and return the residuals with their derivatives; ``z`` has the start of each segment."""
+        size = 2 * self.stepper.dimension
+        starts = z[:-1].reshape(-1, size)
+        count = len(starts)
+        bounds = self._bounds(count)
+        segments = [self._segment(*each, z[-1]) for each in zip(starts, bounds[:-1], bounds[1:], strict=True)]
+        rows = np.zeros((count, size, count * size + 1))
+        defects = np.array([segment.states[-1] for segment in segments]) - np.roll(starts, -1, axis=0)
+        defects[-1] -= np.append(self.gain, np.zeros(size // 2))
+        for k, segment in enumerate(segments):
+            after = (k + 1) % count
+            rows[k, :, k * size : (k + 1) * size] = segment.monodromy
+            rows[k, :, after * size : (after + 1) * size] -= np.eye(size)
+            rows[k, :, -1] = segment.by_period
+        error = float(np.abs(defects).max())
+        left = self._independent_equations(starts, segments)
+        rows[-1], defects[-1] = left @ rows[-1], left @ defects[-1]
+        partials, wanted = rows.reshape(count * size, -1), defects.ravel()
+        if self.energy is not None:
+            first = starts[0]
+            energy = self.stepper.energy(first[: size // 2], first[size // 2 :], self.t, self.parameters)
+            wanted = np.append(wanted, energy - self.energy)
+            row = np.zeros(len(z))
+            row[:size] = self._integral_gradients(first, self.t)[0]
+            partials = np.vstack([partials, row])
+        return _ClosingEquations(segments, error, wanted, partials)
+
+    def _segment(self, start: Array, first: int, last: int, period: float) -> _Segment:
+        """Integrate from the start of step ``first`` to the start of step ``last``."""
+        stepper, size, steps = self.stepper, len(start), last - first
+        h = period / self.steps
+        times = times_after(self.t, h, np.arange(first, last))[0]
+        starts = Starts.chain(start[: size // 2], start[size // 2 :], times, np.full(steps, h))
+        vectors = np.zeros((steps + 1, size + 2, stepper._input_size))
+        vectors[0, :size, :size] = np.eye(size)
+        vectors[0, size, -2:] = first / self.steps, 1.0 / self.steps
+        vectors[0, size + 1, -2] = 1.0
+        q, p = stepper._propagate(starts, vectors, self.parameters, self.options)
+        partials = vectors[-1, :, :size].T.copy()
+        return _Segment(
+            states=np.column_stack([q, p]),
+            start_time=self.t + period * (first / self.steps),
+            end_time=self.t + period * (last / self.steps),
+            monodromy=partials[:, :size],
+            by_period=partials[:, size],
+            by_time=partials[:, size + 1],
+        )
+
+    def _independent_equations(self, starts: Array, segments: Sequence[_Segment]) -> Array:
+        """Return the (2m, 2m) projection onto the equations of return not implied by conserved quantities.
+
+        Energy and momentum maps count as conserved if the Jacobian of every segment maps their gradients accordingly.
+        """
+        conserved_masks = []
+        for start, segment in zip(starts, segments, strict=True):
+            begin = self._integral_gradients(start, segment.start_time)
+            end = self._integral_gradients(segment.states[-1], segment.end_time)
+            sizes = np.linalg.norm(end, axis=1) * np.linalg.norm(segment.monodromy, 2)
+            conserved_masks.append(np.linalg.norm(end @ segment.monodromy - begin, axis=1) <= CONSERVED * sizes)
+        conserved = self._integral_gradients(starts[0], self.t)[np.all(conserved_masks, axis=0)]
+        directions, strengths, _ = np.linalg.svd(conserved.T, full_matrices=False)
+        directions = directions[:, strengths > CONSERVED * strengths.max(initial=0.0)]
+        projection: Array = np.eye(starts.shape[1]) - directions @ directions.T
+        return projection
+
+    def _integral_gradients(self, state: Array, t: float) -> Array:
+        """Return (r, 2m) gradients of the energy and the momentum maps by finite differences, for directions only."""
+        size, width = len(state), DIFFERENCE_INCREMENT * max(1.0, float(np.abs(state).max()))
+        states = np.vstack([state + width * np.eye(size), state - width * np.eye(size)])
+        q, p = np.ascontiguousarray(states[:, : size // 2]), np.ascontiguousarray(states[:, size // 2 :])
+        times = np.full(2 * size, t)
+        values = np.column_stack(
+            [
+                self.stepper.energy(q, p, times, self.parameters),
+                self.stepper.momentum_maps(q, p, times, self.parameters).reshape(2 * size, -1),
+            ]
+        )
+        partials: Array = (values[:size] - values[size:]).T / (2.0 * width)
+        return partials
+
+
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    """Trajectory along some of the steps of a period.
+
+    Attributes:
+        states: (n, 2m) states after each step.
+        start_time, end_time: times of its ends.
+        monodromy, by_period, by_time: derivatives of the end; the last is 0 for autonomous systems.
+    """
+
+    states: Array
+    start_time: float
+    end_time: float
+    monodromy: Array
+    by_period: Array
+    by_time: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _ClosingEquations:
+    """Residuals of the conditions of continuity and closing.
+
+    Attributes:
+        segments: in their order.
+        error: largest entry of the ends minus the starts that follow.
+        defects: (r,) residuals.
+        partials: (r, 2m segments + 1) Jacobian of the residuals with respect to the starts of segments and the period.
+    """
+
+    segments: Sequence[_Segment]
+    error: float
+    defects: Array
+    partials: Array
+
+    @property
+    def motion(self) -> _Segment:
+        """Return the only segment, of a whole period."""
+        (motion,) = self.segments
+        return motion

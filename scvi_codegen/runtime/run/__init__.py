@@ -1,0 +1,1 @@
+"""Runs: state, step plan, run loop, accuracy of runs."""

@@ -1,0 +1,82 @@
+"""Short descriptions of runs and results for ``repr``."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from scvi_codegen.representation import one_line
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.step_plan import StepPlan
+
+__all__ = ["describe_run", "describe_states", "describe_step_size", "short_title"]
+
+
+class DescribedRun(Protocol):
+    """Interface required of a run."""
+
+    plan: StepPlan | None
+
+    @property
+    def t(self) -> float: ...
+    @property
+    def h(self) -> float: ...
+    @property
+    def steps(self) -> int: ...
+
+
+class Titled(Protocol):
+    """Interface required of the description of an integrator."""
+
+    @property
+    def system(self) -> str: ...
+    @property
+    def method(self) -> str: ...
+
+
+class DescribedStates(Protocol):
+    """Interface required of the states of a run."""
+
+    @property
+    def stepper(self) -> Integrator: ...
+    @property
+    def t(self) -> Array: ...
+    @property
+    def steps(self) -> int: ...
+
+
+def describe_run(
+    title: str, solver: str, run: DescribedRun, *, tau: bool = False, unset_inputs: tuple[str, ...] = ()
+) -> str:
+    """Return ``<Run of TITLE; t = 3 after 30 steps of 0.1, solver fixed-point>``.
+
+    Args:
+        title: system and method.
+        solver: solver of the stage equations, "" if unknown.
+        run: the run.
+        tau: whether steps are of transformed time.
+        unset_inputs: inputs that are not set.
+    """
+    plan = "" if run.plan is None else f", t_end = {run.plan.t_end:g}"
+    solved = f", solver {solver}" if solver else ""
+    waits = f", inputs not set: {', '.join(unset_inputs)}" if unset_inputs else ""
+    steps = f"{run.steps} steps{describe_step_size(run.h, run.plan, tau=tau)}"
+    return one_line(run, title, f"t = {run.t:g} after {steps}{plan}{solved}{waits}")
+
+
+def describe_states(result: DescribedStates, lengths: str) -> str:
+    """Return ``<Trajectory of TITLE; 31 states from t = 0 to 3, 30 steps of 0.1>``; ``lengths`` follows "steps"."""
+    span = f"{len(result.t)} states from t = {result.t[0]:g} to {result.t[-1]:g}"
+    return one_line(result, short_title(result.stepper.interface), f"{span}, {result.steps} steps{lengths}")
+
+
+def short_title(interface: Titled) -> str:
+    """Return the system and the short name of the method."""
+    return f"{interface.system}, {interface.method}"
+
+
+def describe_step_size(h: float, plan: StepPlan | None, *, tau: bool) -> str:
+    """Describe the step size of a run."""
+    if plan is None:
+        return f" of {h:g}{' in tau' * tau}"
+    return f" of {plan.tau:g} in tau" if plan.tau else " of adaptive size"

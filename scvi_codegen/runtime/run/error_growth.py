@@ -1,0 +1,219 @@
+"""Check for exponential error growth after an adaptive run, by repeating it from a perturbed initial state.
+
+The difference of two runs shows how the motion amplifies an initial error. A coarse run with a larger tolerance shows
+in the first half of the steps whether errors grow exponentially; only then is the run repeated from a state
+perturbed in its last place. The repeated run stores no states and has a bounded number of steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runtime.constraints.projection import projected
+from scvi_codegen.runtime.indexed.run import IndexedRun
+from scvi_codegen.runtime.run.accuracy import warnings_wanted
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.step_plan import StepPlan
+
+__all__ = ["MOST_STEPS", "GrowthCheck"]
+
+Array = NDArray[np.float64]
+
+MOST_STEPS, MOST_NUMBERS = 2048, 2**18
+"""Default limits of the second run: number of steps, and that number times the number of coordinates."""
+DECADES_PER_STEP = math.log10(1.15)
+"""Assumed largest growth of an error per step; runs with too few steps to reach the threshold are not checked."""
+NUDGE = 2.0**-50
+"""Relative perturbation of the initial state, unless the local tolerance is larger."""
+TOLERABLE, LOOSE, LARGEST = 1e-7, 1e5, 0.1
+"""Reporting threshold of the relative difference: max(TOLERABLE, LOOSE * tolerance), at most LARGEST."""
+COARSE = 1e-8
+"""Local tolerance and relative perturbation of the coarse run, unless the tolerance of the run is larger."""
+FIRST, DECISIVE = 1.0 / 4.0, 1.0 / 2.0
+"""Fractions of the steps at which the coarse run is compared: for the growth rate, and for the decision.
+
+A decision after a quarter misses half of the chaotic motions with late close encounters.
+"""
+MANY = 256
+"""Number of steps from which on the coarse run is also compared at the fraction FIRST."""
+SMALLEST = 1e-140
+"""Numbers below this, or above its inverse, are scaled before squaring to avoid underflow and overflow."""
+SLOW = 0.9
+"""Fraction of the decades to the threshold that the extrapolated growth must reach for the run to be repeated."""
+
+
+class ComparedStates(Protocol):
+    """States of a run for comparison."""
+
+    @property
+    def t(self) -> Array: ...
+    @property
+    def q(self) -> Any: ...
+    @property
+    def p(self) -> Any: ...
+
+
+class GrowthCheck:
+    """Check of error growth, with the initial state of the run.
+
+    Args:
+        run: the run at its start.
+        requested: ``True``: repeat the whole run; ``None``: repeat up to ``MOST_STEPS`` of its steps, and only if a
+            coarse run shows exponential growth; ``False``: no check.
+        advance_until: function that advances the run to a time; by default adaptive steps to that time.
+
+    Raises:
+        StateError: if the check is requested for a fixed step size.
+    """
+
+    def __init__(
+        self, run: Memory | IndexedRun, requested: bool | None, advance_until: Callable[[float], None] | None = None
+    ) -> None:
+        adaptive = run.plan is not None and not run.plan.tau
+        if requested and not adaptive:
+            raise StateError(
+                "check_growth=True requires adaptive steps, but the step size is fixed: give t_end without h, or omit "
+                "check_growth"
+            )
+        self.run, self.requested, self.advance_until = run, requested, advance_until or self._to
+        self.wanted = adaptive and requested is not False and warnings_wanted()
+        if self.wanted:
+            self.start: Any = run.snapshot
+            self.parameters = run.parameters if isinstance(run, Memory) else None  # inputs change them during the run
+
+    def warn(self, states: ComparedStates) -> None:
+        """Repeat the run and warn if its states differ by more than is tolerable; the run is left where that ends."""
+        if not self.wanted or len(states.t) < 2:
+            return
+        assert self.run.plan is not None  # by construction
+        steps, tolerance = self.run.steps, self.run.plan.tolerance
+        nudge = max(NUDGE, tolerance)
+        tolerable = min(max(TOLERABLE, LOOSE * tolerance), LARGEST)
+        decades = math.log10(tolerable / nudge)
+        if not self.requested and steps * DECADES_PER_STEP < decades:
+            return
+        last = self._last(states, steps)
+        if last == 0 or (not self.requested and self._grows_slowly(states, last, max(nudge, COARSE), decades)):
+            return
+        try:
+            self._begin(nudge, tolerance)
+            for k in sorted({last // 2, last} - {0}):
+                self.advance_until(float(states.t[k]))
+                apart = self._relative_difference(states, k)
+                if not apart <= tolerable:
+                    self._report(nudge, f"differs by {apart:.1e} (relative) at t = {states.t[k]:g}")
+                    return
+        except StepFailedError as failure:
+            self._report(nudge, f"fails at t = {failure.t:g}")
+
+    def _grows_slowly(self, states: ComparedStates, last: int, tolerance: float, decades: float) -> bool:
+        """Return whether errors grow too slowly to matter, by a coarse run of at most half of the steps.
+
+        The growth A(k) until step k of n is extrapolated exponentially from the start, A(k)^(n/k), and from the
+        previous comparison at step j, A(k) (A(k) / A(j))^((n - k) / (k - j)); the smaller value counts. For algebraic
+        growth the second is smaller.
+        """
+        first = {int(last * FIRST)} if last >= MANY else set()
+        before, grown_before = 0, 0.0
+        try:
+            self._begin(tolerance, tolerance)
+            for k in sorted((first | {int(last * DECISIVE)}) - {0}):
+                self.advance_until(float(states.t[k]))
+                little = 0.0 if k in first else SLOW * decades * k / last
+                grown = math.log10(max(self._relative_difference(states, k, tolerance * 10.0**little) / tolerance, 1.0))
+                rate = max(grown - grown_before, 0.0) / (k - before)
+                if k not in first and (grown < little or grown + rate * (last - k) < SLOW * decades):
+                    return True
+                before, grown_before = k, grown
+        except StepFailedError:
+            pass
+        return False
+
+    def _last(self, states: ComparedStates, steps: int) -> int:
+        """Return the index of the last state to compare; 0 unless all states of the run are saved."""
+        count = len(states.t) - 1
+        if len(self._rows(states.q, 0, len(states.t))) != len(states.t):
+            return 0
+        most = float(min(MOST_STEPS, MOST_NUMBERS // len(self._positions_and_momenta()[0])))
+        return count if self.requested or steps <= most else int(count * most / steps)
+
+    def _positions_and_momenta(self) -> tuple[Array, Array]:
+        """Return views of the positions and momenta of the run."""
+        if isinstance(self.run, Memory):
+            return self.run._q, self.run._p
+        q, p = np.split(self.run.state, 2)
+        return q, p
+
+    def _begin(self, nudge: float, tolerance: float) -> None:
+        """Reset the run to its perturbed initial state, on its constraints, with another local tolerance."""
+        run = self.run
+        run.rollback(self.start)
+        if isinstance(run, Memory):
+            run._parameters[:] = self.parameters
+        assert run.plan is not None  # by construction
+        run.plan = StepPlan(t_end=run.plan.t_end, tolerance=tolerance)
+        q, p = self._positions_and_momenta()
+        factors = _factors(len(q), nudge)
+        q *= factors[0]
+        p *= factors[1]
+        if isinstance(run, Memory) and run.stepper.interface.constraints:
+            q[:], p[:], _ = projected(run.stepper, q.copy(), p.copy(), run.t, run.parameters)
+
+    def _to(self, t: float) -> None:
+        run = self.run
+        assert run.plan is not None  # by construction
+        run.plan = StepPlan(t_end=t, tolerance=run.plan.tolerance)
+        while not run.arrived:
+            run.advance(MOST_STEPS)
+
+    def _relative_difference(self, states: ComparedStates, k: int, small: float = 0.0) -> float:
+        """Return the larger of |dq|/|q| and |dp|/|p| at a state, relative to the largest norms up to that state.
+
+        If the difference relative to the state itself is at most ``small``, this cheaper bound is returned.
+        """
+        ratios = []
+        for mine, each in zip(self._positions_and_momenta(), (states.q, states.p), strict=True):
+            row = self._rows(each, k, k + 1)[0]
+            difference = mine - row
+            largest = float(np.abs(row).max())
+            apart = size = 0.0
+            if SMALLEST < max(largest, float(np.abs(difference).max())) < 1.0 / SMALLEST:  # squares do not overflow
+                apart, size = math.sqrt(difference @ difference), math.sqrt(row @ row)
+            if not (size > 0.0 and apart <= small * size):
+                rows = self._rows(each, 0, k + 1)
+                unit = float(np.abs(rows).max()) or 1.0
+                size = float(np.linalg.norm(rows / unit, axis=1).max())
+                apart = float(np.linalg.norm(difference / unit))
+            ratios.append(apart / size if apart and size else apart)
+        return max(ratios)
+
+    @staticmethod
+    def _rows(values: Any, first: int, end: int) -> Array:
+        """Return states as rows; several arrays are concatenated."""
+        if isinstance(values, Mapping):
+            parts = [each[first:end] for each in values.values()]
+            return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+        return np.asarray(values)[first:end]
+
+    @staticmethod
+    def _report(nudge: float, difference_text: str) -> None:
+        warn(
+            f"the motion amplifies errors: a run with the initial state perturbed by {nudge:.1e} (relative) "
+            f"{difference_text}, so "
+            "later states are not reproducible. Use error= to find the time until which digits are confirmed, or "
+            "check_growth=False to skip this check",
+            AccuracyWarning,
+        )
+
+
+@lru_cache(maxsize=8)
+def _factors(size: int, nudge: float) -> tuple[Array, Array]:
+    """Return factors for positions and momenta that change them by about ``nudge``, relatively."""
+    return 1.0 + nudge * np.cos(np.arange(size)), 1.0 + nudge * np.cos(np.arange(size) + 1)

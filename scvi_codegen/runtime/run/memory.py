@@ -1,0 +1,371 @@
+"""Memory of a run: one plain C struct that is started, advanced, saved and restored bitwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.native.options import SolverOptions, checked_options, step_failure
+from scvi_codegen.runtime.constraints.projection import check_reachable
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import (
+    Array,
+    Parameters,
+    checked_parameters,
+    checked_vector,
+    inputs_not_given,
+    missing_input,
+    no_input,
+    parameter_index,
+)
+from scvi_codegen.runtime.run.one_thread import OneThread, alone, in_use
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.validation.counts import LARGEST_COUNT, checked_count
+
+__all__ = ["Memory", "fill"]
+
+
+STEPS_PER_CALL = 10**5
+"""Largest number of steps per call into C, between checks for Ctrl-C."""
+GRID_FIELDS, MOST_GRID_LEVEL = ("grid_level", "change", "change_before", "direction", "failed", "avoiding"), 2**16
+"""Fields of adaptive steps that index tables of the step-size grid; a bound beyond all exponents of a double."""
+FUNCTIONS = ("start", "advance", "advance_to", "step_error")
+"""Functions of C that take a run; sources of version 0.1 have no error estimate."""
+NO_OUTPUT = LARGEST_COUNT
+"""Output stride that saves no state."""
+
+
+class Memory(OneThread):
+    """State of a run: positions, momenta, compensation terms and the predictor for the next step.
+
+    Attributes:
+        stepper: the compiled integrator.
+        longest: largest difference of t between consecutive saved states so far.
+
+    Steps of a system with inputs require every input to be set, by :meth:`set_inputs` or parameters. The arguments of
+    C calls are allocated once per run, so a call costs little more than its steps.
+    """
+
+    def __init__(self, stepper: Integrator) -> None:
+        super().__init__()
+        self.stepper, binding = stepper, stepper.binding
+        self._memory = memory = binding.new("run *")
+        self._q, self._p = (np.frombuffer(binding.buffer(part)) for part in (memory.q, memory.p))
+        self._parameters = stepper.defaults
+        self._arguments = binding.pointer(self._parameters), binding.null
+        self._options: SolverOptions | None = None
+        self._plan: StepPlan | None = None
+        self._discarded = *(binding.numbers(f"double[{stepper.dimension}]"),) * 3, binding.numbers("int *")
+        self._report, self._workspace = binding.new("report *"), binding.workspace()
+        self._functions = {name: binding.function(name, memory) for name in FUNCTIONS if binding.has(name)}
+        firsts = {name: parameter_index(stepper.interface, f"{name}_0") for name in stepper.interface.inputs}
+        self._inputs = {name: slice(first, first + 5) for name, first in firsts.items()}
+
+    @classmethod
+    def started(
+        cls,
+        stepper: Integrator,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float | StepPlan,
+        t: float = 0.0,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+    ) -> Self:
+        """Construct at (q, p) and t before the first step, with fixed step size or a step plan."""
+        run = cls(stepper)
+        run._start(q, p, h=h, t=t, parameters=parameters, options=options)
+        return run
+
+    def _start(
+        self,
+        q: ArrayLike,
+        p: ArrayLike,
+        *,
+        h: float | StepPlan,
+        t: float,
+        parameters: Parameters,
+        options: SolverOptions | None,
+    ) -> None:
+        """Start at (q, p) and t, with fixed step size or a step plan; nothing of an earlier run remains."""
+        stepper, interface = self.stepper, self.stepper.interface
+        plan = h if isinstance(h, StepPlan) else None
+        q0, p0 = checked_vector(interface, q, "q"), checked_vector(interface, p, "p")
+        now, size = checked_number(t, "the time t"), 0.0 if isinstance(h, StepPlan) else checked_step(h)
+        self._functions["start"](now, size, *stepper.binding.pointers(q0, p0))
+        values = stepper._parameters_at(q0, p0, parameters)
+        self._set(values, checked_options(options), plan, inputs_not_given(interface, parameters))
+
+    def _set(
+        self, values: Array, options: SolverOptions | None, plan: StepPlan | None, unset_inputs: tuple[str, ...]
+    ) -> None:
+        self._parameters[:], self.plan = values, plan
+        if options is not self._options:
+            self._arguments, self._options = (self._arguments[0], self.stepper.binding.options(options)), options
+        self._unset_inputs, self.longest = unset_inputs, 0.0
+        self._crossed: tuple[int, ...] = ()  # crossings of each event in earlier pieces, counted for terminal events
+
+    @classmethod
+    def restored(
+        cls,
+        stepper: Integrator,
+        saved: bytes,
+        *,
+        parameters: Parameters = None,
+        options: SolverOptions | None = None,
+        plan: StepPlan | None = None,
+    ) -> Self:
+        """Construct from the bytes of :meth:`save`; raise ``StateError`` for invalid bytes or another kind of steps."""
+        run = cls(stepper)
+        memory, buffer = run._memory, stepper.binding.buffer(run._memory)
+        if not isinstance(saved, bytes):
+            raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
+        if len(saved) != len(buffer):
+            raise StateError(f"invalid saved run: it has {len(saved)} bytes, those of this stepper have {len(buffer)}")
+        buffer[:] = saved
+        _check_memory(memory)
+        if (memory.h == 0.0) != (plan is not None):
+            raise StateError(
+                "the saved run has adaptive steps: give t_end"
+                if plan is None
+                else "the saved run has fixed steps: omit t_end"
+            )
+        if not stepper._has_energy(parameters):
+            raise StateError("a saved run in transformed time requires its energy: give parameters=run.parameters")
+        values = checked_parameters(stepper.interface, parameters)
+        run._set(values, checked_options(options), plan, inputs_not_given(stepper.interface, parameters))
+        return run
+
+    @property
+    def plan(self) -> StepPlan | None:
+        """Step plan of adaptive steps, ``None`` for fixed steps."""
+        return self._plan
+
+    @plan.setter
+    def plan(self, plan: StepPlan | None) -> None:
+        self._plan, self._plan_arguments = plan, (plan.t_end, plan.tau or plan.tolerance) if plan else ()
+        self._advance_function = self._functions["advance_to" if plan else "advance"]
+
+    @property
+    def h(self) -> float:
+        """Step size, 0 for adaptive steps."""
+        return float(self._memory.h)
+
+    @property
+    def parameters(self) -> Array:
+        """(k,) values in the order of ``stepper.parameters``."""
+        return self._parameters.copy()
+
+    @property
+    def options(self) -> SolverOptions | None:
+        """Convergence criterion of the solver; ``None`` for the defaults."""
+        return self._options
+
+    @property
+    def t(self) -> float:
+        """Time, the rounded compensated sum of all steps."""
+        return _time(self._memory)
+
+    def left_to(self, end: float) -> float:
+        """Return the time left to ``end``, computed with the low word of the run's time."""
+        return (end - self.t) - float(getattr(self._memory, "t_low", 0.0))
+
+    @alone
+    def update(self, *, parameters: Parameters = None, h: float | None = None, plan: StepPlan | None = None) -> None:
+        """Set parameters, step size or step plan; what is omitted is unchanged.
+
+        Args:
+            parameters: values by name, the others unchanged; or all in order.
+
+        Raises:
+            StateError: if a name or number is invalid, or position constraints would jump.
+        """
+        interface = self.stepper.interface
+        missing = inputs_not_given(interface, parameters)
+        if isinstance(parameters, Mapping):
+            known = dict(zip(interface.parameters, self._parameters.tolist(), strict=True))
+            parameters = {**known, **parameters}
+        if parameters is not None:
+            self._set_parameters(checked_parameters(interface, parameters))
+            self._unset_inputs = tuple(name for name in self._unset_inputs if name in missing)
+        if h is not None and checked_step(h) != self._memory.h:
+            self._memory.h, self._memory.guess = h, 0
+        if plan is not None:
+            self.plan = plan
+
+    def set_inputs(self, **inputs: float) -> None:
+        """Set inputs to constant values for the following steps (zero-order hold).
+
+        >>> run.set_inputs(u=-1.5); run.advance(10)  # doctest: +SKIP
+        """
+        values = self._parameters.copy()
+        for name, value in inputs.items():
+            if name not in self._inputs:
+                raise no_input(name, self._inputs)
+            values[self._inputs[name]] = checked_number(value, f"the input {name}"), 0.0, 0.0, 0.0, 0.0
+        if not self._lock.acquire(False):
+            raise in_use()
+        try:
+            self._set_parameters(values)
+        finally:
+            self._lock.release()
+        if self._unset_inputs:
+            self._unset_inputs = tuple(name for name in self._unset_inputs if name not in inputs)
+
+    def _set_parameters(self, values: Array) -> None:
+        """Set parameter values; raise ``StateError`` if position constraints jump."""
+        if self.stepper.interface.constraints:
+            check_reachable(self.stepper, self.q, self.p, self.t, values)
+        self._parameters[:] = values
+
+    @property
+    def steps(self) -> int:
+        """Number of completed steps."""
+        return int(self._memory.step)
+
+    @property
+    def q(self) -> Array:
+        """(m,) positions."""
+        return self._q.copy()
+
+    @property
+    def p(self) -> Array:
+        """(m,) momenta."""
+        return self._p.copy()
+
+    @property
+    def _compensation(self) -> tuple[Array, Array]:
+        """(m,) compensation terms of :attr:`q` and of :attr:`p`, added in the following steps."""
+        return np.array(list(self._memory.carry_q)), np.array(list(self._memory.carry_p))
+
+    @alone
+    def _resume_at(self, steps: int, time: tuple[float, float], carries: tuple[Array, Array]) -> None:
+        """Continue a run made elsewhere: set its step number, double-double time and compensation terms of q and p."""
+        self._memory.step = steps
+        self._memory.t, self._memory.t_low = time
+        for i, (cut_q, cut_p) in enumerate(zip(*carries, strict=True)):
+            self._memory.carry_q[i], self._memory.carry_p[i] = cut_q, cut_p
+
+    @property
+    def snapshot(self) -> bytes:
+        """Bitwise copy of the present state for :meth:`rollback`."""
+        return bytes(self.stepper.binding.buffer(self._memory))
+
+    @alone
+    def checkpoint(self) -> bytes:
+        """Return a bitwise copy of the run for :meth:`Stepper.from_checkpoint` on the same kind of machine."""
+        return self.snapshot
+
+    def check_inputs(self) -> None:
+        """Raise :class:`StateError` if an input is not set."""
+        if self._unset_inputs:
+            raise missing_input(self._unset_inputs[0])
+
+    @alone
+    def rollback(self, saved: bytes) -> None:
+        """Restore the state saved by :meth:`save`."""
+        self.stepper.binding.buffer(self._memory)[:] = saved
+
+    def advance(self, steps: int) -> None:
+        """Take ``steps`` steps; adaptive steps end at the target time.
+
+        Raises:
+            StepFailedError: if a step fails; the run is left at the state before it.
+        """
+        left = checked_count(steps, "steps", least=0)
+        if not self._lock.acquire(False):  # as ``alone``, at half the cost
+            raise in_use()
+        try:
+            while left > 0 and not self.arrived:
+                if status := self._advance(min(left, STEPS_PER_CALL), NO_OUTPUT, self._discarded):
+                    raise step_failure(status, self._report, step=self.steps, h=self.h)
+                left -= STEPS_PER_CALL
+        finally:
+            self._lock.release()
+
+    def _run_to_target(self) -> None:
+        """Advance to the target time without saving intermediate states."""
+        while not self.arrived:
+            self.advance(STEPS_PER_CALL)
+
+    def _advance(self, steps: int, save_every: int, output_arrays: tuple[Any, ...]) -> int:
+        """Take steps in one C call; every ``save_every``-th state goes to ``output_arrays``. Return the status."""
+        if self._unset_inputs and steps:
+            self.check_inputs()
+        status: int = self._advance_function(
+            *self._plan_arguments, steps, save_every, *self._arguments, *output_arrays, self._report, self._workspace
+        )
+        return status
+
+    @property
+    def iterations(self) -> int:
+        """Number of solver iterations since the last saved state."""
+        return int(self._memory.iterations)
+
+    @iterations.setter
+    def iterations(self, count: int) -> None:
+        self._memory.iterations = count
+
+    def has_arrived(self) -> bool:
+        """Return whether the run has reached its target time."""
+        return self._plan is not None and self.left_to(self._plan.t_end) == 0.0
+
+    @property
+    def arrived(self) -> bool:
+        """Return whether the run has reached its target time."""
+        return self.has_arrived()
+
+    @property
+    def rejected_steps(self) -> int:
+        """Number of rejected steps."""
+        return int(self._memory.rejected) if self._plan is not None and not self._plan.tau else 0
+
+    @property
+    def step_error(self) -> tuple[float, float]:
+        """Estimated relative error of the worst step and its start time; NaN without an estimate."""
+        if "step_error" not in self._functions:
+            return np.nan, np.nan
+        error = self._functions["step_error"]()
+        return (error, self._memory.error_t) if error >= 0.0 else (np.nan, np.nan)
+
+    @property
+    def _leaving(self) -> bool:
+        """Return whether the run started at the origin and is still near it, where relative errors are undefined."""
+        return bool(getattr(self._memory, "steps_from_rest", 0))
+
+
+def fill(
+    memory: Memory, steps: int, save_every: int, t: Array, q: Array, p: Array, iterations: NDArray[np.int32]
+) -> tuple[int, Any]:
+    """Advance by ``steps`` in one C call and store every ``save_every``-th state in the arrays.
+
+    With a step plan the run ends at the target time and its last state is stored; ``stored`` in the report counts the
+    states.
+
+    Returns:
+        The status, 0 unless a step failed, and the report, whose ``steps`` counts the completed steps.
+    """
+    pointer = memory.stepper.binding.pointer
+    status = memory._advance(steps, save_every, (pointer(t), pointer(q), pointer(p), pointer(iterations)))
+    return status, memory._report
+
+
+def _time(memory: Any) -> float:
+    """Return the time of a run; structs of version 0.1 store the start and the number of steps instead."""
+    return float(memory.t if hasattr(memory, "t") else memory.t0 + memory.step * memory.h)
+
+
+def _check_memory(memory: Any) -> None:
+    """Raise :class:`StateError` if the bytes cannot belong to a run."""
+    numbers = [_time(memory), memory.h, *memory.q, *memory.p, *memory.carry_q, *memory.carry_p]
+    counts = {"step": memory.step, "guess": memory.guess, "iterations": memory.iterations}
+    grid_levels = {name: getattr(memory, name) for name in GRID_FIELDS if hasattr(memory, name)}
+    sound = np.isfinite(numbers).all() and all(0 <= count < 2**53 for count in counts.values())
+    if not sound or memory.guess > 2 or any(abs(grid_level) > MOST_GRID_LEVEL for grid_level in grid_levels.values()):
+        raise StateError(f"invalid saved run: h = {memory.h:g}, {counts | grid_levels}")

@@ -1,0 +1,227 @@
+"""Runs with events, with output at given times, or with fixed steps to a final time.
+
+The run advances in chunks with all states; events are searched between these states and only the requested states are
+saved. States are therefore bitwise equal with and without events.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError, StepFailedError
+from scvi_codegen.native.arguments import checked_number
+from scvi_codegen.runtime.events.detection import CrossingSearch
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.run_loop import drive, record, trajectory_of
+from scvi_codegen.runtime.run.singular_time import ProgressWatch
+from scvi_codegen.runtime.run.times import WHOLE
+from scvi_codegen.runtime.trajectory.dense_output import states_and_steps_at, step_sizes_at, times_of_run
+from scvi_codegen.runtime.trajectory.time_transformation import part_of_step
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+from scvi_codegen.validation.counts import checked_count
+
+__all__ = ["Observation", "observed_until"]
+
+Array = NDArray[np.float64]
+CHUNK_NUMBERS = 2**18
+"""Largest number of positions in a chunk."""
+FIRST_STEPS = 64
+
+
+class Observation:
+    """Recorder of a run with events or with output at given times.
+
+    Args:
+        run: the run to advance.
+        save_every: without ``times``, save the present state and those whose step number is a multiple of this.
+        times: (n,) output times, sorted in the direction of the run.
+        end: final time of fixed steps, also in transformed time; the last step is shorter.
+    """
+
+    def __init__(
+        self, run: Memory, *, save_every: int = 1, times: Array | None = None, end: float | None = None
+    ) -> None:
+        self.run, self.save_every, self.times = run, checked_count(save_every, "save_every", least=1), times
+        self.search = CrossingSearch(run.stepper, run._crossed) if run.stepper.events else None
+        self.end, self.arrived, self.partial_steps = end, False, 0
+        self.states: list[tuple[Array, Array, Array, Array, Array, NDArray[np.int64]]] = []
+        self.iterations = 0
+
+    @property
+    def ended(self) -> bool:
+        """Return whether the run ended within a step, by a terminal event or at its final time."""
+        return self.arrived or (self.search is not None and self.search.ended)
+
+    def advance(
+        self,
+        steps: int | None,
+        progress: Callable[[int], None] | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Trajectory:
+        """Advance by ``steps`` (``None``: to the end) or to a terminal event; return the saved states.
+
+        ``stop`` is called after each chunk and ends the run if it returns true.
+
+        Raises:
+            StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+            EventError: if an event function is not finite.
+        """
+        run, plan = self.run, self.run.plan
+        unbounded = steps is None and (plan or self.end is not None)
+        count = math.inf if unbounded else checked_count(steps, "steps", least=0)
+        self._keep(record(run, 0), first=True)
+        most = max(1, CHUNK_NUMBERS // run.stepper.dimension)
+        end = self.end if plan is None else plan.t_end if plan.tau else None
+        watch = None if end is None else ProgressWatch(run.stepper, end)
+
+        def advance(size: int) -> int:
+            before, number = run.t, run.steps
+            self._advance_chunk(size)
+            if watch is not None:
+                watch.check_progress(before, run.t, run.steps - number, run.steps)
+            return run.steps - number
+
+        try:
+            drive(
+                advance,
+                count,
+                first=min(FIRST_STEPS, most),
+                most=most,
+                ended=lambda: run.arrived or self.ended or stop(),
+                progress=progress,
+            )
+        except StepFailedError as failure:
+            failure.trajectory = self.trajectory()
+            raise
+        found = self.trajectory()
+        if self.times is None and not self.ended:
+            run.iterations = self.iterations - int(found.iterations.sum())
+        return found
+
+    def _advance_chunk(self, size: int) -> None:
+        """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
+        before, failure = self.run.checkpoint(), None
+        try:
+            part = record(self.run, size)
+        except StepFailedError as error:
+            part, failure = Trajectory.before(error), error
+        if self.end is not None and (part.t[-1] - self.end) * self.run.h >= 0.0:
+            self.run.rollback(before)
+            part, failure = self._arrived(part, before), None
+        if self.search is not None:
+            reached = self.search.search(part, first=self.run.steps - len(part) + 1 + self.arrived)
+            if self.search.ended:
+                self.run.rollback(before)
+                part, failure, self.arrived = self._ended(record(self.run, reached)), None, False
+        self._keep(part)
+        if failure is not None:
+            raise failure
+
+    def _ended(self, part: Trajectory) -> Trajectory:
+        """Return the chunk with the state of the terminal event appended."""
+        assert self.search is not None
+        last = self.search.found[-1][-1]
+        _, _, tau = self._state_within_step(part, float(last["t"]))
+        return self._with_state(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
+
+    def _arrived(self, part: Trajectory, before: bytes) -> Trajectory:
+        """Return the chunk up to the final time, with a shorter last step; the run is left before that step."""
+        assert self.end is not None
+        self.arrived = True
+        whole = int(np.count_nonzero((self.end - part.t) * self.run.h >= 0.0)) - 1
+        part = record(self.run, whole)
+        while self.run.left_to(self.end) * self.run.h < 0.0:  # rounded times tie: the previous step is the last one
+            self.run.rollback(before)
+            whole -= 1
+            part = record(self.run, whole)
+        q, p, tau = self._state_within_step(part, self.end)
+        lengths = part.step_sizes.copy()
+        lengths[-1] = self.run.left_to(self.end) if tau is None else tau - part.stepped[-1]
+        self.partial_steps = int(abs(lengths[-1]) > WHOLE * abs(self.run.h))
+        if tau is None:
+            run = self.run
+            q, p = run.stepper.step(q, p, lengths[-1], run.t, run.parameters, options=run.options)
+        return self._with_state(part, lengths, self.end, q, p, tau)
+
+    def _state_within_step(self, part: Trajectory, t: float) -> tuple[Array, Array, float | None]:
+        """Return the state and tau at a time in the step after a chunk; without time transformation the last state.
+
+        Systems in transformed time are autonomous, so t is counted from the last state.
+        """
+        if part.tau is None or (left := self.run.left_to(t)) == 0.0:
+            return part.q[-1], part.p[-1], None if part.tau is None else float(part.tau[-1])
+        run = self.run
+        q, p, x = part_of_step(run.stepper, 0.0, run.h, left, part.q[-1], part.p[-1], run.parameters, run.options)
+        return q, p, float(part.tau[-1]) + x * run.h
+
+    def _with_state(
+        self, part: Trajectory, lengths: Array, t: float, q: Array, p: Array, tau: float | None
+    ) -> Trajectory:
+        """Return a chunk with one more state within a step appended."""
+        return self._made(
+            np.append(part.t, t),
+            np.concatenate([part.q, [q]]),
+            np.concatenate([part.p, [p]]),
+            np.append(part.iterations, np.int32(0)),
+            np.append(lengths, np.nan),
+            np.append(part.stepped, t if tau is None else tau),
+        )
+
+    def _keep(self, part: Trajectory, *, first: bool = False) -> None:
+        """Save the requested states of a chunk; its first state is already saved unless ``first``."""
+        total = self.iterations + np.cumsum(part.iterations, dtype=np.int64)
+        self.iterations = int(total[-1])
+        if self.times is not None:
+            self._keep_times(part, total, first=first)
+            return
+        number = self.run.steps - (len(part) - 1 - self.ended) + np.arange(len(part))
+        wanted = number % self.save_every == 0
+        wanted[0] = first
+        wanted[-1] |= self.ended or self.run.arrived
+        q, p = part.q[wanted], part.p[wanted]
+        self.states.append((part.t[wanted], q, p, part.step_sizes[wanted], part.stepped[wanted], total[wanted]))
+
+    def _keep_times(self, part: Trajectory, total: NDArray[np.int64], *, first: bool) -> None:
+        assert self.times is not None
+        forward = part.forward
+        left, right = forward * part.t[0], forward * part.t[-1]
+        after = forward * self.times >= left if first else forward * self.times > left
+        times = self.times[after & (forward * self.times <= right)]
+        q, p, stepped = states_and_steps_at(part, times)
+        behind = np.searchsorted(forward * part.t, forward * times, side="right") - 1
+        self.states.append((times, q, p, step_sizes_at(part, times), stepped, total[behind]))
+
+    def trajectory(self) -> Trajectory:
+        """Return all states saved so far."""
+        t, q, p, lengths, stepped, total = (np.concatenate(arrays) for arrays in zip(*self.states, strict=True))
+        return self._made(t, q, p, np.diff(total, prepend=total[:1]).astype(np.int32), lengths, stepped)
+
+    def _made(
+        self, t: Array, q: Array, p: Array, iterations: NDArray[np.int32], lengths: Array, stepped: Array
+    ) -> Trajectory:
+        crossings = self.search.crossings() if self.search is not None else ()
+        tau = stepped if self.run.stepper.interface.energy_parameter else None
+        steps = self.run.steps + (self.partial_steps if self.arrived else 0)
+        return trajectory_of(self.run, t, q, p, iterations, steps=steps, step_sizes=lengths, events=crossings, tau=tau)
+
+
+def observed_until(
+    run: Memory,
+    t_end: float,
+    steps: int | None,
+    save_every: int,
+    t_eval: ArrayLike | None,
+    progress: Callable[[int], None] | None,
+) -> Trajectory:
+    """Return the trajectory of a run with fixed steps to t_end, with the requested output."""
+    end = checked_number(t_end, "the time t_end")
+    if steps is not None:
+        raise StateError(f"give either steps={steps} or t_end={end:g} with h, not both")
+    if (end - run.t) * run.h < 0.0:
+        raise StateError(f"h = {run.h:g} has the wrong sign for a run from t = {run.t:g} to t_end = {end:g}")
+    times = None if t_eval is None else times_of_run(t_eval, run.t, end)
+    return Observation(run, save_every=save_every, times=times, end=end).advance(None, progress)

@@ -1,0 +1,96 @@
+"""Public class of a run in progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Parameters
+from scvi_codegen.runtime.run.accuracy import warn_of_energy_error, warn_of_large_steps
+from scvi_codegen.runtime.run.descriptions import describe_run, short_title
+from scvi_codegen.runtime.run.memory import Memory
+from scvi_codegen.runtime.run.observation import Observation
+from scvi_codegen.runtime.run.one_thread import alone
+from scvi_codegen.runtime.run.run_loop import record
+from scvi_codegen.runtime.run.step_plan import StepPlan
+from scvi_codegen.runtime.trajectory.trajectory import Trajectory
+
+__all__ = ["Run"]
+
+MOST_KEPT = 2**16
+"""Largest number of doubles of workspace of a run that is kept for later calls."""
+
+
+class Run(Memory):
+    """Run in progress: :class:`Memory` with recording of states."""
+
+    def __repr__(self) -> str:
+        interface = self.stepper.interface
+        tau = bool(interface.energy_parameter)
+        return describe_run(short_title(interface), interface.solver, self, tau=tau, unset_inputs=self._unset_inputs)
+
+    @classmethod
+    def _reused(cls, stepper: Integrator) -> Self:
+        """Return a released run of the stepper, to be started, or a new one if all are in use."""
+        try:
+            found: Self = stepper._released_runs.pop()
+            return found
+        except IndexError:
+            pass
+        return cls(stepper)
+
+    def _release(self) -> None:
+        """Let :meth:`_reused` return this run; the caller drops it. Large memory is freed instead."""
+        if len(self._workspace) <= MOST_KEPT:
+            self.stepper._released_runs.append(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        known = dict(zip(self.stepper.parameters, self._parameters.tolist(), strict=True))
+        for name in self._unset_inputs:
+            del known[f"{name}_0"]
+        return (_restored, (self.stepper, self.checkpoint(), known, self._options, self.plan, self.longest))
+
+    @alone
+    def record(
+        self, steps: int | None = None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
+    ) -> Trajectory:
+        """Advance by ``steps``; save the present state and those whose step number is a multiple of ``save_every``.
+
+        Adaptive steps end at the target time, whose state is saved as well; ``steps`` may then be omitted. Events of
+        the stepper are recorded; a terminal event ends the run before the step that contains it. An
+        :class:`~scvi_codegen.AccuracyWarning` is issued when a step is first too large. The warning is suppressed for
+        the first 16 steps of a run started at q = 0, p = 0, where a relative error is undefined.
+
+        Raises:
+            StepFailedError: if a step fails; ``trajectory`` has the saved states, the run is left before that step.
+            EventError: if an event function is not finite.
+        """
+        before = 0.0 if self._leaving else self.step_error[0]
+        trajectory = self._recorded(steps, save_every=save_every, progress=progress)
+        if not self._leaving:
+            warn_of_large_steps(trajectory, before=before)
+        warn_of_energy_error(trajectory)
+        return trajectory
+
+    def _recorded(
+        self, steps: int | None, *, save_every: int = 1, progress: Callable[[int], None] | None = None
+    ) -> Trajectory:
+        """Return the states as :meth:`record` does, without its warnings and its lock."""
+        if self.stepper.events:
+            return Observation(self, save_every=save_every).advance(steps, progress)
+        return record(self, steps, save_every=save_every, progress=progress)
+
+
+def _restored(
+    stepper: Integrator,
+    saved: bytes,
+    parameters: Parameters,
+    options: SolverOptions | None,
+    plan: StepPlan | None,
+    longest: float = 0.0,
+) -> Run:
+    run = Run.restored(stepper, saved, parameters=parameters, options=options, plan=plan)
+    run.longest = longest
+    return run

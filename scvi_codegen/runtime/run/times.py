@@ -1,0 +1,65 @@
+"""Double-double times t + n h of runs; numbers of steps that make up a span."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import checked_number, checked_step
+from scvi_codegen.runtime.core.validation import Array
+
+__all__ = ["WHOLE", "steps_to", "steps_within", "times_after"]
+
+SPLITTER = 2.0**27 + 1.0
+"""Factor that splits a double into two halves of 26 bits (Dekker 1971)."""
+WHOLE = 1e-9
+"""Fraction of a step that rounding may leave of a span."""
+MOST_STEPS = 10**9
+"""Largest number of steps accepted; more indicate a mistyped step size."""
+
+
+def times_after(t: float, h: float, steps: ArrayLike) -> tuple[Array, Array]:
+    """Return t + n h after n < 2^53 steps as double-double numbers, correctly rounded but for near ties."""
+    mantissa, exponent = math.frexp(h)
+    numbers = np.asarray(steps, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        high, low = (np.ldexp(piece, exponent) for piece in _product(numbers, mantissa))
+        total = t + high
+        part = total - t
+        rest = ((t - (total - part)) + (high - part)) + low
+        time = total + rest
+        return time, rest - (time - total)
+
+
+def steps_within(spans: ArrayLike, h: float) -> NDArray[np.intp]:
+    """Return the number of equal steps not longer than |h| in each span > 0; raise ``StateError`` if too large."""
+    with np.errstate(over="ignore"):
+        counts = np.maximum(1.0, np.ceil(np.asarray(spans) / abs(h) - WHOLE))
+    if not counts.sum() <= MOST_STEPS:
+        raise StateError(f"h = {h:g} requires {counts.sum():.0e} steps: give a larger h")
+    return counts.astype(np.intp)
+
+
+def steps_to(t: float, t_end: float, h: float) -> int | None:
+    """Return the number of steps h from t to t_end, or ``None`` if the last has to be shorter.
+
+    Raises:
+        StateError: if h has the wrong sign or is too small.
+    """
+    span = (checked_number(t_end, "t_end") - checked_number(t, "the time t")) / checked_step(h)
+    if span < 0.0:
+        raise StateError(f"h = {h:g} has the wrong sign for a run from t = {t:g} to t_end = {t_end:g}: use h = {-h:g}")
+    if not span <= MOST_STEPS:
+        raise StateError(f"h = {h:g} requires {span:.0e} steps from t = {t:g} to t_end = {t_end:g}: give a larger h")
+    return round(span) if abs(span - round(span)) <= WHOLE else None
+
+
+def _product(x: Array, y: float) -> tuple[Array, Array]:
+    """Return x y without rounding error as a double-double number (Dekker's product)."""
+    product = x * y
+    x_high, y_high = SPLITTER * x - (SPLITTER * x - x), SPLITTER * y - (SPLITTER * y - y)
+    x_low, y_low = x - x_high, y - y_high
+    return product, ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low

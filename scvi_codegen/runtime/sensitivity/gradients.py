@@ -1,0 +1,252 @@
+"""Derivatives of a trajectory with respect to its initial state and parameters: tangent and adjoint propagation.
+
+Derivatives are those of the computed map with step sizes held fixed. They are evaluated from the saved states; steps
+between these are recomputed from each saved state to the next (checkpointing), so long runs need little memory.
+Recomputed steps are checked against the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.native.arguments import real_array
+from scvi_codegen.native.options import step_failure
+from scvi_codegen.representation import summary
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.run.memory import Memory, fill
+from scvi_codegen.runtime.sensitivity.step_derivatives import LinearisedMethod, Sensitivity, Starts
+from scvi_codegen.runtime.sensitivity.transformed_derivatives import time_of
+from scvi_codegen.runtime.trajectory.recomputation import check_recomputed, steps_between
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+
+__all__ = [
+    "Gradient",
+    "backward",
+    "checked_cotangents",
+    "finite",
+    "forward",
+    "gradient_of",
+    "pieces",
+    "propagate",
+    "seeds_of",
+    "sensitivity",
+    "starts_of",
+    "tangent_vectors",
+    "tangents_from_directions",
+    "vector_jacobian_product",
+]
+
+MOST_STEPS = 1024
+"""Largest number of steps of a segment processed at once."""
+SAME_STEP_SIZE = 1e-9
+"""Relative difference of step sizes that rounding of times may cause."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gradient:
+    """Gradient of one function, or of c functions, of the states of a run.
+
+    Attributes:
+        q, p: (m,) or (m, c) derivatives with respect to the initial state.
+        parameters: (k,) or (k, c) with respect to the parameters, in the order of ``stepper.parameters``.
+        t: number or (c,) with respect to the initial time, which shifts all times.
+        h: number or (c,) with respect to the common step size; ``None`` if step sizes differ.
+    """
+
+    q: Array
+    p: Array
+    parameters: Array
+    t: Array
+    h: Array | None
+
+    __repr__ = summary("q", "p", "parameters")
+
+
+def tangent_vectors(states: SavedStates, directions: ArrayLike | None) -> Array:
+    """Return (n, 2m, k) tangent vectors at the states, from (2m, k) directions of (q, p) or (2m + parameters + 2, k).
+
+    Without directions the full state-transition matrices of (q, p) are returned.
+
+    Raises:
+        StateError: if the directions have another shape, or the states are not at whole steps.
+    """
+    size = 2 * states.stepper.dimension
+    given = np.eye(size) if directions is None else finite(directions, "directions")
+    found, _ = forward(states, tangents_from_directions(states.stepper, given))
+    return found[:, :size].reshape(len(states), size, *given.shape[1:])
+
+
+def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Array:
+    """Return (k, variables) tangent vectors from directions of (q, p), or of (q, p, parameters, t, h).
+
+    Raises:
+        StateError: if the directions have another shape.
+    """
+    size, given = 2 * stepper.dimension, stepper._input_size
+    if directions.ndim not in (1, 2) or len(directions) not in (size, given):
+        raise StateError(
+            f"directions must have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
+            f"parameters, t, h), not {directions.shape}"
+        )
+    tangents = np.zeros((directions[0].size, given))
+    tangents[:, : len(directions)] = directions.reshape(len(directions), -1).T
+    return tangents
+
+
+def sensitivity(states: SavedStates) -> Sensitivity:
+    """Return the derivatives of all states with respect to all inputs of the run."""
+    columns, _ = forward(states, np.eye(states.stepper._input_size))
+    return Sensitivity.of(columns, states.stepper.dimension, stretched=_has_fixed_step_size(states))
+
+
+def vector_jacobian_product(states: SavedStates, cotangents: ArrayLike) -> Gradient:
+    """Return the vector-Jacobian product of the run with (n, 2m) or (n, 2m, c) cotangents of the states."""
+    derivatives = checked_cotangents(states.stepper, len(states), cotangents)
+    seeds = seeds_of(states.stepper, derivatives)
+    found = backward(states, seeds, np.zeros_like(seeds[0]))
+    return gradient_of(states, found.T.reshape(states.stepper._input_size, *derivatives.shape[2:]))
+
+
+def seeds_of(stepper: LinearisedMethod, derivatives: Array) -> Array:
+    """Return (n, c, variables) adjoint seeds from (n, 2m) or (n, 2m, c) cotangents; 2m + 1 rows include the time."""
+    size = derivatives.shape[1]
+    seeds = np.zeros((len(derivatives), derivatives[0].size // size, stepper._input_size))
+    seeds[:, :, stepper._output_indices[:size]] = derivatives.reshape(len(derivatives), size, -1).transpose(0, 2, 1)
+    return seeds
+
+
+def backward(states: SavedStates, seeds: Array, now: Array) -> Array:
+    """Return (c, variables) adjoints at the start, from the seeds of each state and those ``now`` after the last."""
+    time = time_of(states)
+    states, by_ends = time.states, time.step_cotangents(seeds)
+    for first, last in reversed(list(pieces(states))):
+        starts, numbers = starts_of(states, first, last)
+        vectors = np.zeros((len(numbers), *now.shape))
+        saved = np.flatnonzero(numbers[1:] > 0) + 1
+        vectors[saved] = by_ends[numbers[saved]]
+        vectors[-1] += now
+        propagate(states, starts, numbers, vectors, back=True)
+        now = vectors[0]
+    return time.initial_cotangents(now + by_ends[0], seeds)
+
+
+def checked_cotangents(stepper: LinearisedMethod, count: int, cotangents: ArrayLike) -> Array:
+    """Return validated (n, 2m) or (n, 2m, c) cotangents; in transformed time they may include one of t.
+
+    Raises:
+        StateError: if the shape does not match the number of states.
+    """
+    size, derivatives = 2 * stepper.dimension, finite(cotangents, "cotangents")
+    sizes = {size, len(stepper._output_indices)}
+    if derivatives.ndim not in (2, 3) or derivatives.shape[0] != count or derivatives.shape[1] not in sizes:
+        shape = f"({count}, {size})" + f", or ({count}, {size + 1}) with those by t," * (len(sizes) - 1)
+        raise StateError(
+            f"cotangents, derivatives by (q, p) of each state, must have shape {shape} or (.., c), "
+            f"not {derivatives.shape}"
+        )
+    return derivatives
+
+
+def gradient_of(states: SavedStates, found: Array) -> Gradient:
+    """Construct from (variables, ..) derivatives."""
+    m = states.stepper.dimension
+    return Gradient(
+        q=found[:m],
+        p=found[m : 2 * m],
+        parameters=found[2 * m : -2],
+        t=found[-2],
+        h=found[-1] if _has_fixed_step_size(states) else None,
+    )
+
+
+def finite(given: ArrayLike, name: str) -> Array:
+    """Return a validated array of finite numbers."""
+    array = real_array(given, name)
+    if not np.isfinite(array).all():
+        raise StateError(f"{name} must be finite")
+    return array
+
+
+def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
+    """Return (n, outputs, count) tangent vectors at the states and (count, variables) at the end of the run."""
+    time, outputs = time_of(states), states.stepper._output_indices
+    states, now = time.states, time.initial_tangents(tangents)
+    found = np.empty((len(states), len(outputs), len(now)))
+    found[0] = now[:, outputs].T
+    for first, last in pieces(states):
+        starts, numbers = starts_of(states, first, last)
+        vectors = np.zeros((len(numbers), *now.shape))
+        vectors[0] = now
+        propagate(states, starts, numbers, vectors, back=False)
+        saved = np.flatnonzero(numbers[1:] > 0) + 1
+        found[numbers[saved]] = vectors[saved][:, :, outputs].transpose(0, 2, 1)
+        now = vectors[-1]
+    return time.final_tangents(found, now, tangents)
+
+
+def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:
+    """Propagate tangent or adjoint vectors along the steps of a segment and compare its step ends with the run."""
+    ends = states.stepper._propagate(starts, vectors, states.parameters, states.options, transpose=back)
+    known = np.concatenate([starts.q, starts.p], axis=1)
+    check_recomputed(starts.t, np.concatenate(ends, axis=1), known[1:], known[:-1])
+
+
+def pieces(states: SavedStates) -> Iterator[tuple[int, int]]:
+    """Yield the first and last index of segments whose steps are all saved, or of two consecutive saved states."""
+    spans, lengths = np.diff(states.stepped), states.step_sizes[:-1]
+    several = ~(np.abs(spans) < 1.5 * np.abs(lengths))
+    first = 0
+    while first < len(spans):
+        last = first + 1
+        if not several[first]:
+            ahead = several[first : first + MOST_STEPS]
+            last = first + (int(np.argmax(ahead)) if ahead.any() else len(ahead))
+        yield first, last
+        first = last
+
+
+def starts_of(states: SavedStates, first: int, last: int) -> tuple[Starts, NDArray[np.intp]]:
+    """Return the steps of a segment, and (steps + 1,) indices of the saved states at their ends, -1 if not saved."""
+    length, span = float(states.step_sizes[first]), float(states.stepped[last] - states.stepped[first])
+    count = steps_between(length, span) if last == first + 1 else 1
+    if count == 1:
+        spans, lengths = np.diff(states.stepped[first : last + 1]), states.step_sizes[first:last]
+        h = np.where(np.abs(spans - lengths) < SAME_STEP_SIZE * np.abs(lengths), lengths, spans)
+        of = slice(first, last + 1)
+        starts = Starts(states.t[first:last].copy(), h, states.q[of].copy(), states.p[of].copy())
+        return starts, np.arange(first, last + 1)
+    t, h = states.t[first] + length * np.arange(count), np.full(count, length)
+    starts = Starts.chain(states.q[first], states.p[first], t, h)
+    run = Memory.started(
+        states.stepper,
+        states.q[first],
+        states.p[first],
+        h=length,
+        t=float(t[0]),
+        parameters=states.parameters,
+        options=states.options,
+    )
+    times = np.empty(count)
+    status, report = fill(run, count, 1, times, starts.q[1:], starts.p[1:], np.empty(count, dtype=np.int32))
+    if status:
+        raise step_failure(status, report, step=run.steps, h=length)
+    if states.tau is not None:
+        starts.t[1:] = times[:-1]
+    numbers = np.full(count + 1, -1)
+    numbers[[0, -1]] = first, last
+    starts.q[-1], starts.p[-1] = states.q[last], states.p[last]
+    return starts, numbers
+
+
+def _has_fixed_step_size(states: SavedStates) -> bool:
+    """Return whether all steps have size h."""
+    if states.plan is not None:
+        return False
+    spans = np.diff(states.stepped)
+    steps = np.rint(spans / states.h)
+    return bool((np.abs(spans - steps * states.h) <= SAME_STEP_SIZE * abs(states.h) * np.maximum(1.0, steps)).all())

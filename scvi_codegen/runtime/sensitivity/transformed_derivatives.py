@@ -1,0 +1,140 @@
+"""Derivatives of runs in transformed time: initial states on an energy surface, and ends at a fixed time.
+
+Each step has derivatives with respect to the energy of the run, and derivatives of its physical time. The energy is
+that of the first state and varies with it. If a run ends at t_end or at an event, the size of its last step in tau is
+determined by that time: with w the derivative of the end with respect to this size and w_t that of the time, a
+variation v of the end becomes v - w v_t / w_t (implicit function theorem). The initial time shifts all times and
+nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from scvi_codegen.runtime.core.validation import Array
+from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
+from scvi_codegen.runtime.trajectory.saved_states import SavedStates
+
+__all__ = ["PhysicalTime", "TransformedTime", "time_of"]
+
+T = -2
+"""Index of t among the variables (q, p, parameters, t, h)."""
+
+
+@dataclass(frozen=True)
+class PhysicalTime:
+    """Run without time transformation: the maps below are identities.
+
+    Attributes:
+        states: states of the run at the ends of steps.
+    """
+
+    states: SavedStates
+
+    def initial_tangents(self, tangents: Array) -> Array:
+        """Return (k, variables) variations of the variables of the first step, from those of the initial data."""
+        return tangents
+
+    def final_tangents(self, found: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
+        """Return (n, outputs, k) variations of all states and (k, variables) at the end, from those of the steps."""
+        return found, now
+
+    def step_cotangents(self, seeds: Array) -> Array:
+        """Return (n, k, variables) cotangents of ends from those of states: transpose of :meth:`final_tangents`."""
+        return seeds
+
+    def initial_cotangents(self, derivatives: Array, seeds: Array) -> Array:
+        """Return (k, variables) cotangents of the initial data: the transpose of :meth:`initial_tangents`."""
+        return derivatives
+
+
+@dataclass(frozen=True)
+class TransformedTime(PhysicalTime):
+    """Run in transformed time.
+
+    Attributes:
+        end_time_fixed: whether the time of the last state is fixed, by t_end or a terminal event.
+        repeated: whether the last state repeats the one before, because a step ended exactly there.
+    """
+
+    end_time_fixed: bool
+    repeated: bool
+
+    @classmethod
+    def of(cls, states: SavedStates) -> TransformedTime:
+        """Construct from the states of a run."""
+        end_is_fixed = len(states) > 1 and bool(np.isnan(states.step_sizes[-1]))
+        repeated = end_is_fixed and bool(states.stepped[-1] == states.stepped[-2])
+        return cls(_before_last(states) if repeated else states, end_is_fixed, repeated)
+
+    @cached_property
+    def level(self) -> Array:
+        """(variables,) gradient of the energy with respect to the initial data."""
+        states = self.states
+        return states.stepper._energy_gradient(states.q[0], states.p[0], states.parameters)
+
+    @cached_property
+    def last_step(self) -> Array:
+        """(variables,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
+        states, given = self.states, self.states.stepper._input_size
+        if not self.end_time_fixed or len(states) < 2:
+            return np.zeros(given)
+        span = states.stepped[-1:] - states.stepped[-2:-1]
+        vectors = np.zeros((2, 1, given))
+        vectors[0, 0, -1] = 1.0
+        starts = Starts(states.t[-2:-1].copy(), span, states.q[-2:].copy(), states.p[-2:].copy())
+        states.stepper._propagate(starts, vectors, states.parameters, states.options)
+        derivatives: Array = vectors[1, 0] / vectors[1, 0, T]
+        return derivatives
+
+    def initial_tangents(self, tangents: Array) -> Array:
+        """Add the variation of the energy; see :meth:`PhysicalTime.initial_tangents`."""
+        found = tangents.copy()
+        found[:, self.states.stepper._energy_index] += tangents @ self.level
+        found[:, T] = 0.0
+        return found
+
+    def final_tangents(self, found: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
+        """Project the variation of the end onto the fixed final time; see :meth:`PhysicalTime.final_tangents`."""
+        now = now - now[:, T, np.newaxis] * self.last_step
+        last = now[:, self.states.stepper._output_indices].T[np.newaxis]
+        found = np.concatenate([found if self.repeated else found[:-1], last])
+        found[:, -1] += tangents[:, T]
+        return found, now
+
+    def step_cotangents(self, seeds: Array) -> Array:
+        """Apply the transpose of :meth:`final_tangents`; see :meth:`PhysicalTime.step_cotangents`."""
+        found = seeds.copy()
+        found[-1, :, T] -= seeds[-1] @ self.last_step
+        if self.repeated:
+            found[-2] += found[-1]
+        return found[: len(self.states)]
+
+    def initial_cotangents(self, derivatives: Array, seeds: Array) -> Array:
+        """Apply the transpose of :meth:`initial_tangents`; see :meth:`PhysicalTime.initial_cotangents`."""
+        found = derivatives + derivatives[:, self.states.stepper._energy_index, np.newaxis] * self.level
+        found[:, T] = seeds[:, :, T].sum(axis=0)
+        return found
+
+
+def time_of(states: SavedStates) -> PhysicalTime:
+    """Return the treatment of time for the states of a run."""
+    return PhysicalTime(states) if states.tau is None else TransformedTime.of(states)
+
+
+def _before_last(states: SavedStates) -> SavedStates:
+    assert states.tau is not None
+    return SavedStates(
+        t=states.t[:-1],
+        q=states.q[:-1],
+        p=states.p[:-1],
+        step_sizes=states.step_sizes[:-1],
+        h=states.h,
+        parameters=states.parameters,
+        stepper=states.stepper,
+        options=states.options,
+        tau=states.tau[:-1],
+    )

@@ -1,0 +1,1 @@
+"""Results of runs: saved states, dense output, derived quantities."""

@@ -1,0 +1,63 @@
+"""Derived quantities of states: velocities, energies, momentum maps; NaN where undefined."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.core.integrator import Integrator
+from scvi_codegen.runtime.core.validation import Array
+
+__all__ = ["quantities"]
+
+
+def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
+    """Return the velocity (n, m), energy (n,) and, if there are any, momentum_map (n, c) of n states."""
+    given = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
+
+    def energies(rows: NDArray[np.intp]) -> Array:
+        found: Array = stepper.energy(q[rows], p[rows], t[rows], parameters)
+        return found
+
+    def maps(rows: NDArray[np.intp]) -> Array:
+        return stepper.momentum_maps(q[rows], p[rows], t[rows], parameters)
+
+    def rates(rows: NDArray[np.intp]) -> Array:
+        return stepper.rates(q[rows], p[rows], parameters)
+
+    per_time = np.full(len(t), np.nan)
+    _fill(per_time, given, rates)
+    found = {
+        "velocity": _velocities(stepper, parameters, t, q, p) / per_time[:, np.newaxis],
+        "energy": np.full(len(t), np.nan),
+    }
+    _fill(found["energy"], given, energies)
+    if names := stepper.momentum_map_names:
+        found["momentum_map"] = np.full((len(t), len(names)), np.nan)
+        _fill(found["momentum_map"], given, maps)
+    return found
+
+
+def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:
+    """Fill rows in one call; on failure divide them recursively, so that only failing rows stay NaN."""
+    try:
+        into[rows] = compute(rows)
+    except StateError:
+        for half in np.array_split(rows, 2) if len(rows) > 1 else ():
+            _fill(into, half, compute)
+
+
+def _velocities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> Array:
+    """Return (n, m) velocities by unchecked C calls, for exports with many millions of states."""
+    binding, (n, m) = stepper.binding, q.shape
+    found = np.full((n, m), np.nan)
+    positions, momenta = np.ascontiguousarray(q), np.ascontiguousarray(p)
+    velocity, workspace, values = binding.function("velocity"), binding.workspace(), binding.pointer(parameters)
+    q0, p0, v0 = (binding.pointer(array) for array in (positions, momenta, found))
+    for row, time in enumerate(t.tolist()):
+        if velocity(time, q0 + row * m, p0 + row * m, values, v0 + row * m, workspace):
+            found[row] = np.nan
+    return found

@@ -1,0 +1,83 @@
+"""Recomputation of the steps of a run from its saved states (checkpoint replay), for data that a run does not store.
+
+Newton's iteration solves the steps again, from a linear initial guess. It may converge to another root of the stage
+equations; recomputed steps that do not end in the next saved state raise an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from scvi_codegen.errors import StateError
+from scvi_codegen.runtime.trajectory.dense_output import STEP_END_TOLERANCE, whole_steps
+from scvi_codegen.runtime.trajectory.saved_states import Array, SavedStates
+
+__all__ = ["check_recomputed", "recomputed_steps", "steps_between"]
+
+Found = TypeVar("Found")
+
+SAME_STATE = 1e-6
+"""Largest deviation of a recomputed state, relative to its largest entry; other roots are further away."""
+
+
+def recomputed_steps(
+    states: SavedStates, step: Callable[[Array, Array, float, float], tuple[Array, Array, Found]]
+) -> Iterator[list[Found]]:
+    """Yield the results of all steps between each pair of consecutive saved states.
+
+    Args:
+        states: states at whole steps.
+        step: function of (q, p, h, t) that returns (q1, p1, result).
+
+    Raises:
+        StateError: if the states are not at whole steps, or recomputed steps deviate.
+        StepFailedError: if Newton's iteration does not converge.
+    """
+    for k, (start, length, end) in enumerate(
+        zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), states.t[1:].tolist(), strict=True)
+    ):
+        count, given = steps_between(length, end - start), []
+        q, p = states.q[k], states.p[k]
+        for j in range(count):
+            q, p, found = step(q, p, length if count > 1 else end - start, start + j * length)
+            given.append(found)
+        known = np.concatenate([states.q[k : k + 2], states.p[k : k + 2]], axis=1)
+        check_recomputed(states.t[k : k + 1], np.concatenate([q, p])[np.newaxis], known[1:], known[:1])
+        yield given
+
+
+def steps_between(length: float, span: float) -> int:
+    """Return the number of steps in a span; 1 for a last, shorter step."""
+    if np.isnan(length):
+        raise StateError("this requires states at whole steps: integrate without t_eval and with save_every=1")
+    count = int(whole_steps(np.array([span]), np.array([length]), slack=STEP_END_TOLERANCE)[0])
+    if count > 1 and abs(span - count * length) > STEP_END_TOLERANCE * abs(length):
+        raise StateError("this requires states at whole steps: save all states (save_every=1)")
+    return max(1, count)
+
+
+def check_recomputed(t: Array, found: Array, known: Array, before: Array) -> None:
+    """Raise :class:`StateError` for the first of n recomputed steps that converged to a spurious root.
+
+    Deviations are relative to the largest entry of a state, since entries that are 0 contain only rounding errors.
+
+    Args:
+        t: (n,) start times of the steps.
+        found, known: (n, 2m) recomputed and saved states at their ends.
+        before: (n, 2m) states at their starts.
+    """
+    apart = found - known
+    lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, known))
+    near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
+    rows = np.flatnonzero(~near)
+    sizes = np.maximum(np.abs(known[rows]).max(axis=1), np.abs(before[rows]).max(axis=1))
+    deviating = rows[~(np.abs(apart[rows]).max(axis=1) <= SAME_STATE * sizes)]
+    if deviating.size:
+        raise StateError(
+            f"the steps from t = {t[deviating[0]]:g}, computed again, end in another state than in the run: the stage "
+            "equations have several solutions (use a smaller step size), or the motion is too sensitive between saved "
+            "states (use save_every=1)"
+        )

@@ -1,0 +1,332 @@
+"""Result of an integration: arrays, diagnostics, files and tables."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Self, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from scvi_codegen.display.cards import Html, card, grid, listed, plain, sparkline
+from scvi_codegen.errors import EventError, StateError, StepFailedError
+from scvi_codegen.files.export import States, to_dataframe, write_states
+from scvi_codegen.files.labelled_arrays import checked_units, to_dataset
+from scvi_codegen.runtime.constraints.projection import constraint_values, multipliers
+from scvi_codegen.runtime.events.detection import crossings_of
+from scvi_codegen.runtime.events.event import Crossings, Event, EventLike, as_events
+from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR
+from scvi_codegen.runtime.run.descriptions import describe_states, describe_step_size
+from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
+from scvi_codegen.runtime.sensitivity.trajectory_derivatives import TrajectoryDerivatives
+from scvi_codegen.runtime.trajectory.dense_output import checked_times, states_at
+from scvi_codegen.runtime.trajectory.quantities import quantities
+from scvi_codegen.runtime.trajectory.saved_states import Array, checked_row, checked_rows
+from scvi_codegen.runtime.trajectory.work_and_impulses import work_and_impulses_until
+from scvi_codegen.validation.argument_types import MAPPING, PATH, checks_arguments
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from scvi_codegen.pictures.animation import Film
+    from scvi_codegen.pictures.plots import Plots
+
+__all__ = ["Trajectory", "relative_changes"]
+
+MOST_DRAWN, MOST_CURVES = 400, 6
+"""Largest numbers of states and of coordinates in the plot of a notebook."""
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Trajectory(TrajectoryDerivatives, Confirmed):
+    """States along a run, the initial state first.
+
+    Attributes:
+        t: (n,) times.
+        q: (n, m) positions.
+        p: (n, m) momenta.
+        iterations: (n,) solver iterations since the previous state, 0 for the first.
+        h: step size (negative: backward), the first one for adaptive steps.
+        step_sizes: (n,) size of the step that follows each state; NaN for a state within a step, of ``t_eval`` or where
+            an event ended the run.
+        tau: (n,) values of tau in transformed time (:func:`~scvi_codegen.reparametrise`), where h and ``step_sizes``
+            are steps of tau; else ``None``.
+        parameters: (k,) values in the order of ``stepper.parameters``.
+        stepper: the compiled integrator.
+        options: convergence criterion of the solver, ``None`` for the defaults.
+        events: zero crossings found, parallel to ``stepper.events``.
+        plan: step plan of adaptive steps, else ``None``.
+        steps, rejected_steps: numbers of completed and of rejected steps since the start of the run.
+        step_error, worst_step_time: estimated relative error of the worst step of the run, and its start time. The
+            error is relative to the state, or to the largest state of the run near rest at the origin; NaN for methods
+            without an error estimate.
+        confirmation: the comparison with a second run if ``error=`` was passed, else ``None``.
+    """
+
+    iterations: NDArray[np.int32]
+    events: tuple[Crossings, ...] = ()
+    steps: int = 0
+    rejected_steps: int = 0
+    step_error: float = np.nan
+    worst_step_time: float = np.nan
+    confirmation: GlobalError | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        return describe_states(self, describe_step_size(self.h, self.plan, tau=self.tau is not None))
+
+    @overload
+    def __getitem__(self, rows: slice) -> Self: ...
+    @overload
+    def __getitem__(self, rows: int) -> tuple[float, Array, Array]: ...
+    def __getitem__(self, rows: slice | int) -> Self | tuple[float, Array, Array]:
+        """Return a trajectory for a slice, or (t, q, p) of one state for an index.
+
+        Events outside the times of a slice are omitted; ``steps`` and ``step_error`` remain those of the whole run.
+
+        Raises:
+            IndexError: if an index is out of range, or a slice is empty or descending.
+        """
+        if not isinstance(rows, slice):
+            k = checked_row(rows, len(self))
+            return float(self.t[k]), self.q[k].copy(), self.p[k].copy()
+        first, last, stride = checked_rows(rows, len(self))
+        lengths = self.step_sizes[rows]
+        if stride > 1 and self.plan is not None:  # the next saved state is not the end of the step
+            lengths = np.full_like(lengths, np.nan)
+        low, high = sorted((self.t[first], self.t[range(first, last, stride)[-1]]))
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
+            tau=None if self.tau is None else self.tau[rows],
+            step_sizes=lengths,
+            events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
+        )
+
+    @classmethod
+    def before(cls, failure: StepFailedError) -> Self:
+        """Return the trajectory before a failed step; raise StateError if that was a single step."""
+        if not isinstance(failure.trajectory, cls):
+            raise StateError("a single step that failed has no trajectory")
+        return failure.trajectory
+
+    def energy(self) -> Array:
+        """Return (n,) energies p.v - L, constant along exact trajectories if L does not depend on time."""
+        energies: Array = self.stepper.energy(self.q, self.p, self.t, self.parameters)
+        return energies
+
+    def momentum_maps(self) -> Array:
+        """Return (n, k) conserved quantities, in the order of ``stepper.momentum_map_names``."""
+        return self.stepper.momentum_maps(self.q, self.p, self.t, self.parameters)
+
+    def momentum_errors(self) -> Array:
+        """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
+        values, sizes = self.stepper._momentum_maps_and_sizes(self.q, self.p, self.t, self.parameters)
+        return relative_changes(values, sizes)
+
+    def work(self) -> Array:
+        """Return (n,) work of the forces since the first state: sum h b_i f . v along the curves of the steps.
+
+        For time-independent L, E_n - E_0 - W_n is of the order of the method; for SCVI of order s + 1, that of its
+        curve.
+
+        Raises:
+            MethodError: if no forces act, or the method has no curve of positions.
+            StateError: if the states are not at whole steps.
+        """
+        return work_and_impulses_until(self)[:, 0]
+
+    def impulses(self) -> Array:
+        """Return (n, k) changes by forces of the quantities that L alone conserves, ``stepper.impulse_names``.
+
+        They equal J_n - J_0 to round-off for SVI and related methods, to order s + 1 for SCVI. Raises as
+        :meth:`work`.
+        """
+        return work_and_impulses_until(self)[:, 1:]
+
+    def multipliers(self) -> Array:
+        """Return (n, c) Lagrange multipliers of the constraints; the constraint forces are g_q^T lambda.
+
+        Raises:
+            MethodError: if the system has no constraints.
+        """
+        return multipliers(self.stepper, self.q, self.p, self.t, self.parameters)
+
+    def constraint_values(self) -> tuple[Array, Array]:
+        """Return (n, c) constraint residuals and (n, c) rates at the states, zero up to rounding."""
+        g, rate = constraint_values(self.stepper, self.q, self.p, self.t, self.parameters)
+        return g, rate
+
+    def states(self, units: Mapping[str, str] | None = None) -> States:
+        """Return the states for :mod:`scvi_codegen.files.export`."""
+        interface = self.stepper.interface
+        piece = (self.t, self.q, self.p, self.iterations)
+        return States(
+            count=len(self),
+            pieces=lambda: iter([piece]),
+            coordinates=interface.coordinates,
+            parameters=dict(zip(interface.parameters, map(float, self.parameters), strict=True)),
+            h=self.h,
+            about=interface.about(),
+            maps=interface.map_names,
+            quantities=partial(quantities, self.stepper, self.parameters),
+            units=checked_units(units),
+        )
+
+    @property
+    def ended_by(self) -> Event | None:
+        """Terminal event that ended the run, whose crossing is the last state; or ``None``."""
+        for found in self.events:
+            if found.event.terminal and len(found) >= int(found.event.terminal):
+                return found.event
+        return None
+
+    @property
+    def velocity(self) -> Array:
+        """(n, m) velocities of the states."""
+        return self.stepper.velocity(self.q, self.p, self.t, self.parameters)
+
+    def at(self, t: ArrayLike) -> tuple[Array, Array]:
+        """Return dense output at times t, by partial steps: as accurate as the method and continuous in t.
+
+        At the ends of steps it equals the saved states; steps between saved states are recomputed, equal to round-off.
+        Backward runs are supported.
+
+        Args:
+            t: a time, or (n,) times in any order, within the trajectory.
+
+        Returns:
+            (q, p), each (m,) for a number and (n, m) for times.
+
+        Raises:
+            StateError: if a time is outside the trajectory, or this was made with ``t_eval``.
+        """
+        times = checked_times(t, "t")
+        q, p = states_at(self, times.ravel())
+        return q.reshape(*times.shape, self.stepper.dimension), p.reshape(*times.shape, self.stepper.dimension)
+
+    def crossings(self, events: EventLike | Sequence[EventLike]) -> tuple[Crossings, ...]:
+        """Return the zero crossings of functions along a trajectory with all states (``save_every=1``).
+
+        Args:
+            events: as of :meth:`Stepper.integrate`; terminal ones do not end the search.
+        """
+        if not (asked := as_events(events)):
+            raise EventError("crossings requires at least one event, such as 'q' or Event('q', direction=1)")
+        return crossings_of(self.stepper.with_events(asked), self)
+
+    def _repr_html_(self) -> str:
+        save_every = max(1, -(-len(self) // MOST_DRAWN))
+        series = list(zip(self.stepper.coordinates, self.q[::save_every].T, strict=True))[:MOST_CURVES]
+        energies = self._energies(save_every)
+        rows = [(plain(name), sparkline(values.tolist(), name), _range(values)) for name, values in series]
+        if energies is not None:
+            rows.append((plain("energy"), sparkline(energies.tolist(), "energy"), _range(energies)))
+        names = zip(self.stepper.parameters, self.parameters, strict=True)
+        facts = (
+            ("time", plain(f"{self.t[0]:g} to {self.t[-1]:g}, {self._steps()}")),
+            ("states", plain(f"{len(self)}; q and p of shape {self.q.shape}")),
+            ("coordinates", listed(self.stepper.coordinates)),
+            ("parameters", listed([f"{name} = {value:g}" for name, value in names])),
+            ("iterations", plain(f"{self.iterations.sum()}")),
+            ("step error", plain(self._worst())),
+        )
+        return card(self.stepper.title, facts, grid(rows))
+
+    def _steps(self) -> str:
+        if self.plan:
+            return f"{self.steps} adaptive steps, {self.rejected_steps} rejected"
+        return f"h = {self.h:g}"
+
+    def _worst(self) -> str:
+        if math.isnan(self.step_error):
+            return "unknown: the method has no error estimate here"
+        message = f"about {self.step_error:.1e} relative in the step from t = {self.worst_step_time:g}, the worst"
+        return f"{message}; h is too large" if self.step_error > TOLERABLE_ERROR else message
+
+    def _energies(self, save_every: int) -> Array | None:
+        """Return the energies of every ``save_every``-th state, ``None`` outside the domain of L."""
+        try:
+            energies: Array = self.stepper.energy(
+                self.q[::save_every], self.p[::save_every], self.t[::save_every], self.parameters
+            )
+        except StateError:
+            return None
+        return energies
+
+    @property
+    def plot(self) -> Plots:
+        """Plots: ``run.plot()`` gives an overview, ``run.plot.energy("energy.png")`` a single plot in a file.
+
+        There are ``motion``, ``phase``, ``energy``, ``momentum_maps`` and ``section``; each returns Matplotlib axes.
+        """
+        from scvi_codegen.pictures.plots import Plots
+
+        return Plots(self)
+
+    def animate(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        seconds: float = 8.0,
+        positions: Callable[[Array], Array] | None = None,
+    ) -> Film:
+        """Return an animation for a notebook, or write .gif, .html or .mp4; see :func:`scvi_codegen.animate`."""
+        from scvi_codegen.pictures.animation import animate
+
+        return animate(self, path, seconds=seconds, positions=positions)
+
+    @checks_arguments(path=PATH, units=MAPPING)
+    def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
+        """Write ``.npz``, ``.csv``, ``.h5`` (or ``.nc``) or ``.zarr``, atomically.
+
+        An ``.npz`` file has arrays t, q, p, iterations, h, parameters, coordinates, parameter_names, and strings
+        title, system, method, version. A CSV file has columns t, coordinates x, momenta p_x, iterations, velocities
+        x_dot and energy, NaN where undefined. HDF5 and Zarr files contain the variables of :meth:`to_xarray`.
+
+        Raises:
+            StateError: if the suffix is unknown, or the format has no units.
+            MissingLibraryError: if h5netcdf or zarr is not installed (extra ``data``).
+        """
+        write_states(self.states(units), path)
+
+    def to_xarray(self, *, units: Mapping[str, str] | None = None) -> xarray.Dataset:
+        """Return a dataset of q, p, velocity (t, coordinate), energy, iterations (t), momentum_map (t, symmetry).
+
+        Attributes are h, parameters and titles, and a ``long_name`` of each variable. Undefined values are NaN.
+
+        Args:
+            units: units of t, q, p, velocity, energy or momentum_map, ``{"t": "day", "q": "au"}``; those of velocities
+                follow.
+
+        Raises:
+            StateError: if units name an unknown variable.
+            MissingLibraryError: if xarray is not installed (extra ``data``).
+        """
+        return to_dataset(self.states(units).labelled())
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return one row per state, indexed by time, with the columns of a CSV file (:meth:`save`).
+
+        Raises:
+            MissingLibraryError: if pandas is not installed (extra ``data``).
+        """
+        return to_dataframe(self.states())
+
+
+def relative_changes(values: Array, sizes: Array) -> Array:
+    """Return changes since the first value along axis 0, relative to the largest size; NaN if sizes overflow."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        scales = np.fmax.reduce(sizes, axis=0)
+        changes: Array = (values - values[0]) / np.where(scales > 0.0, scales, 1.0)
+    return np.where(np.isinf(scales), np.nan, changes)
+
+
+def _range(values: Array) -> Html:
+    """Format the smallest and the largest value and their difference."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return plain(f"{low:.10g} to {high:.10g}, a difference of {high - low:.2g}")
