@@ -136,26 +136,26 @@ class Kernel:
 class LoopedKernel:
     """A kernel in loops over indices, whose values are added to entries of arrays.
 
-    Elements, and the targets of an element, are processed in order, so that loops and their unrolled form round alike.
+    Elements, and the writes of an element, are processed in order, so that loops and their unrolled form round alike.
     The length of the code depends on the kernel, not on the number of elements.
 
     Attributes:
-        kernel: of a potential or a force: one value per target, added to the force there (of a momentum: to the
-            velocity); of a mass: one value, added to the mass of the only target.
+        kernel: of a potential or a force: one value per write, added to the force there (of a momentum: to the
+            velocity); of a mass: one value, added to the mass of the only write.
         loops: outermost first.
-        slots: entries (coordinates; for forces, velocities too) that are the kernel's arguments u.
-        targets: entries that each value is added to; for a potential the slots.
+        reads: entries (coordinates; for forces, velocities too) that are the kernel's arguments u.
+        writes: entries that each value is added to; for a potential the reads.
         given: other entries: the last parameters of the kernel or, if they are constants, its last arguments.
         text: the formula.
         scalar: of a potential: L itself.
-        along: number of slots, the last ones, that belong to a direction instead of the state.
+        along: number of reads, the last ones, that belong to a direction instead of the state.
         tables, columns: constant tables of indices, and constant arrays of numbers or parameters, by name.
     """
 
     kernel: Kernel
     loops: tuple[Loop, ...]
-    slots: tuple[Access, ...]
-    targets: tuple[Access, ...]
+    reads: tuple[Access, ...]
+    writes: tuple[Access, ...]
     given: tuple[Access, ...]
     text: str = ""
     scalar: Kernel | None = None
@@ -190,8 +190,8 @@ class LoopedKernel:
         return cls(
             kernel=kernel,
             loops=(Loop(index="e", first=Size(""), end=end),),
-            slots=entries("u", "places", len(table[0])),
-            targets=entries("value", written, kernel.values),
+            reads=entries("u", "places", len(table[0])),
+            writes=entries("value", written, kernel.values),
             given=tuple(Access(array=Array(name, (end,)), places=(Place(index="e"),)) for name in columns),
             tables=(("places", table), *((("targets", targets),) if targets else ())),
             columns=tuple(columns.items()),

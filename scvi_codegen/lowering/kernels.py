@@ -98,8 +98,8 @@ def looped_kernel(
     return LoopedKernel(
         kernel=replace(kernel, purpose=purpose),
         loops=of.loops,
-        slots=accesses * (2 if along else 1),
-        targets=accesses if targets is None else tuple(targets),
+        reads=accesses * (2 if along else 1),
+        writes=accesses if targets is None else tuple(targets),
         given=tuple(access for _, access in given),
         text=comment_text(text),
         along=len(along),

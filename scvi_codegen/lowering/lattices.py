@@ -27,8 +27,8 @@ def reach_of(arrays: Iterable[Array], term_groups: Iterable[LoopedKernel]) -> in
         (target, slot)
         for looped in term_groups
         if looped.loops
-        for target in looped.targets
-        for slot in looped.slots
+        for target in looped.writes
+        for slot in looped.reads
         if target != slot
     ]
     if not all(_same_loops(*pair) for pair in pairs):

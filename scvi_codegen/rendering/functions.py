@@ -80,8 +80,8 @@ def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
     """Return the statements of loops: gather slots, evaluate the kernel, add its values."""
     lines = []
     for each in kernel.sums:
-        at, to = (_named(each, entries[0].places[0].table) for entries in (each.slots, each.targets))
-        reads = [f"u[at[{slot.places[0].column}]]" for slot in each.slots]
+        at, to = (_named(each, entries[0].places[0].table) for entries in (each.reads, each.writes))
+        reads = [f"u[at[{slot.places[0].column}]]" for slot in each.reads]
         reads += [_constant(_named(each, name), column[0], real, sources) for name, column in each.columns]
         lines += [
             f"for (int e = 0; e < {each.rows}; e++) {{",
@@ -89,7 +89,7 @@ def _loops(kernel: Kernel, real: str, sources: Sequence[str] = ()) -> list[str]:
             f"  {real} slot[{each.kernel.arguments}], term[{each.kernel.values}];",
             *(f"  slot[{k}] = {text};" for k, text in enumerate(reads)),
             f"  {each.kernel.name}(slot, t, parameters, term);",
-            *(f"  value[to[{target.places[0].column}]] += term[{k}];" for k, target in enumerate(each.targets)),
+            *(f"  value[to[{target.places[0].column}]] += term[{k}];" for k, target in enumerate(each.writes)),
             "}",
         ]
     return lines

@@ -95,7 +95,7 @@ class Nest:
         self, depth_of: int, prepare: Lines, innermost: Sequence[str], finish: Lines, behind: Sequence[Sequence[str]]
     ) -> list[str]:
         lines = list(self._found(depth_of))
-        outer = [k for k, target in enumerate(self.looped.targets) if self.depth_of(target) == depth_of]
+        outer = [k for k, target in enumerate(self.looped.writes) if self.depth_of(target) == depth_of]
         if depth_of == len(self.looped.loops):
             return [*lines, *innermost]
         lines += [line for k in outer for line in prepare(k)]
@@ -116,7 +116,7 @@ class Nest:
             for offset in offsets
         ]
         if self.chunked:
-            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.targets)}][CHUNK];"]
+            lines += [*self._part_passed_over(loop), f"lanes values[{len(self.looped.writes)}][CHUNK];"]
         lines += _loop(loop, "begin", "end", inner)
         for each in behind:
             lines += _loop(loop, "begin", "end", each)
@@ -137,20 +137,20 @@ class Nest:
     def adding(self, k: int, value: str) -> list[str]:
         """Return the lines that add to the element of a target, if the task adds to it."""
         if self.sharing is not Sharing.BY_PLACES:
-            return [f"F[{self.place_of(self.looped.targets[k])}] += {value};"]
+            return [f"F[{self.place_of(self.looped.writes[k])}] += {value};"]
         named = [self._named(k)] if self._in_a_part(k) else []
         return [*named, f"if (whole || within(here, place_{k}))", f"  F[place_{k}] += {value};"]
 
     def _named(self, k: int) -> str:
-        return f"const long long place_{k} = {self.place_of(self.looped.targets[k])};"
+        return f"const long long place_{k} = {self.place_of(self.looped.writes[k])};"
 
     def _in_a_part(self, k: int) -> bool:
         """Return whether an element is only known in the loops over a part."""
-        return self.chunked and self.is_innermost(self.looped.targets[k])
+        return self.chunked and self.is_innermost(self.looped.writes[k])
 
     def _passed_over(self) -> list[str]:
         """Return the lines that skip an element that adds to nothing in a task."""
-        wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.targets))]
+        wanted = [f"within(here,\0place_{k})" for k in range(len(self.looped.writes))]
         past = [f"if (!(whole || {' || '.join(wanted)}))", "  continue;"]
         return past if self.sharing is Sharing.BY_PLACES and not self.chunked else []
 
@@ -158,7 +158,7 @@ class Nest:
         """Return the lines that skip a part of the innermost loop that adds to nothing in a task."""
         if self.sharing is not Sharing.BY_PLACES:
             return []
-        places = range(len(self.looped.targets))
+        places = range(len(self.looped.writes))
         named = [self._named(k) for k in places if self._in_a_part(k)]
         tests = [f"wanted |= within(here, place_{k});" for k in places]
         look = _loop(loop, "begin", "end && !wanted", [*named, *tests])
@@ -166,21 +166,21 @@ class Nest:
 
     def _offsets(self, loop: Loop) -> list[int]:
         """Return the distances of neighbours across a periodic boundary."""
-        accesses = (*self.looped.slots, *self.looped.targets, *self.looped.given)
+        accesses = (*self.looped.reads, *self.looped.writes, *self.looped.given)
         places = [place for access in accesses for place in access.places]
         moved = {place.base.number for place in places if place.index == loop.index and not place.table}
         return sorted(moved - {0}) if loop.periodic else []
 
     def _found(self, depth_of: int) -> Iterator[str]:
         """Yield the lines known at a level: arguments, parameters, elements that not every task adds to."""
-        for k, target in enumerate(self.looped.targets if self.sharing is Sharing.BY_PLACES else ()):
+        for k, target in enumerate(self.looped.writes if self.sharing is Sharing.BY_PLACES else ()):
             if self.depth_of(target) == depth_of and not self._in_a_part(k):
                 yield self._named(k)
         if depth_of == len(self.looped.loops):
             yield from self._passed_over()
-        for k, slot in enumerate(self.looped.slots):
+        for k, slot in enumerate(self.looped.reads):
             if self.depth_of(slot) == depth_of and self.source:
-                source = self.source if k < len(self.looped.slots) - self.looped.along else DIRECTION
+                source = self.source if k < len(self.looped.reads) - self.looped.along else DIRECTION
                 yield f"u[{k}] = {source}[{self.place_of(slot)}];"
         for k, access in enumerate(self.looped.given, self.scalars):
             if self.depth_of(access) == depth_of:
@@ -225,8 +225,8 @@ class Nest:
 
     def _unknowns(self) -> Iterator[str]:
         """Yield the declaration of the arguments of the kernel, if it has any."""
-        if self.source and self.looped.slots:
-            yield f"{self.scalar} u[{len(self.looped.slots)}];"
+        if self.source and self.looped.reads:
+            yield f"{self.scalar} u[{len(self.looped.reads)}];"
         elif self.source:
             yield f"const {self.scalar} u[1] = {{0}};"
             yield f"(void){self.source};"

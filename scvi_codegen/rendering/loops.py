@@ -97,8 +97,8 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     explicit = program.fixed_point is None
     chunked, sharing = explicit and bool(looped.loops), sharing_of(looped)
     nest = Nest(program, looped, "lanes", "X", chunked=chunked, sharing=sharing)
-    slots = range(len(looped.targets))
-    inner = [nest.is_innermost(target) for target in looped.targets]
+    slots = range(len(looped.writes))
+    inner = [nest.is_innermost(target) for target in looped.writes]
 
     def added(k: int, value: str) -> list[str]:
         return nest.adding(k, value) if inner[k] else [f"sum_{k} += {value};"]
@@ -125,7 +125,7 @@ def _force_text(program: Program, looped: LoopedKernel) -> str:
     if sharing is Sharing.BY_PLACES:
         zero.append("const int whole = here->whole;")
     unused = ["(void)here;"] if sharing is Sharing.ALONE else []
-    values = f"lanes value[{len(looped.targets)}]"
+    values = f"lanes value[{len(looped.writes)}]"
     text = nest.function(f"static void add_{looped.kernel.name}", arguments, [*unused, *zero, *lines], values=values)
     return f"{text}\n\n{_sharing_text(program, looped)}"
 
@@ -165,7 +165,7 @@ def _energy_text(program: Program, looped: LoopedKernel, kernel: Kernel) -> str:
 
 def _mass_text(program: Program, looped: LoopedKernel) -> str:
     """Return a function that adds to the masses."""
-    name, place = looped.kernel.name, Nest(program, looped, "", "").place_of(looped.targets[0])
+    name, place = looped.kernel.name, Nest(program, looped, "", "").place_of(looped.writes[0])
     lines = [f"{name}(NULL, 0.0, parameters, value);", f"mass[{place}] += value[0];"]
     return _function(program, looped, f"add_{name}", ["double *mass"], lines, source="")
 
@@ -175,7 +175,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
     if held is None:
         return {"held": None}
     counts = [count_text(each.loops) for each in held.conditions]
-    entries = [f"{count} * {len(each.slots)}" for count, each in zip(counts, held.conditions, strict=True)]
+    entries = [f"{count} * {len(each.reads)}" for count, each in zip(counts, held.conditions, strict=True)]
     pairs = zip(held.conditions, held.curvatures, strict=True)
     found = {
         "functions": [text for pair in pairs for text in _constraint_texts(program, *pair)],
@@ -190,7 +190,7 @@ def _constraint_context(program: Program, held: ConstrainedSteps | None) -> dict
 
 def _constraint_texts(program: Program, condition: LoopedKernel, curvature: LoopedKernel) -> Iterator[str]:
     """Yield functions of a constraint: g, g_t and derivatives; second derivatives; indices of its coordinates."""
-    name, count = condition.kernel.name, len(condition.slots)
+    name, count = condition.kernel.name, len(condition.reads)
     X, now = "const double *restrict X", "condition *now"
     lines = [
         f"{name}(u, t, parameters, value);",
@@ -203,8 +203,8 @@ def _constraint_texts(program: Program, condition: LoopedKernel, curvature: Loop
     lines = [f"{second}(u, t, parameters, value);", "now->g[now->count++] = value[0];"]
     arguments = [X, f"const double *restrict {DIRECTION}", "double t", now]
     yield _function(program, curvature, f"find_{second}", arguments, lines)
-    bare = replace(condition, slots=(), given=())
-    places = map(Nest(program, bare, "", "").place_of, condition.targets)
+    bare = replace(condition, reads=(), given=())
+    places = map(Nest(program, bare, "", "").place_of, condition.writes)
     lines = [
         "now->first[now->count++] = (int)now->entries;",
         *(f"now->place[now->entries++] = (int)({place});" for place in places),

@@ -32,7 +32,7 @@ class Sharing(Enum):
 
 def sharing_of(looped: LoopedKernel) -> Sharing:
     """Return the kind of tasks for a term group."""
-    loops, targets = looped.loops, looped.targets
+    loops, targets = looped.loops, looped.writes
     if not loops:
         return Sharing.ALONE
     if _axes(targets, {loops[0].index}):
@@ -49,7 +49,7 @@ def sharing_text(looped: LoopedKernel) -> str:
     found, loops = sharing_of(looped), looped.loops
     if found is Sharing.IN_TURN:
         span = f"{size_text(loops[0].first)}, {size_text(loops[0].end)}"
-        return f"alternating_blocks({span}, {_width(looped.targets, {loops[0].index})}, {count_text(loops[1:])})"
+        return f"alternating_blocks({span}, {_width(looped.writes, {loops[0].index})}, {count_text(loops[1:])})"
     if found is Sharing.IN_TILES:
         return f"pairs_of_blocks({size_text(loops[0].end)})"
     return "by_elements(run, n)" if found is Sharing.BY_PLACES else "alternating_blocks(0, 1, 0, 1)"
