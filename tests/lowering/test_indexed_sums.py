@@ -15,6 +15,7 @@ from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.program_source import render, render_ensemble
+from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 
 FLAGS = (*(flag for flag in QUICK_FLAGS if "contract" not in flag), "-ffp-contract=off")
@@ -52,8 +53,7 @@ def states(system: LagrangianSystem, force: Kernel | None) -> tuple[np.ndarray, 
     stepper = Stepper(
         render(program),
         describe(program, system, method),
-        ensemble=lambda: render_ensemble(program),
-        controlled=lambda: None,
+        variants=Variants({"ensemble": render_ensemble(program)}),
         flags=FLAGS,
     )
     q = np.sin(np.arange(1, system.dimension + 1) / 3) / 2
