@@ -1,3 +1,4 @@
+/* Solver of steps whose fixed-point iteration fails: none (NO_FALLBACK) or Newton's method. */
 #ifdef NO_FALLBACK
 /* No fallback: if the fixed-point iteration fails, the step fails. */
 static int fall_back(int status, const step_data *step, double *dq, double *dp, const solver_options *options,

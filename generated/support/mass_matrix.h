@@ -1,3 +1,4 @@
+/* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS) or full. */
 #ifdef DIAGONAL_MASS
 /* Diagonal mass matrices. Requires: points.h or trajectories.h. */
 enum { DIAGONAL = 1,

@@ -1,3 +1,4 @@
+/* Explicit splitting method: drifts by constant masses (BY_MASSES) or by velocities v(p, t), and kicks. */
 #ifdef BY_MASSES
 /* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
 typedef struct {

@@ -27,7 +27,7 @@ static inline real *entry(real *jacobian, const band *shape, int i, int r, int j
 }
 #else
 /* Sums between blocks of unknowns z and points, for every method. Requires: real, M, B, POINTS, POSITION_IN_MATRIX,
- * band.h, step.h, stages.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
+ * band.h, step.h. Row r of site i is rows[i (B + 1) + r], the last one for p1. The first M sites are the
  * coordinates. */
 
 /* u = q0 + u at every point, including the compensation of q0. */

@@ -126,9 +126,7 @@ static double largest_yet(const run_memory *run, const lanes *velocity, long lon
   return largest_of(&all, 0);
 }
 
-/* Largest value in a block of (displacement due to the leading coefficient of the velocities)^2 / (displacement due to
- * the curvature), all relative to the largest coordinate. The coefficient is at least `decay` times the next lower one
- * (curve_error.h). */
+/* Largest value of unresolved_part in a block for velocities, relative to the largest coordinate. */
 static double unresolved_of_block(const run_memory *run, const lanes *velocity, long long n, double decay,
     double largest, section here)
 {
@@ -139,9 +137,7 @@ static double unresolved_of_block(const run_memory *run, const lanes *velocity, 
     const double size = scale * (fabs(run->q[i]) + moved_by(run, velocity, n, i) + largest);
     const double start = at_point(rate, 2 * n, 0), middle = at_point(rate, 2 * n, KEPT / 2);
     const double ends = fabs(at_point(rate, 2 * n, KEPT - 1) - start) + fabs(middle - start);
-    const double curvature = fabs(unit) * ends + NEGLIGIBLE * size;
-    const double top = unit * top_coefficient(rate, 2 * n, decay);
-    least = larger(least, top * top / larger(curvature * size, DBL_MIN)); /* all may be 0 */
+    least = larger(least, unresolved_part(unit, top_coefficient(rate, 2 * n, decay), ends, size));
   }
   return least;
 }

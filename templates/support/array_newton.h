@@ -100,7 +100,7 @@ static void find_own_inverses(linear_system *of)
     keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
 }
 
-/* Vectors over all points of all coordinates; every thread computes its own part. Requires: array_newton.h. */
+/* Vectors over all points of all coordinates; every thread computes its own part. */
 
 /* Inner product of scaled vectors. */
 static double inner_product(const linear_system *of, const lanes *x, const lanes *y)

@@ -92,9 +92,8 @@ static double largest_moved(const step_points *w, double largest)
   return largest_of(&all, 0);
 }
 
-/* Error estimate of a block: the largest value of (displacement due to the leading coefficient of the forces)^2 /
- * (displacement due to the curvature), all relative to the largest coordinate. The coefficient is at least `decay`
- * times the next lower one (curve_error.h). NaN if a force is not finite. */
+/* Error estimate of a block: the largest value of unresolved_part for forces, relative to the largest coordinate. NaN
+ * if a force is not finite. */
 static double unresolved(const step_points *w, double largest, double decay, section here)
 {
   const double scale = scale_of(largest);
@@ -104,11 +103,10 @@ static double unresolved(const step_points *w, double largest, double decay, sec
     const double unit = scale * unit_of(w, i);
     const double moved = w->step->h * w->data->inverse_mass[i] * w->step->p0[i];
     const double size = scale * (fabs(w->step->q0[i]) + fabs(moved) + largest);
-    const double curvature = fabs(unit) * ends_of_forces(w, i) + NEGLIGIBLE * size;
-    const double top = unit * top_coefficient(&w->F[i], w->n, decay);
+    const double top = top_coefficient(&w->F[i], w->n, decay);
     for (int g = 0; g < GROUPS; g++)
       faults += 0.0 * w->F[g * w->n + i];
-    least = larger(least, top * top / larger(curvature * size, DBL_MIN)); /* all may be 0 */
+    least = larger(least, unresolved_part(unit, top, ends_of_forces(w, i), size));
   }
   return least + lanes_total(faults);
 }

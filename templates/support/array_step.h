@@ -155,7 +155,7 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
 }
 
 /* Step of an indexed system with a solver: error estimate, comparison with half steps, update of the state. Requires:
- * solve, continue_steps; tables LAST_ALONE, LAST, BEFORE; curve_error.h, sizes.h, array_step.h. */
+ * solve, continue_steps; tables LAST_ALONE, LAST, BEFORE; curve_error.h, sizes.h. */
 
 /* Largest coordinate and largest momentum. */
 static void find_size(const run_memory *run, long long n, double *q, double *p)

@@ -110,7 +110,7 @@ const casadi_int *EXTERNAL(adj1_, _sparsity_out)(casadi_int i)
 }
 
 #ifdef SECOND_DERIVATIVES
-/* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. Requires: casadi_flow.h, flow.h. */
+/* Jacobian of the adjoint of a flow for CasADi: exact second derivatives. Requires: flow.h. */
 
 static const casadi_int NO_INPUT_SHAPE[2 + 1 + 1] = {STEP_INPUTS, 1};
 static const casadi_int HESSIAN_SHAPE[] = {STEP_INPUTS, STEP_INPUTS, 1};

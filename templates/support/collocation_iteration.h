@@ -1,3 +1,5 @@
+/* Fixed-point iteration of a collocation method: momenta at the ends, by quadrature of the action (NODES) or by the
+ * Legendre transform, and the iteration. */
 #ifdef NODES
 /* Momenta at both ends of a curve by quadrature of the action; p0 determines the initial velocity. Requires:
  * curve.h, the tables of the contributions of the points to p0 and p1, the kernel action_lanes. */

@@ -92,8 +92,8 @@ long long NAME(constraint_pairs)(run_memory *run, const problem *given)
 
 /* Systems with the constraint matrix G M^-1 G^T by conjugate gradients, preconditioned by the incomplete factorisation
  * L D L^T without fill (J. A. Meijerink & H. A. van der Vorst, Math. Comp. 31, 1977). For a chain or a tree whose
- * constraints are ordered from an end the factors are exact. Redundant constraints make the matrix singular, which is
- * an error. Requires: constraint_matrix.h. */
+ * constraints are ordered from an end the factors are exact. Redundant constraints make the matrix singular, which
+ * is an error. */
 
 #define LEAST_PIVOT 1e-3 /* relative to the diagonal: a smaller pivot was lost by the incomplete factorisation */
 #define DEPENDENT 1e-13 /* of the matrix relative to L D L^T: curvature that counts as 0 */

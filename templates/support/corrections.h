@@ -16,7 +16,7 @@ static inline void place(const step_data *step, int n, lanes (*scaled)[M], lanes
 
 #ifdef FOLLOWED
 /* Velocity corrections from residual momenta r, with forces and momenta linearised in the correction. Requires:
- * corrections.h, point_weights.h, a mass. */
+ * point_weights.h, a mass. */
 enum { VALUES = 2 * M + 3 * M * M }; /* of point_lanes: forces, momenta; F_q, F_v, P_q by rows */
 
 /* Product of a matrix row and x. */
@@ -75,8 +75,8 @@ static inline void converged_forces(const step_data *step, const iteration_data 
       F[n][i] += value[n][i];
 }
 #else
-/* Velocity corrections mass^-1 r from residual momenta r, with forces and momenta frozen. Requires: corrections.h,
- * point_weights.h, a mass, the kernel force_lanes. */
+/* Velocity corrections mass^-1 r from residual momenta r, with forces and momenta frozen. Requires: point_weights.h, a
+ * mass, the kernel force_lanes. */
 enum { VALUES = 2 * M }; /* of point_lanes: forces, momenta */
 
 /* r = mass^-1 r at all points. */

@@ -1,3 +1,5 @@
+/* Collocation curve of a step: its initial velocity, known from p0 (HAMILTONIAN) or an unknown, and with NODES its
+ * quadrature points. */
 #ifdef HAMILTONIAN
 /* Initial velocity of a curve from p0. Requires: HAMILTONIAN, 1 for Hamiltonian systems. */
 static int nearby_velocity(const step_data *step, double *v0)
@@ -89,7 +91,7 @@ static inline void end_increment(const step_data *step, const curve_data *curve,
 }
 
 #ifdef NODES
-/* Quadrature points on a collocation curve. Requires: curve.h, NODES, the tables POINT_POSITION, POINT_VELOCITY. */
+/* Quadrature points on a collocation curve. Requires: NODES, the tables POINT_POSITION, POINT_VELOCITY. */
 
 /* Positions and velocities at the quadrature points. */
 static inline void place_points(const step_data *step, const curve_data *curve, lanes *u)

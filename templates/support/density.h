@@ -1,3 +1,5 @@
+/* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
+ * not on velocities. */
 #ifdef HAMILTONIAN_SYSTEM
 /* Arguments of the step density: positions and momenta. Requires: step.h. */
 static int density_arguments(const step_data *step, real *u)

@@ -1,3 +1,5 @@
+/* Discrete Lagrangian of an explicit method (EXPLICIT_STEPS) or of an implicit one (DISCRETE_LAGRANGIAN), with its
+ * Legendre transforms; otherwise work and impulses of the forces of a step. */
 #if defined(EXPLICIT_STEPS)
 /* Discrete Lagrangian of the kick-drift-kick scheme (Stoermer-Verlet) and its discrete Legendre transforms. The drift
  * has the velocity (q1 - q0) / h, so that no equations are solved. Requires: splitting.h, energy. */

@@ -1,3 +1,4 @@
+/* Events: zero crossings of functions along the steps of a run; TIME_TRANSFORMATION: h is a step in tau. */
 #ifdef TIME_TRANSFORMATION
 /* Velocities dq/dt as arguments of event functions of a time-transformed system, whose integrator has dq/dtau, and the
  * duration of a part h of a step in tau. Requires: status_codes.h. */

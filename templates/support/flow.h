@@ -221,7 +221,7 @@ static int flow_rows(flow_part part, flow_call *way, long long rows, const real 
 }
 
 #ifdef SECOND_DERIVATIVES
-/* Second derivatives of a flow: tangent vectors of its VJP. Requires: flow.h, second_derivatives.h. */
+/* Second derivatives of a flow: tangent vectors of its VJP. Requires: second_derivatives.h. */
 
 /* Computes from (count, kept states, FLOW_STATE) adjoint vectors, each with one of (count, STEP_INPUTS) tangent
  * vectors of the inputs, the (count, STEP_INPUTS) derivatives of the gradients along them. `room` is for (steps + 1,

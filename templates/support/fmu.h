@@ -191,7 +191,7 @@ FMI_EXPORT fmi3Status FMI(Reset)(fmi3Instance instance)
   return fmi3OK;
 }
 
-/* Variables of an FMU by value reference. Requires: fmu.h, INPUTS, INPUT_PARTS, INPUT_INDEX. */
+/* Variables of an FMU by value reference. Requires: INPUTS, INPUT_PARTS, INPUT_INDEX. */
 
 /* Returns true if the model description has the reference; the internal parts of an input other than its value are
  * hidden. */
@@ -256,8 +256,7 @@ FMI_EXPORT fmi3Status FMI(SetFloat64)(fmi3Instance instance, const fmi3ValueRefe
   return fmi3OK;
 }
 
-/* Integration from one communication point to the next. Requires: fmu.h, and PROJECT, the projection onto
- * constraints. */
+/* Integration from one communication point to the next. Requires: PROJECT, the projection onto constraints. */
 
 #define NO_STEP 1e-9 /* relative to a step: remaining time that needs no step, e.g. with tabulated inputs */
 #define TIME_ROUNDING (4 * DBL_EPSILON) /* relative to a time: error of a sum of steps */
@@ -364,7 +363,7 @@ FMI_EXPORT fmi3Status FMI(DoStep)(fmi3Instance instance, fmi3Float64 point, fmi3
   return fmi3OK;
 }
 
-/* States of an FMU: get, set, serialise. Requires: fmu.h. */
+/* States of an FMU: get, set, serialise. */
 
 /* Copies the state to the importer's memory, which is allocated if there is none. */
 static fmi3Status copy_state_to(const fmu *one, const void *state, fmi3FMUState *kept)
@@ -424,8 +423,8 @@ FMI_EXPORT fmi3Status FMI(DeserializeFMUState)(fmi3Instance instance, const fmi3
   return copy_state_to(instance, bytes, state);
 }
 
-/* Functions that FMI 3.0 requires and this FMU does not support: variables of other types, events, clocks, derivatives,
- * model exchange, scheduled execution. Each returns an error. Requires: fmu.h. */
+/* Functions that FMI 3.0 requires and this FMU does not support: variables of other types, events, clocks,
+ * derivatives, model exchange, scheduled execution. Each returns an error. */
 
 #if defined(__GNUC__) || defined(__clang__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"

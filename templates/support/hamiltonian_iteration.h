@@ -106,8 +106,7 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
 }
 
 #ifdef TIME_TRANSFORMATION
-/* Integrals along a step solved by fixed-point iteration. Requires: hamiltonian_iteration.h, the kernel
- * integrand_lanes. */
+/* Integrals along a step solved by fixed-point iteration. Requires: the kernel integrand_lanes. */
 
 /* Quadrature of the momenta at the converged velocities and forces, which `memory` contains. */
 static inline void integrals_of_iteration(const step_data *step, const iteration_data *data, const double *memory,

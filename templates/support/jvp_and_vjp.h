@@ -1,3 +1,4 @@
+/* Tangent and adjoint vectors over a step solved by Newton's method; TIME_TRANSFORMATION: time depends on the state. */
 #ifdef TIME_TRANSFORMATION
 /* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first
  * points. Requires: linearised.h, INTEGRAL_WEIGHT, RATE_ENTRY, RATE_DERIVATIVES, the kernels rate_derivatives and

@@ -1,3 +1,5 @@
+/* Largest error estimate of the steps of a run: by Newton's method alone (NEWTON_ALONE), or by fixed-point iteration
+ * with a fallback in another library (LIBRARY_FALLBACK), with an own one (STAGE_POWER) or without one. */
 #if defined(NEWTON_ALONE)
 /* Largest error estimate of steps by Newton's method. Requires: stage_error.h. */
 static real largest_error(const run_memory *run, const step_data *step, const solver_data *data, const real *dq,

@@ -9,8 +9,7 @@ typedef struct {
 
 #ifdef LIBRARY_FALLBACK
 /* Fallback to the Newton solver of another library, which is loaded on demand. Until it is set, a step whose
- * fixed-point iteration fails returns FALLBACK_REQUIRED, is not performed, and has to be repeated. Requires:
- * library_fallback.h. */
+ * fixed-point iteration fails returns FALLBACK_REQUIRED, is not performed, and has to be repeated. */
 static const fallback *library_fallback; /* set once, before the calls that need it are repeated */
 
 void NAME(set_fallback)(const void *shared_fallback)
@@ -28,7 +27,7 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
   return library_fallback->step(step, dq, dp, options, report, workspace);
 }
 #else
-/* Newton solver for a library without it (see library_fallback.h). Requires: fallback.h, FALLBACK_WORKSPACE. */
+/* Newton solver for a library without it. Requires: fallback.h, FALLBACK_WORKSPACE. */
 #include <stdlib.h>
 
 static SELDOM int provided_step(const step_data *step, double *dq, double *dp, const solver_options *options,

@@ -1,3 +1,4 @@
+/* Tangent or adjoint vectors over many steps: each by Newton's method, or several at once (VECTORS_BY_ITERATION). */
 #ifndef VECTORS_BY_ITERATION
 /* Tangent and adjoint vectors over steps that are each solved by Newton's method. Requires: vectors_by_newton.h. */
 enum {

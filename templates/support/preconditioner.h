@@ -1,3 +1,4 @@
+/* Preconditioner for Newton-GMRES: by Fourier modes (ON_LATTICES) or from the diagonal of F'. */
 #ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
  * not overlap or reach a boundary, and F' is multiplied by all of them at once. Requires: lattice_transform.h,
@@ -121,8 +122,8 @@ static double off_diagonal_ratio(const linear_system *of, const lattice *all, co
 }
 
 /* Fourier preconditioner for Newton-GMRES on lattices: the mean of F' over a lattice, a circulant matrix, which is
- * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings are
- * uniform and boundaries few; otherwise the diagonal of F' is used. Requires: preconditioner.h. */
+ * diagonal in Fourier space (T. F. Chan, SIAM J. Sci. Stat. Comput. 9, 1988, 766). It is accurate if the couplings
+ * are uniform and boundaries few; otherwise the diagonal of F' is used. */
 
 enum { SPARE_VECTORS = 2 }; /* of work */
 #define COUPLED 0.1 /* relative to the diagonal: weaker couplings do not justify the Fourier preconditioner */

@@ -1,3 +1,5 @@
+/* Trial of an adaptive step of arrays (ARRAYS) or of named coordinates, by fixed-point iteration or by Newton's
+ * method (NEWTON_ALONE). */
 #ifdef ARRAYS
 /* Trial of an adaptive step of an indexed system. Requires: step_size_levels.h, predictor_tables.h, array_step.h;
  * DOUBTS. */

@@ -74,7 +74,7 @@ XLA_FFI_Error *NAME(xla_vjp)(XLA_FFI_CallFrame *frame)
 }
 
 #ifdef SECOND_DERIVATIVES
-/* Derivatives of gradients as an XLA custom call. Requires: xla_flow.h, flow.h. */
+/* Derivatives of gradients as an XLA custom call. Requires: flow.h. */
 
 /* x (.., STEP_INPUTS), adjoint vectors (.., count, kept states, FLOW_STATE) and tangent vectors (.., count,
  * STEP_INPUTS); results like the latter. */
