@@ -149,7 +149,7 @@ def _warnings_as_lines() -> Iterator[None]:
     """Print each warning of this package once, as one line."""
     shown: set[str] = set()
 
-    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *location: Any, **more: Any) -> None:
         if str(message) not in shown:
             shown.add(str(message))
             click.echo(f"Warning: {message}", err=True)

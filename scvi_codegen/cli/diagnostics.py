@@ -109,12 +109,12 @@ def _packages(extra: str, name: str) -> CheckResult:
     present, absent = [], []
     for wanted in _requirements(PACKAGE, extra):
         try:
-            found = version(wanted["name"])
+            installed = version(wanted["name"])
         except PackageNotFoundError:
             absent.append(wanted["name"])
             continue
-        present.append(f"{wanted['name']} {found}")
-        if _numbers(found) < _numbers(wanted["least"]):
+        present.append(f"{wanted['name']} {installed}")
+        if _numbers(installed) < _numbers(wanted["least"]):
             absent.append(f"{wanted['name']} >= {wanted['least']}")
     if not absent:
         return CheckResult(name=name, status=OK, found=", ".join(present))
@@ -143,9 +143,11 @@ def _compilation() -> Iterator[CheckResult]:
         "" if not from_wheel(command) or os.environ.get("CC") else " (extra compiler: the PATH has no cc, gcc or clang)"
     )
     yield CheckResult(name="compiler", status=OK, found=f"{' '.join(command)}: {title}{why}")
-    own = os.environ.get(FLAGS_VARIABLE, "")
+    own_flags = os.environ.get(FLAGS_VARIABLE, "")
     yield CheckResult(
-        name="flags", status=OK, found=" ".join([*TUNED_FLAGS, *([own, f"({FLAGS_VARIABLE})"] if own else [])])
+        name="flags",
+        status=OK,
+        found=" ".join([*TUNED_FLAGS, *([own_flags, f"({FLAGS_VARIABLE})"] if own_flags else [])]),
     )
     with tempfile.TemporaryDirectory(prefix="scvi-codegen-doctor-", ignore_cleanup_errors=True) as folder:
         trial = _trial(Path(folder))

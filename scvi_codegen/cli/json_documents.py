@@ -104,18 +104,18 @@ def _by_name(names: Sequence[str], vector: np.ndarray[Any, Any]) -> dict[str, fl
 
 def _conserved(result: Trajectory | DrivenTrajectory | EnsembleTrajectory) -> dict[str, Any]:
     """Return the largest changes of the energy and of the momentum maps, these relative to the size of their terms."""
-    found: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
+    values_by_name: dict[str, Any] = {"energy_change": None, "energy": None, "momentum_errors": None}
     try:
         with np.errstate(all="ignore"):
             energy = np.asarray(result.energy())
-            found["energy"] = energy[0]
-            found["energy_change"] = _largest(energy - energy[0])
+            values_by_name["energy"] = energy[0]
+            values_by_name["energy_change"] = _largest(energy - energy[0])
             errors = np.asarray(result.momentum_errors())
             names = result.stepper.interface.map_names
-            found["momentum_errors"] = {name: _largest(errors[..., k]) for k, name in enumerate(names)}
+            values_by_name["momentum_errors"] = {name: _largest(errors[..., k]) for k, name in enumerate(names)}
     except StateError:
         pass  # a state without a velocity; the summary reports it
-    return found
+    return values_by_name
 
 
 def _largest(changes: np.ndarray[Any, Any]) -> float | None:

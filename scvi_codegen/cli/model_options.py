@@ -116,10 +116,10 @@ def _assignments(
 
 
 def _sizes(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> tuple[tuple[str, int], ...]:
-    for name, value in (found := _assignments(context, parameter, values)):
+    for name, value in (assignments := _assignments(context, parameter, values)):
         if not value.is_integer():
             raise click.BadParameter(f"the size {name} must be an integer, not {value:g}")
-    return tuple((name, int(value)) for name, value in found)
+    return tuple((name, int(value)) for name, value in assignments)
 
 
 def _input_files(
@@ -129,10 +129,10 @@ def _input_files(
     result = []
     for text in values:
         name, _, arguments = (part.strip() for part in text.partition("="))
-        found = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", arguments)
-        if not name or not found:
+        match = re.fullmatch(r"(?P<file>.+?\.\w+)(:(?P<kind>[a-z]+))?", arguments)
+        if not name or not match:
             raise click.BadParameter(f"'{text}' is not of the form NAME=FILE[:KIND], as in u=u.csv:cubic")
-        entry = {key: value for key, value in found.groupdict().items() if value is not None}
+        entry = {key: value for key, value in match.groupdict().items() if value is not None}
         result.append((name, entry | {"file": str(Path(entry["file"]).absolute())}))
     return tuple(result)
 

@@ -57,8 +57,8 @@ def check_format(output: str, *, ensemble: bool) -> None:
 def check_resumed(context: click.Context) -> None:
     """Reject options that would change the run that ``--resume`` continues."""
     for name in context.params:
-        given = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
-        if given and name not in WITH_RESUME:
+        chosen = context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT
+        if chosen and name not in WITH_RESUME:
             word = "MODEL" if name == "model_name" else f"--{name.replace('_', '-')}"
             raise click.UsageError(
                 f"{word} is not allowed with --resume: the folder defines the run; only --steps or --span may extend it"
@@ -131,8 +131,8 @@ class Recording:
 
     def check(self, recorded: bool) -> None:
         """Reject options that have no effect on a run in memory."""
-        given = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
-        for name, value in given.items():
+        options = {"--checkpoint": self.seconds, "--checkpoint-steps": self.steps, "--certificate": self.certificate}
+        for name, value in options.items():
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
 

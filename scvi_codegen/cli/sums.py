@@ -139,9 +139,9 @@ def _summary(model: IndexedModel, outcome: IndexedOutcome) -> Iterator[str]:
     yield f"{model.system.name}: {counted(count, 'coordinate')}{f', {sizes}' if sizes else ''}"
     geometry = f"{'' if method.symplectic else 'not '}symplectic, {'' if method.symmetric else 'not '}symmetric"
     yield f"{method.title}; {order}, {geometry}"
-    kept = counted(len(trajectory.t), "state")
+    saved = counted(len(trajectory.t), "state")
     lengths = "of adaptive size" if run.plan else f"of {model.h:g}"
-    yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {kept} saved"
+    yield f"{counted(run.steps, 'step')} {lengths} from t = {model.t:g} to t = {run.t:g}; {saved} saved"
     if run.steps:
         each = outcome.seconds / run.steps
         yield (

@@ -100,16 +100,16 @@ def _filled(value: Any, shape: tuple[int, ...], where: str, names: Mapping[str, 
         formula = parse_expression(value, {name: symbol(name) for name in (*indices, *names)})
     except ExpressionError as error:
         raise ModelFileError(f"{where}: {error}") from error
-    places = zip(indices, np.indices(shape, dtype=float, sparse=True), strict=True)
-    known: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *places)}
+    coordinates = zip(indices, np.indices(shape, dtype=float, sparse=True), strict=True)
+    known: dict[Expr, Any] = {symbol(name): number for name, number in (*names.items(), *coordinates)}
     with np.errstate(all="ignore"):
         return np.array(np.broadcast_to(on_arrays(formula, known), shape), dtype=float)
 
 
 def _from_list(value: list[Any], where: str) -> Numbers:
     try:
-        found = np.array(value, dtype=object)
-        return np.array([real(entry, where) for entry in found.reshape(-1)]).reshape(found.shape)
+        array = np.array(value, dtype=object)
+        return np.array([real(entry, where) for entry in array.reshape(-1)]).reshape(array.shape)
     except ValueError as error:
         raise ModelFileError(f"{where} must be a list of numbers, or of lists of one length") from error
 

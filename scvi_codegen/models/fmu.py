@@ -110,9 +110,9 @@ def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, by
     source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
     by_velocity = model.velocity is not None
     start = _start(model)
-    places = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
+    indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)
     token = _token(source.to_json(), interface, start)
-    source = with_fmu(source, interface, start, by_velocity=by_velocity, input_indices=places, token=token)
+    source = with_fmu(source, interface, start, by_velocity=by_velocity, input_indices=indices, token=token)
     described = model_text(model)
     texts = {
         DESCRIPTION: model_description(interface, start, by_velocity=by_velocity, token=token),

@@ -61,9 +61,9 @@ def model_description(interface: Interface, start: ExampleRun, *, by_velocity: b
     end = start.t + start.span
     SubElement(root, "DefaultExperiment", startTime=repr(start.t), stopTime=repr(end), stepSize=repr(start.h))
     variables = list(enumerate(_variables(interface, start, by_velocity=by_velocity)))
-    SubElement(root, "ModelVariables").extend(_element(place, one) for place, one in variables if one.description)
+    SubElement(root, "ModelVariables").extend(_element(index, one) for index, one in variables if one.description)
     structure = SubElement(root, "ModelStructure")
-    outputs = [(str(place), one) for place, one in variables if one.causality == "output"]
+    outputs = [(str(index), one) for index, one in variables if one.causality == "output"]
     for reference, _ in outputs:
         SubElement(structure, "Output", valueReference=reference)
     for reference, one in outputs:
@@ -94,8 +94,8 @@ def _variables(interface: Interface, start: ExampleRun, *, by_velocity: bool) ->
         yield Variable(name, "output", "continuous", f"coordinate {name}", value)
     for name, rate in zip(names, velocities, strict=True):
         yield Variable(name + DOT, "output", "continuous", f"velocity of {name}", rate)
-    for name, own, momentum in zip(names, interface.momenta, momenta, strict=True):
-        yield Variable(_free(own, taken), "output", "continuous", f"momentum of {name}", momentum)
+    for name, momentum_name, momentum in zip(names, interface.momenta, momenta, strict=True):
+        yield Variable(_free(momentum_name, taken), "output", "continuous", f"momentum of {name}", momentum)
     yield Variable(_free(ENERGY, taken), "output", "continuous", "energy")
     yield from _parameters(interface, start.parameters)
 

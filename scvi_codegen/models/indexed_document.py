@@ -43,23 +43,23 @@ class _Files:
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
 
-    def section(self, section: str, given: Section, known: Mapping[str, Any]) -> dict[str, Any]:
+    def section(self, section: str, values: Section, known: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of a section, by declarations."""
-        names = {key: key.partition("[")[0] for key in given}
-        return {key: self.value(f"{section}_{names[key]}", given[key], known.get(names[key])) for key in given}
+        names = {key: key.partition("[")[0] for key in values}
+        return {key: self.value(f"{section}_{names[key]}", values[key], known.get(names[key])) for key in values}
 
-    def state(self, key: str, given: Any, known: Mapping[str, Any]) -> Any:
+    def state(self, key: str, value: Any, known: Mapping[str, Any]) -> Any:
         """Return the value of one array, or of several by name."""
-        if not isinstance(given, dict):
-            return given
-        if "file" in given:
-            return self.value(key, given, next(iter(known.values())))
-        return {name: self.value(f"{key}_{name}", value, known[name]) for name, value in given.items()}
+        if not isinstance(value, dict):
+            return value
+        if "file" in value:
+            return self.value(key, value, next(iter(known.values())))
+        return {name: self.value(f"{key}_{name}", entry, known[name]) for name, entry in value.items()}
 
-    def value(self, name: str, given: Any, values: Any) -> Any:
+    def value(self, name: str, value: Any, values: Any) -> Any:
         """Return a reference to a new table (or a list) for values read from a file, else the value itself."""
-        if not isinstance(given, dict):
-            return given
+        if not isinstance(value, dict):
+            return value
         if np.ndim(values) > 2:
             return np.asarray(values).tolist()
         columns = np.asarray(values).reshape(len(values), -1)

@@ -99,18 +99,18 @@ class Entry:
     where: str
 
 
-def read_indexed(document: Document, given: Document, folder: str | os.PathLike[str]) -> IndexedModel:
-    """Return the model of a file, with the sections ``given`` merged over it.
+def read_indexed(document: Document, changes: Document, folder: str | os.PathLike[str]) -> IndexedModel:
+    """Return the model of a file, with the sections ``changes`` merged over it.
 
     Raises:
         ModelFileError: naming the key at fault.
     """
-    for layer in (document, given):
+    for layer in (document, changes):
         _check_known(layer)
-    specification = {key: value for key, value in chosen_method(document, given).items() if key != "solver"}
-    solver = {"solver": SOLVERS[0], **document.get("method", {}), **given.get("method", {})}["solver"]
-    parameters = _declared(document.get("parameters", {}), given.get("parameters", {}))
-    document = {**merged_sections(document, given), "parameters": parameters}
+    specification = {key: value for key, value in chosen_method(document, changes).items() if key != "solver"}
+    solver = {"solver": SOLVERS[0], **document.get("method", {}), **changes.get("method", {})}["solver"]
+    parameters = _declared(document.get("parameters", {}), changes.get("parameters", {}))
+    document = {**merged_sections(document, changes), "parameters": parameters}
     tables = {key: in_section("[tables]", partial(parse_array, key)) for key in document.get("tables", {})}
     system = _read_system(document)
     method = in_section("[method]", lambda: read_method(fitted(specification, one_coordinate(system))))
@@ -127,8 +127,8 @@ def read_indexed(document: Document, given: Document, folder: str | os.PathLike[
         },
     }
     numbers = {parameter.name: value for parameter, value in zip(system.parameters, system.defaults, strict=True)}
-    found = _read_arrays(entries, _read_sizes(document.get("sizes", {}), system), folder, numbers)
-    groups = {key: {name: values for (group, name), values in found.items() if group == key} for key in GROUPS}
+    arrays = _read_arrays(entries, _read_sizes(document.get("sizes", {}), system), folder, numbers)
+    groups = {key: {name: values for (group, name), values in arrays.items() if group == key} for key in GROUPS}
     return IndexedModel(
         system=system,
         method=method,
@@ -158,13 +158,13 @@ def _check_known(document: Document) -> None:
         check_keys(document.get(name, {}), known, "key", f"[{name}]")
 
 
-def _declared(section: Section, given: Section) -> dict[str, Any]:
-    """Return parameters by declaration, ``m[N]``, with ``given`` values by name replacing those of the section."""
+def _declared(section: Section, changes: Section) -> dict[str, Any]:
+    """Return parameters by declaration, ``m[N]``, with ``changes`` values by name replacing those of the section."""
     names = {key.partition("[")[0]: key for key in section}
-    for name in given:
+    for name in changes:
         if name not in names:
             raise ModelFileError(f"the system has no parameter '{name}'")
-    return {**section, **{names[name]: value for name, value in given.items()}}
+    return {**section, **{names[name]: value for name, value in changes.items()}}
 
 
 def _is_number(value: Any) -> bool:
@@ -179,7 +179,7 @@ def _read_system(document: Document) -> ArraySystem:
         key: real(value, f"[parameters] {key}") if "[" not in key or _is_number(value) else 1.0
         for key, value in parameters.items()
     }
-    given: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "name": text_of(section, "name", "[system]"),
         "coordinates": names_of(section, "coordinates"),
         "parameters": defaults,
@@ -190,7 +190,7 @@ def _read_system(document: Document) -> ArraySystem:
         "dissipation": text_of(section, "dissipation", "[system]") if "dissipation" in section else None,
         "constraints": names_of(section, "constraints") if "constraints" in section else (),
     }
-    return in_section("[system]", lambda: ArraySystem.from_text(**given))
+    return in_section("[system]", lambda: ArraySystem.from_text(**arguments))
 
 
 def _state_entries(section: Section, system: ArraySystem) -> dict[tuple[str, str], Entry]:
@@ -198,7 +198,7 @@ def _state_entries(section: Section, system: ArraySystem) -> dict[tuple[str, str
     check_one(section, "initial", "p", "q_dot")
     required(section, "q", "[initial]")
     names = [array.name for array in system.coordinates]
-    found = {}
+    entries = {}
     for key in ("q", "p", "q_dot"):
         if key not in section:
             continue
@@ -211,8 +211,8 @@ def _state_entries(section: Section, system: ArraySystem) -> dict[tuple[str, str
             value = {names[0]: value}
         check_keys(value, names, "array", where)
         for array in system.coordinates:
-            found[key, array.name] = Entry(array, required(value, array.name, where), f"{where}, {array.name}")
-    return found
+            entries[key, array.name] = Entry(array, required(value, array.name, where), f"{where}, {array.name}")
+    return entries
 
 
 def _read_sizes(section: Section, system: ArraySystem) -> dict[str, int]:
@@ -229,7 +229,7 @@ def _read_arrays(
     numbers: Mapping[str, float],
 ) -> dict[tuple[str, str], Any]:
     """Read all arrays: lists and files first, since they determine sizes, then numbers and formulas."""
-    sizes, found = dict(sizes), {}
+    sizes, arrays = dict(sizes), {}
     for key, entry in sorted(entries.items(), key=lambda item: is_filled(item[1].value)):
         values = read_array(entry.array, entry.value, entry.where, folder=folder, sizes=sizes, parameters=numbers)
         if values.ndim != len(entry.array.axes):
@@ -239,8 +239,8 @@ def _read_arrays(
                 raise ModelFileError(
                     f"{entry.where}: the size {axis} is {length} here, but {sizes[axis.name]} elsewhere or in [sizes]"
                 )
-        found[key] = values
-    return found
+        arrays[key] = values
+    return arrays
 
 
 def _whole(values: Any, where: str) -> Any:

@@ -170,15 +170,15 @@ class IndexedModel:
         run_options: dict[str, Any] = {"options": options, "threads": threads}
         stepper, lengths = stepper or self.stepper(), self._step_arguments
         if self.error is not None:
-            found = self.confirmed(stepper, **run_options)
-            lengths = {"t_end": lengths["t_end"], "tolerance": found.local_tolerance}
+            confirmation = self.confirmed(stepper, **run_options)
+            lengths = {"t_end": lengths["t_end"], "tolerance": confirmation.local_tolerance}
         return stepper.start(**self._initial_arguments, **lengths, **run_options)
 
     def confirmed(self, stepper: IndexedStepper, **run_options: Any) -> GlobalError:
         """Return the local tolerance for :attr:`error`, confirmed by further runs, as in :class:`Model`."""
-        found = stepper.integrate(**self._initial_arguments, **self._step_arguments, **run_options).confirmation
-        assert found is not None  # by construction
-        return found
+        confirmation = stepper.integrate(**self._initial_arguments, **self._step_arguments, **run_options).confirmation
+        assert confirmation is not None  # by construction
+        return confirmation
 
     def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
         """Integrate over the whole span; raises as :meth:`IndexedStepper.integrate`."""

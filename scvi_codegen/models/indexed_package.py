@@ -43,8 +43,8 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
     problem = read_arrays(interface, model.q, model.parameters, model.tables)
     arrays = {"q": _flat(problem.state)}
     moving = "p" if model.velocity is None else "velocity"
-    if (given := getattr(model, moving)) is not None:
-        arrays[moving] = _flat(read_state(interface, given, moving))
+    if (state := getattr(model, moving)) is not None:
+        arrays[moving] = _flat(read_state(interface, state, moving))
     arrays |= {f"field_{name}": values for name, values in problem.fields.items()}
     arrays |= {f"table_{name}": values for name, values in problem.places.items()}
     example = render_array_example(

@@ -80,15 +80,15 @@ def _read(name: str, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     except OSError as error:
         raise ModelFileError(f"it cannot be read: {error.strerror or error}") from error
     t = _column(table, TIME)
-    others = [given for given in table.columns if given != TIME]
-    own = next((given for given in (name, VALUE) if given in others), None)
-    if own is None and len(others) != 1:
+    others = [each for each in table.columns if each != TIME]
+    column = next((each for each in (name, VALUE) if each in others), None)
+    if column is None and len(others) != 1:
         raise ModelFileError(f"there is no column {name} or {VALUE} among {', '.join(table.columns)}")
     late = np.flatnonzero(np.diff(t) <= 0.0)
     if late.size:
         k = int(late[0]) + 1
         raise ModelFileError(f"{table.place(k)}, t: {t[k]:g} is not greater than {t[k - 1]:g}: times must ascend")
-    return tuple(t.tolist()), tuple(_column(table, own or others[0]).tolist())
+    return tuple(t.tolist()), tuple(_column(table, column or others[0]).tolist())
 
 
 def _column(table: CsvTable, name: str) -> NDArray[np.float64]:

@@ -23,14 +23,14 @@ class InputTable(NamedTuple):
     kind: str = "linear"
 
 
-def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[str, InputTable]:
+def checked_tables(system: MechanicalSystem, tables: Mapping[str, Any]) -> dict[str, InputTable]:
     """Return validated tables by name, as plain numbers; some may be missing.
 
     Raises:
         ModelFileError: for a name that is not an input of the system, and a value that is not a table.
     """
-    found = {}
-    for name, table in given.items():
+    checked = {}
+    for name, table in tables.items():
         if name not in system.inputs:
             raise ModelFileError(
                 f"'{name}' is not an input of '{system.name}', whose inputs are {', '.join(system.inputs) or 'none'}"
@@ -42,8 +42,8 @@ def checked_tables(system: MechanicalSystem, given: Mapping[str, Any]) -> dict[s
         except StateError as error:
             raise ModelFileError(str(error)) from error
         t, values = (tuple(np.asarray(part, dtype=float).tolist()) for part in table[:2])
-        found[name] = InputTable(t, values, *table[2:])
-    return found
+        checked[name] = InputTable(t, values, *table[2:])
+    return checked
 
 
 def tables_of_example(

@@ -38,5 +38,5 @@ def key_hint(key: str, names: Iterable[str]) -> str:
         return here
     if (hint := closest(key, known)) != ".":
         return hint
-    places = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
-    return f"; {places[0]}." if places else "."
+    locations = [LOCATIONS[name] for name in ([key] if key in LOCATIONS else likely_names(key)) if name in LOCATIONS]
+    return f"; {locations[0]}." if locations else "."

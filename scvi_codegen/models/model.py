@@ -260,8 +260,8 @@ class Model:
         """Return the inputs, and the parameters as a function of time."""
         from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of
 
-        found = checked_inputs(stepper.interface, self.all_inputs())
-        return found, parameters_of(stepper, self.parameters, found)
+        inputs = checked_inputs(stepper.interface, self.all_inputs())
+        return inputs, parameters_of(stepper, self.parameters, inputs)
 
     def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
         """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end."""
@@ -273,8 +273,8 @@ class Model:
                 raise ModelFileError(
                     "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
                 )
-            own: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
-            h = largest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **own)
+            arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
+            h = largest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **arguments)
         to_end = h is None or self.time_transformation is not None
         tolerance = self.tolerance if self.error is None else self.confirmed(stepper, options=options).local_tolerance
         return stepper.start(
@@ -298,9 +298,9 @@ class Model:
         common |= {"parameters": self.parameters, "options": options}
         if self.system.inputs:
             common["inputs"] = self.all_inputs()
-        found: GlobalError | None = stepper.integrate(self.q, p, **common).confirmation
-        assert found is not None  # by construction
-        return found
+        confirmation: GlobalError | None = stepper.integrate(self.q, p, **common).confirmation
+        assert confirmation is not None  # by construction
+        return confirmation
 
     def _check_length(self) -> None:
         if self.time_transformation is not None and (self.system.clock is not None or self.span is None):

@@ -29,8 +29,8 @@ def document_of(model: Model) -> dict[str, Any]:
         "system": {"name": system.name, "coordinates": names, **momenta, kind: _wrapped(system.to_text())}
     }
     forces = zip(names, system.forces, strict=False)
-    if acting := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
-        document["forces"] = acting
+    if applied := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
+        document["forces"] = applied
     if system.damping != 0:
         document["system"]["damping"] = system.text_of(system.damping)
     if system.constraints:

@@ -134,7 +134,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
     return cast(Model, read_model_file(path, given))
 
 
-def read_model_file(path: str | os.PathLike[str], given: Document | None = None) -> Model | IndexedModel:
+def read_model_file(path: str | os.PathLike[str], changes: Document | None = None) -> Model | IndexedModel:
     """Read a model of either kind. Raises as :func:`load_model`."""
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -143,7 +143,7 @@ def read_model_file(path: str | os.PathLike[str], given: Document | None = None)
     except UnicodeDecodeError as error:
         raise ModelFileError(f"{path} is not a text file in UTF-8: {error.reason} at byte {error.start}") from error
     try:
-        return _parsed(text, given, folder=Path(path).parent)
+        return _parsed(text, changes, folder=Path(path).parent)
     except ModelFileError as error:
         raise ModelFileError(f"{path}: {error}") from error
 
@@ -159,23 +159,23 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
-def catalogue_model(name: str, given: Document | None = None) -> Model:
-    """Return a catalogue entry with the sections ``given`` merged over it. Raises as :func:`load_model`."""
-    return _read_model({"system": {"catalogue": name}}, given or {})
+def catalogue_model(name: str, changes: Document | None = None) -> Model:
+    """Return a catalogue entry with the sections ``changes`` merged over it. Raises as :func:`load_model`."""
+    return _read_model({"system": {"catalogue": name}}, changes or {})
 
 
-def parse_model(text: str, given: Document | None = None, *, folder: str | os.PathLike[str] = ".") -> Model:
+def parse_model(text: str, changes: Document | None = None, *, folder: str | os.PathLike[str] = ".") -> Model:
     """Return the model of TOML text; see the module's docstring. Raises as :func:`load_model`.
 
     Args:
         text: of the file.
-        given: sections merged over it.
+        changes: sections merged over it.
         folder: base of relative paths.
     """
-    return cast(Model, _parsed(text, given, folder))
+    return cast(Model, _parsed(text, changes, folder))
 
 
-def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -> Model | IndexedModel:
+def _parsed(text: str, changes: Document | None, folder: str | os.PathLike[str]) -> Model | IndexedModel:
     document = read_toml(text)
     check_keys(document, (*SECTIONS, *ARRAY_SECTIONS), "section")
     for name, content in document.items():
@@ -184,13 +184,13 @@ def _parsed(text: str, given: Document | None, folder: str | os.PathLike[str]) -
     if _has_arrays(document):
         from scvi_codegen.models.indexed_file import read_indexed  # imported here: other models are read without NumPy
 
-        return read_indexed(document, given or {}, folder)
+        return read_indexed(document, changes or {}, folder)
     for name in ARRAY_SECTIONS:
         if name in document:
             raise ModelFileError(f'[{name}] belongs to arrays whose sizes are names, coordinates = ["q[N]"]')
     for name, known in KEYS.items():
         check_keys(document.get(name, {}), known, "key", f"[{name}]")
-    return _read_model(document, given or {}, folder)
+    return _read_model(document, changes or {}, folder)
 
 
 def _has_arrays(document: Document) -> bool:
@@ -216,21 +216,21 @@ def dump_model(model: Model) -> str:
     return text
 
 
-def _read_model(document: Document, given: Document, folder: str | os.PathLike[str] = ".") -> Model:
+def _read_model(document: Document, changes: Document, folder: str | os.PathLike[str] = ".") -> Model:
     entry = _read_catalogue(document.get("system", {}))
-    if given.get("sizes"):
+    if changes.get("sizes"):
         raise ModelFileError('[sizes] belongs to coordinates that are arrays, coordinates = ["q[N]"]')
-    if "time_transformation" in given.get("system", {}) and "error" in document.get("run", {}):
-        _check_error_bound(document["run"]["error"], given.get("run", {}))
-    document, given = _without_inherited_step(document), _without_inherited_step(given)
+    if "time_transformation" in changes.get("system", {}) and "error" in document.get("run", {}):
+        _check_error_bound(document["run"]["error"], changes.get("run", {}))
+    document, changes = _without_inherited_step(document), _without_inherited_step(changes)
     if entry is not None:
         names = [coordinate.name for coordinate in entry.system.coordinates]
         document = merged_sections(motion_of(Model.from_problem(entry), names), document)
-    chosen = chosen_method(document, given)
-    document = {**merged_sections(document, given), "method": chosen}
+    chosen = chosen_method(document, changes)
+    document = {**merged_sections(document, changes), "method": chosen}
     if entry is None:
         _check_complete(document)
-        _check_used(document, given.get("parameters", {}))
+        _check_used(document, changes.get("parameters", {}))
     with warnings.catch_warnings():  # other formulas than that of the system may use its parameters
         warnings.simplefilter("ignore", SystemDefinitionWarning)
         plain = _with_arrays(_read_system(document, entry), document.get("parameters", {}))
@@ -313,15 +313,19 @@ def _read_system(document: Document, entry: Problem | None) -> MechanicalSystem:
     common["damping"] = formula_of(section, "damping", "[system]") if "damping" in section else None
     common["inputs"] = names_of(section, "inputs") if "inputs" in section else ()
     if "hamiltonian" in section:
-        bound = names_of(section, "constraints") if "constraints" in section else ()
+        constraints = names_of(section, "constraints") if "constraints" in section else ()
         if "dissipation" in section:
             raise ModelFileError(
                 "[system] has a dissipation, in velocities, and a hamiltonian: write the forces in [forces] instead"
             )
         common["hamiltonian"] = text_of(section, "hamiltonian", "[system]")
         common["momenta"] = names_of(section, "momenta") if "momenta" in section else None
-        given = in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
-        return in_section("[system]", lambda: lagrangian_of(given, constraints=bound)) if bound else given
+        hamiltonian = in_section("[system]", lambda: HamiltonianSystem.from_text(**common))
+        return (
+            in_section("[system]", lambda: lagrangian_of(hamiltonian, constraints=constraints))
+            if constraints
+            else hamiltonian
+        )
     if "momenta" in section:
         raise ModelFileError(
             "[system] has momenta and a lagrangian: momenta are names for a hamiltonian; leave them out"
@@ -338,9 +342,9 @@ def _with_arrays(system: MechanicalSystem, parameters: Section) -> MechanicalSys
     values: dict[str, float] = {}
     for key, value in parameters.items():
         if isinstance(value, list):
-            entries, given = arrays[key.partition("[")[0]].elements, _flat(value)
-            check_length(given, entries, f"[parameters] {key}")
-            values |= {name: real(each, f"[parameters] {key}") for name, each in zip(entries, given, strict=True)}
+            entries, numbers = arrays[key.partition("[")[0]].elements, _flat(value)
+            check_length(numbers, entries, f"[parameters] {key}")
+            values |= {name: real(each, f"[parameters] {key}") for name, each in zip(entries, numbers, strict=True)}
     return system.with_parameters(**values) if values else system
 
 

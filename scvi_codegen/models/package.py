@@ -166,8 +166,10 @@ def example_of(model: Model, *, controlled: bool) -> ExampleRun:
             f"adaptive steps are unavailable for {model.method.name} and this system: give a step h "
             "(--step, [run] step)"
         )
-    given = model.all_inputs() if model.inputs else {}
-    inputs, parameters = tables_of_example(model.system, given, (model.t, model.end if given else model.t))
+    inputs_by_name = model.all_inputs() if model.inputs else {}
+    inputs, parameters = tables_of_example(
+        model.system, inputs_by_name, (model.t, model.end if inputs_by_name else model.t)
+    )
     momenta = model.p if model.p is not None else _momenta(model, parameters)
     if clock and model.ends_at_time:
         steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))

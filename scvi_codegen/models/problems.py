@@ -70,11 +70,12 @@ class Problem:
         return card(self.title, facts, Html(self.system._repr_html_()))
 
     def __post_init__(self) -> None:
-        given = [part for part in (self.velocity, self.p) if part is not None]
-        if len(given) != 1 or not len(self.q) == len(given[0]) == self.system.dimension:
+        initial = [part for part in (self.velocity, self.p) if part is not None]
+        if len(initial) != 1 or not len(self.q) == len(initial[0]) == self.system.dimension:
             raise SystemDefinitionError(
                 f"problem '{self.name}' has {self.system.dimension} coordinates, but an initial state of "
-                f"{len(self.q)} coordinates and {' and '.join(str(len(part)) for part in given)} velocities or momenta"
+                f"{len(self.q)} coordinates and {' and '.join(str(len(part)) for part in initial)} velocities or "
+                "momenta"
             )
 
 

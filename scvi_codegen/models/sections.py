@@ -38,13 +38,13 @@ INHERITED = ("degree", "quadrature", "nodes", "stages")
 """Arguments of a method that are inherited when another method is merged over it, if that accepts them."""
 
 
-def chosen_method(document: Document, given: Document) -> Section:
+def chosen_method(document: Document, changes: Document) -> Section:
     """Return the method of a file, or the default one, with the given changes."""
     default: Section = DEFAULT_METHOD.specification()
     if document.get("system", {}).get("constraints"):
         default = {"method": "svi", "degree": 6}
     base = _split_method_name(document.get("method", default))
-    return _changed_method(base, _split_method_name(given.get("method", {})))
+    return _changed_method(base, _split_method_name(changes.get("method", {})))
 
 
 def merged_sections(below: Document, above: Document) -> dict[str, Section]:
@@ -69,20 +69,20 @@ def _split_method_name(section: Section) -> Section:
     return {**section, **spelt}
 
 
-def _changed_method(base: Section, given: Section) -> Section:
+def _changed_method(base: Section, changes: Section) -> Section:
     """Return a method with some arguments changed; another method inherits common arguments."""
-    if not given:
+    if not changes:
         return base
     base_section = dict(base)
     if base_section.get("quadrature") == f"gauss-legendre:{base_section.get('degree')}":
         del base_section["quadrature"]  # the default for its degree; another degree has another default
-    name = given.get("method", base_section.get("method"))
+    name = changes.get("method", base_section.get("method"))
     if name != base_section.get("method"):
         accepted = ARGUMENTS.get(name, ())
         base_section = {key: value for key, value in base_section.items() if key in INHERITED and key in accepted}
-    if {"abscissae", "space"} & given.keys():
+    if {"abscissae", "space"} & changes.keys():
         base_section.pop("nodes", None)  # alternatives to nodes
-    return sized({**base_section, **given}) if "method" in given else {**base_section, **given}
+    return sized({**base_section, **changes}) if "method" in changes else {**base_section, **changes}
 
 
 def read_method(section: Section) -> Method:
@@ -157,12 +157,10 @@ def read_run(section: Section) -> dict[str, Any]:
         check_one(section, "run", one, other)
     check_one(section, "run", "span", "steps")
     fields = {"step": "h", "tolerance": "tolerance", "error": "error", "span": "span"}
-    found: dict[str, Any] = {
-        field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section
-    }
+    run: dict[str, Any] = {field: real(section[key], f"[run] {key}") for key, field in fields.items() if key in section}
     if not {"step", "tolerance", "error"} & section.keys() and "steps" in section:
         raise ModelFileError("[run] has steps but no step: give the step size")
     if "steps" in section:
-        found["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
-    found["save_every"] = checked_count(section.get("save_every", 1), "[run] save_every", least=1, error=ModelFileError)
-    return found
+        run["steps"] = checked_count(section["steps"], "[run] steps", least=0, error=ModelFileError)
+    run["save_every"] = checked_count(section.get("save_every", 1), "[run] save_every", least=1, error=ModelFileError)
+    return run

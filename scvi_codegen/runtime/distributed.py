@@ -131,9 +131,9 @@ def _gather(
     futures = {client.submit(_integrate, pickled, work.part(part), pure=False): part for part in parts}
     done = 0
     try:
-        for future, found in as_completed(futures, with_results=True):
+        for future, values in as_completed(futures, with_results=True):
             part = futures[future]
-            arrays = dict(zip(ARRAYS, found, strict=True))
+            arrays = dict(zip(ARRAYS, values, strict=True))
             parameters = work.parameters[part]
             work.keep(part, EnsembleTrajectory(**arrays, h=0.0, parameters=parameters, stepper=work.stepper))
             future.release()

@@ -39,15 +39,15 @@ class Kind:
         size = self.coordinates[1][2:-1]
         return named if self.named else f"sum(i in {size}, {indexed})"
 
-    def system(self, *, kinetic: str = "", **beside: Any) -> Any:
+    def system(self, *, kinetic: str = "", **arguments: Any) -> Any:
         """Return the system with a further kinetic energy, and other arguments of from_text."""
         moving, springs = (
             self.sum("y_dot**2/2 + z_dot**2/2", "q_dot[i]**2/2"),
             self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2"),
         )
         text = f"x_dot**2/2 + {moving} - k*x**2/2 - x**4/9 - {springs}{kinetic}"
-        given = {"parameters": {"k": 1}, **beside}
-        return sc.LagrangianSystem.from_text("bodies", self.coordinates, text, **given)
+        arguments = {"parameters": {"k": 1}, **arguments}
+        return sc.LagrangianSystem.from_text("bodies", self.coordinates, text, **arguments)
 
     @cache  # noqa: B019  (three objects in all)
     def stepper(self) -> Any:

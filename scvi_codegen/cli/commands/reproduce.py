@@ -201,10 +201,10 @@ class _Progress:
 
 
 @contextmanager
-def _progress(length: int, say: Callable[[str], None]) -> Iterator[_Progress]:
+def _progress(length: int, report: Callable[[str], None]) -> Iterator[_Progress]:
     """Show a bar on stderr if that is a terminal, with the printed lines above it."""
     if not sys.stderr.isatty() or not length or is_quiet():
-        yield _Progress(lambda names: None, say)
+        yield _Progress(lambda names: None, report)
         return
 
     def show(names: Sequence[str]) -> None:
@@ -214,7 +214,7 @@ def _progress(length: int, say: Callable[[str], None]) -> Iterator[_Progress]:
 
     def say_above(line: str) -> None:
         click.echo("\r\x1b[K", nl=False, err=True)
-        say(line)
+        report(line)
         bar.update(1)
 
     with click.progressbar(

@@ -180,20 +180,19 @@ def run(
     if ensemble is not None:
         _run_ensemble(model, ensemble, output, solver, options)
         return
-    model, found = _with_steps(model, wanted, solver, options)
+    model, confirmation = _with_steps(model, wanted, solver, options)
     if output is not None and recorded:
         _finish_recording(recording.record(model, output, solver=solver, options=options))
     else:
         _run_one(model, output, plot, solver, options, advised=advise)
-    _check_confirmed(found)
+    _check_confirmed(confirmation)
 
 
-def _check_confirmed(found: GlobalError | None) -> None:
+def _check_confirmed(confirmation: GlobalError | None) -> None:
     """End with exit status 1 if a global error bound was requested and is not confirmed."""
-    if found is not None and not found.confirmed:
-        unconfirmed = (
-            f"the bound {found.requested:g} on the global error is confirmed only until t = {found.confirmed_until:g}"
-        )
+    if confirmation is not None and not confirmation.confirmed:
+        end = confirmation.confirmed_until
+        unconfirmed = f"the bound {confirmation.requested:g} on the global error is confirmed only until t = {end:g}"
         tell(missed=unconfirmed)
         raise CommandFailure(unconfirmed, FAILURE)
 
@@ -207,8 +206,8 @@ def _with_steps(
         return model_with_adaptive_steps(model, tolerance), None
     if advise is not None:
         return model_with_advised_step(model, advise, solver=solver, options=options), None
-    if (bound := model.error if error is None else error) is not None:
-        return model_with_global_error(model, bound, solver=solver, options=options)
+    if (wanted_error := model.error if error is None else error) is not None:
+        return model_with_global_error(model, wanted_error, solver=solver, options=options)
     return model, None
 
 
@@ -218,10 +217,10 @@ def _indexed_with_steps(
     """Return the same as :func:`_with_steps` for indexed systems."""
     if wanted["tolerance"] is not None:
         return model_with_adaptive_steps(model, wanted["tolerance"]), None
-    bound = model.error if wanted["error"] is None else wanted["error"]
-    if bound is None:
+    wanted_error = model.error if wanted["error"] is None else wanted["error"]
+    if wanted_error is None:
         return model, None
-    return model_with_global_error(model, bound, options=options, threads=threads)
+    return model_with_global_error(model, wanted_error, options=options, threads=threads)
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:

@@ -71,7 +71,7 @@ class ChaosIndicatorsEnsemble:
         self.q, self.p, self.parameters = start_of_ensemble(stepper, q, p, start, parameters)
         self.changes = InitialTangents.checked(stepper, count, directions)
         self.status = np.full(len(self.q), OK, dtype="<U32")
-        self.found = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
+        self.values = np.full((len(SERIES), len(self.t[:: self.save_every]), len(self.q), self._width()), np.nan)
 
     def run(self, *, progress: Callable[[int], None] | None, threads: int | None) -> ChaosIndicators:
         """Compute the indicators; ``progress`` is called with the number of finished trajectories and may raise.
@@ -91,7 +91,7 @@ class ChaosIndicatorsEnsemble:
                 threads=threads,
             )
         self._warn_of_long_steps()
-        return ChaosIndicators.of(self.t[:: self.save_every], self.found, self.status)
+        return ChaosIndicators.of(self.t[:: self.save_every], self.values, self.status)
 
     def _warn_of_long_steps(self) -> None:
         """Warn of too large steps: rerun every ``CHECKED_STRIDE``-th trajectory, as SIMD steps estimate no error."""
@@ -111,7 +111,7 @@ class ChaosIndicatorsEnsemble:
         """Return the compiled ensemble library with tangent vectors, or ``None``."""
         if self.stepper.interface.constraints:
             return None
-        source = self.stepper._variational_source(self.found.shape[-1])
+        source = self.stepper._variational_source(self.values.shape[-1])
         return None if source is None else Binding(building.load(source, flags=self.stepper.flags), source.prefix)
 
     def _all_in_lanes(self, binding: Binding, report: Callable[[int], None], threads: int | None) -> NDArray[np.intp]:
@@ -121,7 +121,7 @@ class ChaosIndicatorsEnsemble:
 
         def follow(k: int, check_stop: StopCheck) -> None:
             part = slice(k * TRAJECTORIES_TOGETHER, min((k + 1) * TRAJECTORIES_TOGETHER, count))
-            self.found[:, :, part], done[part] = propagate_in_lanes(
+            self.values[:, :, part], done[part] = propagate_in_lanes(
                 binding,
                 changes,
                 self.q[part],
@@ -152,7 +152,7 @@ class ChaosIndicatorsEnsemble:
         return self.changes.at(*start, self.parameters[j], self.options)
 
     def _follow(self, j: int, check_stop: StopCheck) -> None:
-        found, failure = ahead(
+        values, failure = ahead(
             self.changes,
             self.q[j],
             self.p[j],
@@ -163,7 +163,7 @@ class ChaosIndicatorsEnsemble:
             options=self.options,
             check_stop=check_stop,
         )
-        self.found[:, :, j] = np.nan if found is None else found
+        self.values[:, :, j] = np.nan if values is None else values
         if failure:
             self.status[j] = failure.status
 

@@ -27,15 +27,15 @@ class Growth:
         log_r_diagonal: (k,) or (K, k) logarithms of the diagonal of R at the start, where norms are 1.
 
     Attributes:
-        found: (5, n, k) or (5, n, K, k) values of :data:`SERIES`; NaN at times that were not reached.
+        values: (5, n, k) or (5, n, K, k) values of :data:`SERIES`; NaN at times that were not reached.
     """
 
     def __init__(self, t: Array, log_r_diagonal: Array) -> None:
         self.start, nothing = float(t[0]), np.zeros_like(log_r_diagonal)
         self.log_r_diagonal = log_r_diagonal
         self.log_norms = self.max_log_norms = self.moments = self.rates = self.areas = nothing
-        self.found = np.full((len(SERIES), len(t), *log_r_diagonal.shape), np.nan)
-        self.found[:, 0] = [nothing, nothing, log_r_diagonal, nothing, nothing]
+        self.values = np.full((len(SERIES), len(t), *log_r_diagonal.shape), np.nan)
+        self.values[:, 0] = [nothing, nothing, log_r_diagonal, nothing, nothing]
 
     def add(self, t: Array, numbers: NDArray[np.intp], log_growth: Array, log_diagonals: Array) -> None:
         """Add consecutive steps; the integrals use the trapezoidal rule.
@@ -57,7 +57,7 @@ class Growth:
         means[0] += self.rates
         areas = self.areas + np.cumsum(np.diff(times, axis=0) / 2 * means, axis=0)
         saved = np.flatnonzero(numbers >= 0)
-        self.found[:, numbers[saved]] = [
+        self.values[:, numbers[saved]] = [
             log_norms[saved],
             max_log_norms[saved],
             self.log_r_diagonal + log_diagonals[saved],
@@ -75,10 +75,10 @@ class Growth:
 def r_factors(images: Array) -> Array:
     """Return the (.., k, k) factors R of (.., 2m, k) matrices."""
     if images.shape[-1] == 1:
-        found: Array = np.linalg.norm(images, axis=-2)[..., np.newaxis]
+        factors: Array = np.linalg.norm(images, axis=-2)[..., np.newaxis]
     else:
-        found = np.asarray(np.linalg.qr(images, mode="r"))
-    return found
+        factors = np.asarray(np.linalg.qr(images, mode="r"))
+    return factors
 
 
 def ill_conditioned(images: Array) -> NDArray[np.bool_]:

@@ -80,7 +80,7 @@ def propagate_in_lanes(
         triangle = last @ triangle / sizes[-1][:, np.newaxis]
         lanes_of_trajectories.take(frame)
         size *= 2
-    return growth.found, lanes_of_trajectories.running
+    return growth.values, lanes_of_trajectories.running
 
 
 def _lengths(images: Array, triangle: Array) -> Array:
@@ -157,12 +157,12 @@ class _TangentLanes:
 
     def advance(self, steps: int) -> Array:
         """Advance all trajectories and return the (steps, K, 2m, k) tangent vectors after each step."""
-        advance, own = self.binding.function("advance"), self.dimension * (self.count + 1)
-        q, p = np.empty((2, steps, len(self.lane_indices), own))
-        row, (at_q, at_p) = len(self.lane_indices) * own, map(self.binding.pointer, (q, p))
+        advance, size = self.binding.function("advance"), self.dimension * (self.count + 1)
+        q, p = np.empty((2, steps, len(self.lane_indices), size))
+        row, (at_q, at_p) = len(self.lane_indices) * size, map(self.binding.pointer, (q, p))
         for k in range(len(self.lanes)):
-            place = k * self.width * own
-            advance(self.memory + k, self.width, steps, 1, self.options, at_q + place, at_p + place, row)
+            offset = k * self.width * size
+            advance(self.memory + k, self.width, steps, 1, self.options, at_q + offset, at_p + offset, row)
         shape = steps, self.size, self.count, self.dimension
         parts = [x[:, : self.size, self.dimension :].reshape(shape).transpose(0, 1, 3, 2) for x in (q, p)]
         return np.concatenate(parts, axis=2)

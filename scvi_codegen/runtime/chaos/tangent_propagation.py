@@ -59,10 +59,10 @@ class InitialTangents:
         if directions is None:
             wanted = None if count is None else checked_count(count, "count", least=1, most=size)
             return cls(stepper, wanted, None)
-        given = real_array(directions, "directions")
-        columns = given[:, np.newaxis] if given.ndim == 1 else given
+        array = real_array(directions, "directions")
+        columns = array[:, np.newaxis] if array.ndim == 1 else array
         if columns.ndim != 2 or len(columns) != size or not 0 < columns.shape[1] <= size:
-            raise StateError(f"directions must have shape ({size},) or ({size}, k), k <= {size}, not {given.shape}")
+            raise StateError(f"directions must have shape ({size},) or ({size}, k), k <= {size}, not {array.shape}")
         if count is not None:
             raise StateError("give either count or directions, not both")
         lengths = np.linalg.norm(columns, axis=0)
@@ -72,17 +72,17 @@ class InitialTangents:
 
     def at(self, q: Array, p: Array, h: float, t: float, parameters: Array, options: SolverOptions | None) -> Array:
         """Return the tangent vectors at (q, p) for a first step of h."""
-        given = self.directions
+        directions = self.directions
         if not self.stepper.interface.constraints:
-            return _frame(self.stepper.dimension)[:, : self.count] if given is None else given
+            return _frame(self.stepper.dimension)[:, : self.count] if directions is None else directions
         before = self.stepper.step(q, p, -h, t, parameters, options=options)
         ends = self.stepper.jacobian(*before, h, t - h, parameters, options=options)
         allowed, sizes, _ = np.linalg.svd(ends)
         frame = allowed[:, sizes > FORBIDDEN * sizes[0]]
-        if given is not None:
-            if np.abs(given - frame @ (frame.T @ given)).max() > INADMISSIBLE:
+        if directions is not None:
+            if np.abs(directions - frame @ (frame.T @ directions)).max() > INADMISSIBLE:
                 raise StateError("directions must be tangent to the constraints")
-            return given
+            return directions
         if self.count is not None and self.count > frame.shape[1]:
             raise StateError(f"count={self.count} exceeds the {frame.shape[1]} directions that the constraints allow")
         mixed, _ = np.linalg.qr(np.random.default_rng(SEED).normal(size=2 * frame.shape[1:]))
@@ -111,7 +111,7 @@ def along(states: SavedStates, tangents: InitialTangents) -> ChaosIndicators:
         tangents.at(*first, states.parameters, states.options), states.stepper._input_size, states.t
     )
     propagation.follow((starts_of(states, first, last) for first, last in pieces(states)), propagate_chunk)
-    return ChaosIndicators.of(states.t, propagation.growth.found)
+    return ChaosIndicators.of(states.t, propagation.growth.values)
 
 
 def ahead(
@@ -156,8 +156,8 @@ def ahead(
         )
         propagation.follow(step_segments(), propagate_chunk)
     except StepFailedError as failure:
-        return propagation.growth.found if propagation else None, failure
-    return propagation.growth.found, None
+        return propagation.growth.values if propagation else None, failure
+    return propagation.growth.values, None
 
 
 class _TangentPropagation:
@@ -165,13 +165,13 @@ class _TangentPropagation:
 
     Args:
         tangents: (2m, k) initial vectors of length 1.
-        given: number of variables of a step.
+        input_size: number of variables of a step.
         t: (n,) times of saved values.
     """
 
-    def __init__(self, tangents: Array, given: int, t: Array) -> None:
+    def __init__(self, tangents: Array, input_size: int, t: Array) -> None:
         self._frame, self._triangle = np.linalg.qr(tangents)
-        self._given, self._size = given, FIRST
+        self._input_size, self._size = input_size, FIRST
         with np.errstate(divide="ignore"):  # linearly dependent directions span zero volume: log 0 = -inf
             self.growth = Growth(t, np.log(np.abs(np.diag(self._triangle))))
 
@@ -184,7 +184,7 @@ class _TangentPropagation:
             while done < steps:
                 end = min(done + self._size, steps)
                 part, saved = starts.part(done, end), numbers[done : end + 1]
-                vectors = np.zeros((end - done + 1, self._frame.shape[1], self._given))
+                vectors = np.zeros((end - done + 1, self._frame.shape[1], self._input_size))
                 vectors[0, :, : len(self._frame)] = self._frame.T
                 propagate_chunk(part, saved, vectors)
                 done += self._take(part, saved[1:], vectors[1:, :, : len(self._frame)].transpose(0, 2, 1))

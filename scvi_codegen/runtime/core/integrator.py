@@ -66,8 +66,8 @@ class Integrator(LinearisedMethod):
         q0, p0 = self._vector(q, "q"), self._vector(p, "p")
         check_inputs_given(self.interface, parameters)
         q1, p1 = np.empty_like(q0), np.empty_like(p0)
-        given = (q0, p0, self._parameters_at(q0, p0, parameters))
-        self._solve(self.binding, "step", t, h, given, options, (q1, p1))
+        arrays = (q0, p0, self._parameters_at(q0, p0, parameters))
+        self._solve(self.binding, "step", t, h, arrays, options, (q1, p1))
         return q1, p1
 
     def _solve(
@@ -76,18 +76,18 @@ class Integrator(LinearisedMethod):
         name: str,
         t: float,
         h: float,
-        given: Sequence[Array],
+        inputs: Sequence[Array],
         options: SolverOptions | None,
-        found: Sequence[Array],
+        results: Sequence[Array],
     ) -> None:
-        """Solve the equations of a step in C and fill the arrays ``found``; raise ``StepFailedError`` on failure."""
+        """Solve the equations of a step in C and fill the arrays ``results``; raise ``StepFailedError`` on failure."""
         report = binding.new("report *")
         status = binding.function(name)(
             checked_number(t, "the time t"),
             checked_step(h),
-            *map(binding.pointer, given),
+            *map(binding.pointer, inputs),
             binding.options(options),
-            *map(binding.pointer, found),
+            *map(binding.pointer, results),
             report,
             binding.workspace(),
         )
@@ -109,14 +109,14 @@ class Integrator(LinearisedMethod):
     def rates(self, q: ArrayLike, p: ArrayLike, parameters: Parameters = None) -> Array:
         """Return (n,) rates dt/dtau at (n, m) states; 1 if time is not transformed."""
         _, positions, momenta = checked_states(self.interface, q, p, 0.0)
-        found = np.ones(positions.size // self.dimension)
+        rates = np.ones(positions.size // self.dimension)
         if not self.interface.energy_parameter:
-            return found
+            return rates
         values = self.binding.pointer(self._parameters(parameters))
         pointers = map(self.binding.pointer, (positions, momenta))
-        if self.binding.function("rates")(len(found), *pointers, values, self.binding.pointer(found)):
+        if self.binding.function("rates")(len(rates), *pointers, values, self.binding.pointer(rates)):
             raise StateError("the rate dt/dtau of the time transformation must be positive at every state")
-        return found
+        return rates
 
     def momentum(self, q: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None) -> Array:
         """Return momenta p = dL/dv at (q, v, t), the Legendre transform: (m,), or (n, m) for (n, m) states."""
@@ -138,8 +138,8 @@ class Integrator(LinearisedMethod):
         Raises:
             StateError: unless exactly one of both is passed.
         """
-        name, given = self.momentum_or_velocity(p, velocity)
-        return given if name == "p" else self.initial_momentum(q, given, t, parameters)
+        name, values = self.momentum_or_velocity(p, velocity)
+        return values if name == "p" else self.initial_momentum(q, values, t, parameters)
 
     def initial_momentum(self, q: ArrayLike, velocity: ArrayLike, t: float, parameters: Parameters) -> Array:
         """Return the (m,) momentum of the initial state of a run.
@@ -307,10 +307,10 @@ class Integrator(LinearisedMethod):
             )
         check_inputs_given(self.interface, parameters)
         state = self._vector(q, "q"), self._vector(p, "p"), self._parameters(parameters)
-        q1, p1, given = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
+        q1, p1, values = *np.empty((2, self.dimension)), np.empty(len(self.interface.exchange_names))
         name = "work_and_impulses"
-        self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, given))
-        return q1, p1, given
+        self._solve(self.binding.with_function(name), name, t, h, state, options, (q1, p1, values))
+        return q1, p1, values
 
     def step_positions(
         self,

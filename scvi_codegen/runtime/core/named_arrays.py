@@ -31,49 +31,49 @@ def flat_state(interface: Interface, value: Any, name: str) -> Any:
     (_, shape), *others = arrays
     if others or len(shape) < 2:
         return value
-    found = real_array(value, name)
-    whole = found.shape[-len(shape) :] == shape
-    return found.reshape(*found.shape[: -len(shape)], -1) if whole and found.ndim != 1 else value
+    array = real_array(value, name)
+    whole = array.shape[-len(shape) :] == shape
+    return array.reshape(*array.shape[: -len(shape)], -1) if whole and array.ndim != 1 else value
 
 
 def state_by_name(interface: Interface, values: Array) -> dict[str, Array]:
     """Return (.., m) numbers, such as states of a trajectory, by the names of their arrays."""
-    found, first = {}, 0
+    state, first = {}, 0
     for name, shape in _coordinates(interface):
         size = math.prod(shape)
-        found[name] = values[..., first : first + size].reshape(*values.shape[:-1], *shape)
+        state[name] = values[..., first : first + size].reshape(*values.shape[:-1], *shape)
         first += size
-    return found
+    return state
 
 
 def entries_by_name(interface: Interface, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters with each array replaced by its entries; a number is the value of all entries."""
     arrays = dict(_declared(interface.arrays))
-    found = {}
+    entries = {}
     for name, value in parameters.items():
         shape = () if name in interface.parameters else arrays.get(name, ())
         if not shape:
-            found[name] = value
+            entries[name] = value
             continue
-        given = real_array(value, f"the parameter {name}")
-        if given.ndim and given.shape[given.ndim - len(shape) :] != shape:
-            raise StateError(f"the parameter {name} must have the shape {shape}, not {given.shape}")
-        by_place = np.moveaxis(given, range(-len(shape), 0), range(len(shape))) if given.ndim else given
-        for place in product(*map(range, shape)):
-            found["_".join([name, *map(str, place)])] = by_place[place] if given.ndim else given
-    return found
+        array = real_array(value, f"the parameter {name}")
+        if array.ndim and array.shape[array.ndim - len(shape) :] != shape:
+            raise StateError(f"the parameter {name} must have the shape {shape}, not {array.shape}")
+        by_index = np.moveaxis(array, range(-len(shape), 0), range(len(shape))) if array.ndim else array
+        for index in product(*map(range, shape)):
+            entries["_".join([name, *map(str, index)])] = by_index[index] if array.ndim else array
+    return entries
 
 
-def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], given: Mapping[str, Any], what: str) -> Array:
+def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], by_name: Mapping[str, Any], what: str) -> Array:
     names = [name for name, _ in arrays]
-    for name in given:
+    for name in by_name:
         if name not in names:
             raise StateError(f"there is no '{name}' in {what}{closest(str(name), names)} Known: {', '.join(names)}")
     parts = []
     for name, shape in arrays:
-        if name not in given:
+        if name not in by_name:
             raise StateError(f"'{name}' is missing in {what}")
-        part = real_array(given[name], f"{what}: '{name}'")
+        part = real_array(by_name[name], f"{what}: '{name}'")
         if part.shape[max(0, part.ndim - len(shape)) :] != shape:
             raise StateError(f"{what}: '{name}' must have the shape {shape}, not {part.shape}")
         parts.append(part.reshape(*part.shape[: part.ndim - len(shape)], math.prod(shape)))
@@ -84,12 +84,12 @@ def _joined(arrays: Sequence[tuple[str, tuple[int, ...]]], given: Mapping[str, A
 
 def _coordinates(interface: Interface) -> list[tuple[str, tuple[int, ...]]]:
     """Return the name and shape of each array of coordinates; without arrays, each coordinate is one."""
-    found, total = [], 0
+    coordinates, total = [], 0
     for name, shape in _declared(interface.arrays or interface.coordinates):
         if total < interface.dimension:
-            found.append((name, shape))
+            coordinates.append((name, shape))
             total += math.prod(shape)
-    return found
+    return coordinates
 
 
 def _declared(declarations: Sequence[str]) -> Iterator[tuple[str, tuple[int, ...]]]:

@@ -172,10 +172,10 @@ class Stepper(Integrator):
             plan = h, t_end if to_end else None, tolerance
             run = stepper._started(q, p, velocity, plan, t, parameters, options, reuse=True)
             check = GrowthCheck(run, check_growth)
-            found = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
-            check.warn(found)
+            trajectory = _recorded(run, h, steps, t_end, save_every=save_every, t_eval=t_eval, progress=progress)
+            check.warn(trajectory)
             run._release()
-            return found
+            return trajectory
         end = final_time(t, None if self.interface.time_transformation else h, steps, t_end)
         values = parameters_of(self, parameters, data)
         plan = h, end if to_end else None, tolerance
@@ -342,10 +342,10 @@ class Stepper(Integrator):
         if error is not None and isinstance(work, AdaptiveEnsemble):
             work.confirm(self, error, threads=threads)
         work.run(progress=progress, threads=threads)
-        found = work.result()
-        warn_of_unconfirmed(found.confirmations)
-        warn_of_energy_errors(found)
-        return found
+        trajectories = work.result()
+        warn_of_unconfirmed(trajectories.confirmations)
+        warn_of_energy_errors(trajectories)
+        return trajectories
 
     @checks_arguments(StateError, progress=FUNCTION)
     def chaos_indicators_ensemble(
@@ -432,8 +432,8 @@ class Stepper(Integrator):
         They satisfy d/dt L_v = L_q + f + G^T lambda with G = g_q, or g_v for a velocity constraint; for ``x**2 + y**2 =
         l**2`` the tension of the rod is -2 l lambda. They depend on the state alone and are as accurate as the state.
         """
-        found = multipliers(self, q, p, t, parameters)
-        return found[0] if np.ndim(q) == 1 else found
+        values = multipliers(self, q, p, t, parameters)
+        return values[0] if np.ndim(q) == 1 else values
 
     def constraint_values(
         self, q: ArrayLike, p: ArrayLike, t: ArrayLike = 0.0, parameters: Parameters = None

@@ -107,12 +107,12 @@ def checked_parameters(interface: Interface, parameters: Parameters) -> Array:
         for name, value in entries_by_name(interface, parameters).items():
             values[parameter_index(interface, name)] = checked_number(value, f"the parameter {name}")
     else:
-        given = real_array(parameters, "parameters")
-        if given.shape != values.shape:
+        array = real_array(parameters, "parameters")
+        if array.shape != values.shape:
             raise StateError(
-                f"parameters must have {len(values)} values ({', '.join(names) or 'none'}), not {given.size}"
+                f"parameters must have {len(values)} values ({', '.join(names) or 'none'}), not {array.size}"
             )
-        values = given
+        values = array
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
         raise StateError(f"the parameter {names[worst]} is {values[worst]}: it must be finite")

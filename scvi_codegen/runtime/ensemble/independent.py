@@ -151,33 +151,33 @@ class AdaptiveEnsemble:
         self.confirmations = [None] * len(self)
 
         def confirm_one(j: int, check_stop: StopCheck) -> None:
-            own: dict[str, Any] = {
+            arguments: dict[str, Any] = {
                 "t": self.t0,
                 "t_end": self.plans[j].t_end,
                 "save_every": self.save_every,
                 "options": self.options,
             }
-            own |= {"error": wanted, "progress": check_stop, **self._parameters_and_inputs(j)}
+            arguments |= {"error": wanted, "progress": check_stop, **self._parameters_and_inputs(j)}
             with without_accuracy_warnings(), suppress(StateError, StepFailedError):
-                self.confirmations[j] = stepper.integrate(self.q[j], self.p[j], **own).confirmation
+                self.confirmations[j] = stepper.integrate(self.q[j], self.p[j], **arguments).confirmation
 
         run_jobs(len(self), confirm_one, progress=None, threads=threads)
         self.plans = [
-            plan if found is None else replace(plan, tolerance=found.tolerance)
-            for plan, found in zip(self.plans, self.confirmations, strict=True)
+            plan if confirmation is None else replace(plan, tolerance=confirmation.tolerance)
+            for plan, confirmation in zip(self.plans, self.confirmations, strict=True)
         ]
 
     def _parameters_and_inputs(self, j: int) -> dict[str, Any]:
         """Return the arguments ``parameters`` and ``inputs`` of a single run of trajectory j."""
         of_inputs = columns_of_inputs(self.stepper.interface) if self.inputs else ()
         values = zip(self.stepper.parameters, self.parameters[j].tolist(), strict=True)
-        own = {
+        inputs = {
             name: replace(each, pieces=each.pieces[:, j]) if each.pieces.ndim == 3 else each
             for name, each in self.inputs.items()
         }
         return {
             "parameters": {name: x for k, (name, x) in enumerate(values) if k not in of_inputs},
-            "inputs": own or None,
+            "inputs": inputs or None,
         }
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
@@ -206,15 +206,15 @@ class AdaptiveEnsemble:
                 parameters=self._values(j, first_inner_time(self.t0, self.plans[j].t_end)),
                 options=self.options,
             )
-            found, status = self._states(j, run, check_stop)
+            states, status = self._states(j, run, check_stop)
         except StateError:  # a sum of finite terms has overflowed
             return SavedLane(np.array([self.t0]), self.q[[j]], self.p[[j]], "not finite", 0)
-        return SavedLane(found.t, found.q, found.p, status, run.steps)
+        return SavedLane(states.t, states.q, states.p, status, run.steps)
 
     def _values(self, j: int, t: float) -> Array:
         """Return the parameters of trajectory j for the pieces of the inputs that contain t."""
-        found: Array = parameters_at(self.stepper.parameters, self.parameters, self.inputs, t, slice(j, j + 1))[0]
-        return found
+        values: Array = parameters_at(self.stepper.parameters, self.parameters, self.inputs, t, slice(j, j + 1))[0]
+        return values
 
     def _states(self, j: int, run: Memory, check_stop: StopCheck) -> tuple[LaneStates, str]:
         """Return the saved states of trajectory j and its status."""
@@ -228,28 +228,28 @@ class AdaptiveEnsemble:
             segments = prepared_segments(run, self.inputs, self.plans[j].t_end, partial(self._values, j))
             pieces.extend(record(run, steps, save_every=self.save_every, progress=check_stop) for steps in segments)
         except StepFailedError as failure:
-            found = Trajectory.before(failure)
-            return DrivenTrajectory((*pieces, found)) if pieces else found, failure.status
+            last = Trajectory.before(failure)
+            return DrivenTrajectory((*pieces, last)) if pieces else last, failure.status
         return DrivenTrajectory(tuple(pieces or [record(run, 0)])), OK
 
     def result(self) -> EnsembleTrajectory:
         """Return the trajectories; incomplete ones are ``"interrupted"`` after their initial state."""
-        found = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
+        lanes = [self.saved.get(j) or self._unfinished(j) for j in range(len(self))]
         if self.t_eval is None:
-            t, times, rows = self._by_number(found)
+            t, times, rows = self._by_number(lanes)
         else:
             t, times = self.t_eval, None
-            rows = [slice(0, len(each.t)) for each in found]
+            rows = [slice(0, len(each.t)) for each in lanes]
         q, p = np.full((2, len(t), len(self), self.stepper.dimension), np.nan)
-        for j, (each, row) in enumerate(zip(found, rows, strict=True)):
+        for j, (each, row) in enumerate(zip(lanes, rows, strict=True)):
             q[row, j], p[row, j] = each.q, each.p
         return EnsembleTrajectory(
             t=t,
             times=times,
             q=q,
             p=p,
-            status=np.array([each.status for each in found], dtype="<U32"),
-            steps=np.array([each.steps for each in found], dtype=np.int64),
+            status=np.array([each.status for each in lanes], dtype="<U32"),
+            steps=np.array([each.steps for each in lanes], dtype=np.int64),
             h=0.0,
             plans=tuple(self.plans),
             confirmations=tuple(self.confirmations),
@@ -271,12 +271,12 @@ class AdaptiveEnsemble:
             values = partial(parameters_at, self.stepper.parameters, self.parameters, self.inputs, (start + end) / 2)
             yield slice(first, until), slice(j, j + 1), values
 
-    def _by_number(self, found: list[SavedLane]) -> tuple[Array, Array, list[slice]]:
+    def _by_number(self, lanes: list[SavedLane]) -> tuple[Array, Array, list[slice]]:
         """Return row numbers, (n, k) times padded with NaN, and the rows of each trajectory."""
-        rows = [slice(0, len(each.t)) for each in found]
+        rows = [slice(0, len(each.t)) for each in lanes]
         count = max(row.stop for row in rows)
-        times = np.full((count, len(found)), np.nan)
-        for j, (each, row) in enumerate(zip(found, rows, strict=True)):
+        times = np.full((count, len(lanes)), np.nan)
+        for j, (each, row) in enumerate(zip(lanes, rows, strict=True)):
             times[row, j] = each.t
         return np.arange(count, dtype=float), times, rows
 
@@ -284,7 +284,7 @@ class AdaptiveEnsemble:
         first = slice(0, 1 if self.t_eval is None else 0)
         return SavedLane(np.array([self.t0])[first], self.q[[j]][first], self.p[[j]][first], INTERRUPTED, 0)
 
-    def keep(self, part: slice, found: EnsembleTrajectory) -> None:
+    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
-        for j, each in zip(range(part.start, part.stop), found.each(), strict=True):
+        for j, each in zip(range(part.start, part.stop), trajectories.each(), strict=True):
             self.saved[j] = SavedLane(*each)

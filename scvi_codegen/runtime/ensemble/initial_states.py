@@ -60,8 +60,10 @@ def start_of_ensemble(
     positions, momenta = checked_ensemble(stepper, q, p)
     values = parameters_of_each(stepper, parameters, len(positions))
     if stepper.interface.constraints:
-        for k, own in enumerate(values):
-            positions[k], momenta[k] = consistent(stepper, positions[k], momenta[k], t, own, check_rank=k == 0)
+        for k, parameters_of_lane in enumerate(values):
+            positions[k], momenta[k] = consistent(
+                stepper, positions[k], momenta[k], t, parameters_of_lane, check_rank=k == 0
+            )
     return positions, momenta, values
 
 

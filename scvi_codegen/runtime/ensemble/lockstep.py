@@ -122,8 +122,8 @@ class Ensemble:
         self.count = len(start_q)
         if not stepper._has_energy(parameters):
             for j in range(self.count):
-                level = parameter_index(stepper.interface, stepper.interface.energy_parameter)
-                self.parameters[j, level] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
+                energy = parameter_index(stepper.interface, stepper.interface.energy_parameter)
+                self.parameters[j, energy] = stepper.energy(start_q[j], start_p[j], 0.0, self.parameters[j])
         if self.inputs:
             self.parameters[:, columns_of_inputs(stepper.interface)] = 0.0
         self.q, self.p = (empty_array((len(self.numbers), self.count, stepper.dimension)) for _ in "qp")
@@ -178,17 +178,17 @@ class Ensemble:
 
     def saved_times(self) -> Array:
         """Return the (n,) times of the saved states; tau from 0 in transformed time."""
-        found, first = np.empty(len(self.numbers)), 0
+        times, first = np.empty(len(self.numbers)), 0
         for k, segment in enumerate(self.segments):
             rows = slice(first, self.row(self.ends[k]))
             (start, low), first = segment.start if self.times is None else (0.0, 0.0), rows.stop
             high, rest = times_after(start, segment.h, self.numbers[rows] - self._first(k))
-            found[rows] = high + (rest + low)
-        return found
+            times[rows] = high + (rest + low)
+        return times
 
     def part(self, part: slice) -> dict[str, object]:
         """Return keyword arguments that construct the ensemble of a slice of the trajectories."""
-        found: dict[str, object] = {
+        arguments: dict[str, object] = {
             "q": self.q[0, part],
             "p": self.p[0, part],
             "h": self.h,
@@ -198,19 +198,19 @@ class Ensemble:
             "options": self.options,
         }
         if self.t_end is None:
-            return found | {"steps": self.steps}
-        return found | {"t_end": self.t_end, "inputs": inputs_of_slice(self.inputs, part)}
+            return arguments | {"steps": self.steps}
+        return arguments | {"t_end": self.t_end, "inputs": inputs_of_slice(self.inputs, part)}
 
-    def keep(self, part: slice, found: EnsembleTrajectory) -> None:
+    def keep(self, part: slice, trajectories: EnsembleTrajectory) -> None:
         """Store the results of a slice that was integrated elsewhere."""
         self.q[:, part], self.p[:, part], self.status[part], self.done[part] = (
-            found.q,
-            found.p,
-            found.status,
-            found.steps,
+            trajectories.q,
+            trajectories.p,
+            trajectories.status,
+            trajectories.steps,
         )
         if self.times is not None:
-            self.times[:, part] = found.times
+            self.times[:, part] = trajectories.times
 
     def run(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> None:
         """Integrate all blocks with ``threads`` threads; an exception raised by ``progress`` stops them promptly.
@@ -341,17 +341,17 @@ class LaneBlock:
                 )
             self._advance(chunk_size.steps, chunk_size.save_every)
 
-    def _change(self, h: float, own: Array) -> None:
+    def _change(self, h: float, parameters: Array) -> None:
         """Set step size and parameters; a new step size invalidates the predictor."""
         for lane, alone in self.left.items():
-            alone.update(h, own[lane])
-        self.parameters[:, : self.count] = own.T
-        self.parameters[:, self.count :] = own[-1:].T
+            alone.update(h, parameters[lane])
+        self.parameters[:, : self.count] = parameters.T
+        self.parameters[:, self.count :] = parameters[-1:].T
         if h == self.memory.h:
             return
         self.memory.h, self.memory.guess = h, 0
         if self.binding.constant("NEEDS_VELOCITIES"):
-            self._reset_predictor(own)
+            self._reset_predictor(parameters)
 
     def _reset_predictor(self, parameters: Array) -> None:
         """Reset the predictor to the current velocities, as initially; deactivate lanes without velocities."""
@@ -369,15 +369,15 @@ class LaneBlock:
         if len(self.left) < self.count:
             row = work.row(begin)
             stride = work.count * work.stepper.dimension
-            place = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
+            offset = row * stride + self.first * work.stepper.dimension if row < len(work.q) else 0
             self.binding.function("advance")(
                 self.memory,
                 self.count,
                 size,
                 save_every,
                 self.binding.options(work.options),
-                self.binding.pointer(work.q) + place,
-                self.binding.pointer(work.p) + place,
+                self.binding.pointer(work.q) + offset,
+                self.binding.pointer(work.p) + offset,
                 stride,
             )
         running = self.active[: self.count] > 0.0

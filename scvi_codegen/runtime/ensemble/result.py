@@ -134,10 +134,10 @@ class EnsembleTrajectory(ConfirmedEnsemble):
     def _with_parameters(self) -> Iterator[tuple[int, NDArray[np.intp], Array]]:
         """Yield trajectories with the rows of their states and the parameters in these rows."""
         for rows, some, parameters in self.spans or ((slice(None), slice(None), self.parameters.__getitem__),):
-            for j, own in zip(range(*some.indices(len(self))), parameters(some), strict=True):
+            for j, values in zip(range(*some.indices(len(self))), parameters(some), strict=True):
                 good = np.flatnonzero(self._reached(j)[rows]) + (rows.start or 0)
                 if good.size:
-                    yield j, good, own
+                    yield j, good, values
 
     @checks_arguments(path=PATH, units=MAPPING)
     def save(self, path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> None:
@@ -211,13 +211,13 @@ class EnsembleTrajectory(ConfirmedEnsemble):
 
     def _quantities(self) -> dict[str, Array]:
         times = np.nan_to_num(self._times())
-        found: dict[str, Array] = {}
+        result: dict[str, Array] = {}
         for j, good, parameters in self._with_parameters():
             part = quantities(self.stepper, parameters, times[good, j], self.q[good, j], self.p[good, j])
             for name, values in part.items():
                 shape = (*self.q.shape[:2], *values.shape[1:])
-                found.setdefault(name, np.full(shape, np.nan))[good, j] = values
-        return found
+                result.setdefault(name, np.full(shape, np.nan))[good, j] = values
+        return result
 
     def _reached(self, j: int) -> NDArray[np.bool_]:
         """Return (n,) flags of the states that trajectory j reached."""

@@ -67,13 +67,13 @@ def ensemble_work(
 
 def _common_steps(h: float | None, steps: int | None, **others: object) -> tuple[float, int]:
     """Return h and steps of a fixed-step ensemble; raise ``StateError`` for missing or contradictory arguments."""
-    given = [name for name, value in others.items() if value is not None]
+    names = [name for name, value in others.items() if value is not None]
     if h is None or steps is None:
         raise StateError("give either h with steps or t_end (fixed step size), or t_end alone (adaptive step size)")
     if others["t_end"] is not None:
         raise StateError(f"give either steps={steps} or t_end with h, not both")
-    if given:
-        raise StateError(f"{given[0]} requires adaptive steps: give t_end without h and steps")
+    if names:
+        raise StateError(f"{names[0]} requires adaptive steps: give t_end without h and steps")
     return h, steps
 
 
@@ -134,8 +134,8 @@ def _start_with_inputs(
     count = len(checked_ensemble(stepper, q, q)[0])
     data = checked_inputs(stepper.interface, inputs, count)
     check_left_to_inputs(stepper.interface, parameters)
-    own = parameters_of_each(stepper, parameters, count)
-    start = parameters_at(stepper.parameters, own, data, first_inner_time(*interval))
+    values = parameters_of_each(stepper, parameters, count)
+    start = parameters_at(stepper.parameters, values, data, first_inner_time(*interval))
     return data, momenta_of_each(stepper, q, p, velocity, interval[0], start), start
 
 

@@ -177,20 +177,20 @@ def _solved(
     """Return the joined segments, the unknowns, a mask of those at bounds, and the number of evaluations."""
     from scipy.optimize import least_squares  # here: slow to import
 
-    own, count = model.bounded(bounds), len(x) - len(model.names)
-    limits = np.append(own[0], np.full(count, -np.inf)), np.append(own[1], np.full(count, np.inf))
+    ends, count = model.bounded(bounds), len(x) - len(model.names)
+    limits = np.append(ends[0], np.full(count, -np.inf)), np.append(ends[1], np.full(count, np.inf))
     several = len(chain.parts) > 1
     if several:
         chain = replace(chain, jump=LOOSE, unit=chain.typical(x))
-    found = least_squares(chain.residuals, x, jac=chain.jacobian, bounds=limits, x_scale="jac")
-    if not found.success:
-        raise FitError(f"least squares did not converge: {found.message} Give a better initial guess")
-    at_bound = found.active_mask != 0
-    _check_determined(model.names, found.jac, chain.typical_unknowns(found.x), at_bound)
+    solution = least_squares(chain.residuals, x, jac=chain.jacobian, bounds=limits, x_scale="jac")
+    if not solution.success:
+        raise FitError(f"least squares did not converge: {solution.message} Give a better initial guess")
+    at_bound = solution.active_mask != 0
+    _check_determined(model.names, solution.jac, chain.typical_unknowns(solution.x), at_bound)
     if not several:
-        return chain, found.x, at_bound, found.nfev
-    x, at_bound, more = joined(chain, found.x, limits)
-    return replace(chain, jump=TIGHT), x, at_bound, found.nfev + more
+        return chain, solution.x, at_bound, solution.nfev
+    x, at_bound, more = joined(chain, solution.x, limits)
+    return replace(chain, jump=TIGHT), x, at_bound, solution.nfev + more
 
 
 @dataclass(eq=False)
@@ -222,11 +222,11 @@ class _Model:
     ) -> _Model:
         """Construct from validated arguments of :func:`fit`."""
         stepper, m = measurements.stepper, measurements.stepper.dimension
-        own = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
-        wanted = tuple(own) if unknown is None else distinct(unknown, "unknown")
+        estimable = [name for name in stepper.parameters if name not in _of_inputs(stepper)]
+        wanted = tuple(estimable) if unknown is None else distinct(unknown, "unknown")
         for name in wanted:
-            if name not in own:
-                raise StateError(f"there is no parameter '{name}' to estimate{closest(name, own)}")
+            if name not in estimable:
+                raise StateError(f"there is no parameter '{name}' to estimate{closest(name, estimable)}")
         if p is None and not fit_initial_state:
             raise StateError(
                 "velocity does not determine the initial momenta before the parameters are known: give p, or "
@@ -304,14 +304,14 @@ def _step_size_warning(chain: Chain, fitted: Fit, x: Array, free: NDArray[np.boo
     Changes below a millionth of the size of an unknown are ignored: noise-free data have no errors.
     """
     finer = replace(chain, parts=tuple(part.halved() for part in chain.parts))
-    count, found = len(fitted.names), x.copy()
+    count, moved_x = len(fitted.names), x.copy()
     errors, determined = np.sqrt(np.diag(fitted.covariance)), free[:count]
     noticed = np.maximum(errors, NEGLIGIBLE_CHANGE * chain.typical_unknowns(x)[:count])
     with suppress(StepFailedError):
         for _ in range(REFINEMENT_ITERATIONS):
-            scaled, jacobian = finer.evaluated(found)
-            found[free] -= np.linalg.pinv(jacobian[:, free]) @ scaled
-            moved = np.abs(found - x)[:count][determined]
+            scaled, jacobian = finer.evaluated(moved_x)
+            moved_x[free] -= np.linalg.pinv(jacobian[:, free]) @ scaled
+            moved = np.abs(moved_x - x)[:count][determined]
             if not (moved > noticed[determined]).any():
                 return ""
         ratios = moved / errors[determined]
@@ -340,9 +340,9 @@ def _check_determined(names: Sequence[str], jacobian: Array, sizes: Array, at_bo
     """
     if at_bound.all():
         return
-    own = [*names, *[""] * (len(at_bound) - len(names))]
+    labels = [*names, *[""] * (len(at_bound) - len(names))]
     free, jacobian, sizes = (
-        [name for name, at in zip(own, at_bound, strict=True) if not at],
+        [name for name, at in zip(labels, at_bound, strict=True) if not at],
         jacobian[:, ~at_bound],
         sizes[~at_bound],
     )

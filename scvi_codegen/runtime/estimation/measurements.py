@@ -110,8 +110,8 @@ class Measurements:
         rows = (self.step_numbers >= begin) & ((self.step_numbers < end) | last)
         steps = tuple(piece for piece in pieces if len(piece[1]))
         start = float(steps[0][0][0])
-        own = replace(self, t=self.t[rows], measured=self.measured[rows], step_numbers=self.step_numbers[rows] - begin)
-        return replace(own, pieces=steps, start=start)
+        part = replace(self, t=self.t[rows], measured=self.measured[rows], step_numbers=self.step_numbers[rows] - begin)
+        return replace(part, pieces=steps, start=start)
 
     def motion(self, state: Array, tangents: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
         """Integrate and return the computed measurements and the final state, with derivatives.

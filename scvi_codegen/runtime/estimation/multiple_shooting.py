@@ -84,7 +84,7 @@ class Chain:
         except StepFailedError:
             if self.at is None:
                 raise
-            return np.full(len(self.found[0]), np.inf)
+            return np.full(len(self.evaluation[0]), np.inf)
 
     def jacobian(self, x: Array) -> Array:
         """Return the (residuals and jumps, unknowns) Jacobian."""
@@ -92,8 +92,8 @@ class Chain:
 
     def scaled(self, x: Array) -> Array:
         """Return the residuals of the measurements."""
-        found = self.evaluated(x)[0]
-        return found[: len(found) - self.jumps.size]
+        residuals = self.evaluated(x)[0]
+        return residuals[: len(residuals) - self.jumps.size]
 
     def typical(self, x: Array) -> float:
         """Return the root mean square residual of the measurements, bounded below."""
@@ -110,28 +110,28 @@ class Chain:
         """Return (unknowns,) typical sizes; 0 for parameters whose initial guess is 0."""
         guess, sizes = self.known[self.unknown_indices], np.zeros(len(self.known))
         sizes[: self.state] = self.sizes
-        own = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
-        first = np.maximum(own, sizes[self.unknown_indices])
+        typical = np.where(guess != 0.0, np.maximum(np.abs(guess), np.abs(x[: len(guess)])), 0.0)
+        first = np.maximum(typical, sizes[self.unknown_indices])
         return np.concatenate([first, np.tile(self.sizes, len(self.parts) - 1)])
 
     def evaluated(self, x: Array) -> tuple[Array, Array]:
         """Return residuals and Jacobian from one integration; the last evaluation is cached."""
         if self.at is None or not np.array_equal(x, self.at):
-            found = [self._part(j, x) for j in range(len(self.parts))]
+            by_part = [self._part(j, x) for j in range(len(self.parts))]
             nodes = x[len(self.unknown_indices) :].reshape(-1, self.state)
-            self.computed = np.concatenate([computed for computed, *_ in found])
-            self.jumps = np.stack([end for *_, end, _ in found])[:-1] - nodes
+            self.computed = np.concatenate([computed for computed, *_ in by_part])
+            self.jumps = np.stack([end for *_, end, _ in by_part])[:-1] - nodes
             rows, jacobian = [], []
-            for part, (computed, by, *_) in zip(self.parts, found, strict=True):
+            for part, (computed, by, *_) in zip(self.parts, by_part, strict=True):
                 rows.append(((computed - part.measured) / part.deviations)[part.used])
                 jacobian.append((by / part.deviations[:, np.newaxis])[part.used])
             weights = self.unit / (self.jump * self.sizes)
-            for j, (*_, by) in enumerate(found[:-1]):
+            for j, (*_, by) in enumerate(by_part[:-1]):
                 by[:, self._node(j + 1)] -= np.eye(self.state)
                 rows.append(self.jumps[j] * weights)
                 jacobian.append(by * weights[:, np.newaxis])
-            self.at, self.found = x.copy(), (np.concatenate(rows), np.concatenate(jacobian))
-        return self.found
+            self.at, self.evaluation = x.copy(), (np.concatenate(rows), np.concatenate(jacobian))
+        return self.evaluation
 
     def _node(self, j: int) -> slice:
         """Return the indices of the state of node j among the unknowns."""
@@ -164,22 +164,22 @@ def _node_states_from_measurements(whole: Measurements, parts: Sequence[Measurem
     order = [np.flatnonzero(whole.columns == k) for k in range(m)]
     if not all(len(each) for each in order):
         return _node_states_from_guess(parts, known)
-    found = []
+    states = []
     for part in parts[1:]:
         values = parameters_at(whole.stepper.parameters, known[2 * m :], whole.inputs, part.start)
         parabolas = [_parabola(whole, int(each[0]), part.start) for each in order]
         q, v = np.array(parabolas).T
-        found.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))
-    return np.array(found).reshape(-1, 2 * m)
+        states.append(np.concatenate([q, whole.stepper.momentum(q, v, part.start, values)]))
+    return np.array(states).reshape(-1, 2 * m)
 
 
 def _node_states_from_guess(parts: Sequence[Measurements], known: Array) -> Array:
     size = 2 * parts[0].stepper.dimension
-    state, found = known[:size], []
+    state, states = known[:size], []
     for part in parts[:-1]:
         state = part.motion(state, np.zeros((0, part.stepper._input_size)), known[size:])[2]
-        found.append(state)
-    return np.array(found).reshape(-1, size)
+        states.append(state)
+    return np.array(states).reshape(-1, size)
 
 
 def _parabola(whole: Measurements, column: int, t: float) -> tuple[float, float]:
@@ -221,11 +221,11 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
     whole, (low, high) = replace(chain, jump=1.0, unit=1.0), limits
     rounding = ROUNDING_LEVEL * whole.measured
     for iteration in range(1, MOST + 1):
-        found, jacobian = whole.evaluated(x)
-        rows = len(found) - whole.jumps.size
-        update, multipliers, at_bound = _bounded_update(jacobian, found, rows, (low - x, high - x))
-        moved, size = (float(np.linalg.norm(each)) for each in (jacobian[:rows] @ update, found[:rows]))
-        jump, moved = float(np.abs(found[rows:]).max()), moved / max(size, rounding / SETTLED)
+        residuals, jacobian = whole.evaluated(x)
+        rows = len(residuals) - whole.jumps.size
+        update, multipliers, at_bound = _bounded_update(jacobian, residuals, rows, (low - x, high - x))
+        moved, size = (float(np.linalg.norm(each)) for each in (jacobian[:rows] @ update, residuals[:rows]))
+        jump, moved = float(np.abs(residuals[rows:]).max()), moved / max(size, rounding / SETTLED)
         if jump < JOINED and moved <= SETTLED:
             return x, at_bound, iteration
         near = jump < NEAR and moved < NEAR
@@ -234,7 +234,9 @@ def joined(chain: Chain, x: Array, limits: Limits) -> tuple[Array, NDArray[np.bo
     raise FitError(f"the segments do not join within {MOST} iterations: give a better initial guess, or more segments")
 
 
-def _bounded_update(jacobian: Array, found: Array, rows: int, limits: Limits) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _bounded_update(
+    jacobian: Array, residuals: Array, rows: int, limits: Limits
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return the update that minimises the first rows subject to zeros in the others and to bounds.
 
     Active-set method (Nocedal & Wright, *Numerical Optimization*, 16.5): move towards the equality-constrained solution
@@ -246,20 +248,20 @@ def _bounded_update(jacobian: Array, found: Array, rows: int, limits: Limits) ->
     low, high = limits
     update, at_bound = np.zeros(jacobian.shape[1]), np.zeros(jacobian.shape[1], dtype=bool)
     for _ in range(BOUNDED + 3 * int(np.isfinite(np.concatenate(limits)).sum())):
-        wanted, multipliers = update.copy(), np.zeros(len(found) - rows)
-        rest = found + jacobian[:, at_bound] @ update[at_bound]
+        wanted, multipliers = update.copy(), np.zeros(len(residuals) - rows)
+        rest = residuals + jacobian[:, at_bound] @ update[at_bound]
         wanted[~at_bound], multipliers = _equality_constrained_update(jacobian[:, ~at_bound], rest, rows)
-        beyond, bound = (wanted < low) | (wanted > high), np.where(wanted < low, low, high)
+        beyond, limit = (wanted < low) | (wanted > high), np.where(wanted < low, low, high)
         if beyond.any():
             parts = np.full(len(update), np.inf)
-            parts[beyond] = (bound - update)[beyond] / (wanted - update)[beyond]
+            parts[beyond] = (limit - update)[beyond] / (wanted - update)[beyond]
             first = int(np.argmin(parts))
             update = np.clip(update + parts[first] * (wanted - update), low, high)
-            update[first], at_bound[first] = bound[first], True
+            update[first], at_bound[first] = limit[first], True
             continue
         update = wanted
-        residuals = found[:rows] + jacobian[:rows] @ update
-        uphill = jacobian[:rows].T @ residuals - jacobian[rows:].T @ multipliers
+        predicted = residuals[:rows] + jacobian[:rows] @ update
+        uphill = jacobian[:rows].T @ predicted - jacobian[rows:].T @ multipliers
         inward = np.where(at_bound, np.where(update <= low, -uphill, uphill), 0.0)
         if not (inward > RELEASED * np.abs(uphill).max(initial=0.0)).any():
             break
@@ -269,10 +271,10 @@ def _bounded_update(jacobian: Array, found: Array, rows: int, limits: Limits) ->
 
 def _step_length(chain: Chain, x: Array, update: Array, weight: float) -> float:
     """Return a step length with sufficient descent of the merit function; raise FitError if there is none."""
-    found, jacobian = chain.evaluated(x)
-    rows = len(found) - chain.jumps.size
-    before, part = _merit(found, rows, weight), 1.0
-    descent = found[:rows] @ jacobian[:rows] @ update - weight * np.abs(found[rows:]).sum()
+    residuals, jacobian = chain.evaluated(x)
+    rows = len(residuals) - chain.jumps.size
+    before, part = _merit(residuals, rows, weight), 1.0
+    descent = residuals[:rows] @ jacobian[:rows] @ update - weight * np.abs(residuals[rows:]).sum()
     while not _merit(chain.residuals(x + part * update), rows, weight) <= before + ARMIJO * part * descent:
         part /= 2.0
         if part < LEAST_STEP_LENGTH:
@@ -283,17 +285,17 @@ def _step_length(chain: Chain, x: Array, update: Array, weight: float) -> float:
     return part
 
 
-def _merit(found: Array, rows: int, weight: float) -> float:
+def _merit(residuals: Array, rows: int, weight: float) -> float:
     """Return the exact penalty function: half the sum of squares plus weighted absolute jumps."""
-    return float(0.5 * found[:rows] @ found[:rows] + weight * np.abs(found[rows:]).sum())
+    return float(0.5 * residuals[:rows] @ residuals[:rows] + weight * np.abs(residuals[rows:]).sum())
 
 
-def _equality_constrained_update(jacobian: Array, found: Array, rows: int) -> tuple[Array, Array]:
+def _equality_constrained_update(jacobian: Array, residuals: Array, rows: int) -> tuple[Array, Array]:
     """Solve the sparse equality-constrained least-squares problem; return the update and the multipliers."""
     from scipy.sparse import block_array, csc_array, identity
     from scipy.sparse.linalg import splu
 
     by, of = csc_array(jacobian[:rows]), csc_array(jacobian[rows:])
     matrix = block_array([[identity(rows), by, None], [by.T, None, of.T], [None, of, None]], format="csc")
-    solved = splu(matrix).solve(-np.concatenate([found[:rows], np.zeros(jacobian.shape[1]), found[rows:]]))
+    solved = splu(matrix).solve(-np.concatenate([residuals[:rows], np.zeros(jacobian.shape[1]), residuals[rows:]]))
     return solved[rows : rows + jacobian.shape[1]], solved[rows + jacobian.shape[1] :]

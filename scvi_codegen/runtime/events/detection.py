@@ -31,12 +31,12 @@ class CrossingSearch:
 
     Attributes:
         ended: whether a terminal event occurred; ``found[-1]`` then contains its crossing.
-        found: structured arrays (t, function, q, p), in the order of the run.
+        recorded: structured arrays (t, function, q, p), in the order of the run.
     """
 
     def __init__(self, stepper: Integrator, crossed: Sequence[int] = ()) -> None:
         self.stepper, self.binding = stepper, stepper.binding
-        self.found: list[NDArray[Any]] = []
+        self.recorded: list[NDArray[Any]] = []
         self.watch = self.binding.new("watch *")
         for number, event in enumerate(stepper.events):
             self.watch.direction[number] = event.direction
@@ -85,7 +85,7 @@ class CrossingSearch:
                 workspace,
             )
             count = int(filled[0])
-            self.found.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
+            self.recorded.append(np.frombuffer(self.binding.buffer(crossings), self._record, count).copy())
             done += int(report.steps)
             if status:
                 raise self._failure(status, report, first + done, float(h[done]))
@@ -106,11 +106,11 @@ class CrossingSearch:
 
     def crossings(self) -> tuple[Crossings, ...]:
         """Return the crossings by event."""
-        found = np.concatenate([np.empty(0, self._record), *self.found])
+        records = np.concatenate([np.empty(0, self._record), *self.recorded])
         return tuple(
             Crossings(event=event, t=mine["t"].copy(), q=mine["q"].copy(), p=mine["p"].copy())
             for number, event in enumerate(self.stepper.events)
-            for mine in [found[found["function"] == number]]
+            for mine in [records[records["function"] == number]]
         )
 
 

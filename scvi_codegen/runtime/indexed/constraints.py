@@ -52,17 +52,17 @@ class ConstrainedRun(Protocol):
 
 def constraint_values(run: ConstrainedRun) -> tuple[tuple[Numbers, ...], tuple[Numbers, ...]]:
     """Return g and its rate for each constraint, as arrays over its loops."""
-    found = np.zeros(_count(run)), np.zeros(_count(run))
-    run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, found))
-    return _apart(run, found[0]), _apart(run, found[1])
+    values = np.zeros(_count(run)), np.zeros(_count(run))
+    run.call("constraint_values", run.problem.struct, *map(run.problem.binding.pointer, values))
+    return _apart(run, values[0]), _apart(run, values[1])
 
 
 def multipliers(run: ConstrainedRun) -> tuple[Numbers, ...]:
     """Return the multipliers lambda of the forces G^T lambda of each constraint, as arrays over its loops."""
-    found = np.zeros(_count(run))
-    if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(found)):
+    values = np.zeros(_count(run))
+    if status := run.call("multipliers", run.problem.struct, run.problem.binding.pointer(values)):
         raise StateError(f"the multipliers of '{run.problem.interface.system}' are undefined here: {REASONS[status]}")
-    return _apart(run, found)
+    return _apart(run, values)
 
 
 def consistent(run: ConstrainedRun) -> None:
@@ -139,9 +139,9 @@ def _dependent(run: ConstrainedRun, *, nearest: bool = False) -> str:
         return g, (rates[1:] - rates[0]).T
 
     names = [
-        f"constraint {number}" + (str(list(map(int, place))) if shape else "")
+        f"constraint {number}" + (str(list(map(int, index))) if shape else "")
         for number, shape in enumerate(_shapes(run), 1)
-        for place in np.ndindex(*shape)
+        for index in np.ndindex(*shape)
     ]
     try:
         return rank_deficiency(names, state[:n].copy(), at, nearest=nearest)
@@ -162,12 +162,12 @@ def _shapes(run: ConstrainedRun) -> list[list[int]]:
 
 def _apart(run: ConstrainedRun, values: Numbers) -> tuple[Numbers, ...]:
     """Split a vector into one array per constraint."""
-    found, start = [], 0
+    parts, start = [], 0
     for shape in _shapes(run):
         size = int(np.prod(shape))
-        found.append(values[start : start + size].reshape(shape))
+        parts.append(values[start : start + size].reshape(shape))
         start += size
-    return tuple(found)
+    return tuple(parts)
 
 
 def _shape(loops: Sequence[Loop], sizes: Mapping[str, int]) -> list[int]:

@@ -56,15 +56,15 @@ def states_between(
     flat = within(times.ravel(), t[0], t[-1])
     forward = math.copysign(1.0, t[-1] - t[0])
     left = np.searchsorted(forward * t, forward * flat, side="right") - 1
-    found: list[tuple[dict[str, Numbers], dict[str, Numbers]]] = [({}, {})] * len(flat)
+    states: list[tuple[dict[str, Numbers], dict[str, Numbers]]] = [({}, {})] * len(flat)
     for k in np.unique(left):
         start = ({name: each[k] for name, each in q.items()}, {name: each[k] for name, each in p.items()})
         numbers = np.flatnonzero(left == k)
         wanted = numbers[np.argsort(forward * flat[numbers], kind="stable")]
         for number, state in zip(wanted, _behind(continuations[k], float(t[k]), start, flat[wanted]), strict=True):
-            found[number] = state
-    return _shaped([state for state, _ in found], q, times.shape), _shaped(
-        [state for _, state in found], p, times.shape
+            states[number] = state
+    return _shaped([state for state, _ in states], q, times.shape), _shaped(
+        [state for _, state in states], p, times.shape
     )
 
 

@@ -80,7 +80,7 @@ class IndexedSearch:
         self.run, self.events = run, tuple(events)
         self.functions = [_Function(run, event) for event in events]
         self.remaining = [int(event.terminal) for event in events]
-        self.found: list[list[tuple[float, dict[str, Numbers], dict[str, Numbers]]]] = [[] for _ in events]
+        self.recorded: list[list[tuple[float, dict[str, Numbers], dict[str, Numbers]]]] = [[] for _ in events]
         self.ended = False
         self.values = self._values(run)
         self.started = False
@@ -111,7 +111,7 @@ class IndexedSearch:
 
     def _take(self, k: int, there: IndexedRun) -> bool:
         """Record a crossing; return whether it ends the run."""
-        self.found[k].append((there.t, there.q, there.p))
+        self.recorded[k].append((there.t, there.q, there.p))
         self.remaining[k] -= 1
         return self.remaining[k] == 0
 
@@ -131,25 +131,25 @@ class IndexedSearch:
             return []
         if not abs(change) > AT_REST * size + 4.0 * doubt:
             return []
-        found: list[Sample] = []
+        samples: list[Sample] = []
         for part in PROBES[:-1]:
             value = self._value(self._part(before, part * h), k)
-            if found or abs(value) > 8.0 * noise + 4.0 * abs(old):
-                found.append((part, value))
-            if len(found) == 1 and sign * value < 0.0:
+            if samples or abs(value) > 8.0 * noise + 4.0 * abs(old):
+                samples.append((part, value))
+            if len(samples) == 1 and sign * value < 0.0:
                 event = self.events[k]
                 if self.remaining[k] > 0 and event.direction != sign:
                     raise EventError(ACCUMULATED.format(function=event.function, t=start.t))
                 return []
-        return found
+        return samples
 
     def _rounding(self, start: IndexedRun, k: int, old: float) -> float:
         """Return the change of a function when coordinates change by one ulp up or down."""
-        rng, found = np.random.default_rng(0), 0.0
+        rng, largest = np.random.default_rng(0), 0.0
         for _ in range(4):
             ulps = LAST_BIT * np.abs(start.state) * rng.choice([-1.0, 1.0], start.state.size)
-            found = max(found, abs(self._moved(start, k, start.t, ulps) - old))
-        return found
+            largest = max(largest, abs(self._moved(start, k, start.t, ulps) - old))
+        return largest
 
     def _first_change(
         self, before: IndexedSnapshot, start: IndexedRun, k: int, h: float, noise: float
@@ -191,11 +191,11 @@ class IndexedSearch:
         return tuple(
             IndexedCrossings(
                 event=event,
-                t=np.array([t for t, _, _ in found]),
-                q={name: np.array([q[name] for _, q, _ in found]) for name in names},
-                p={name: np.array([p[name] for _, _, p in found]) for name in names},
+                t=np.array([t for t, _, _ in points]),
+                q={name: np.array([q[name] for _, q, _ in points]) for name in names},
+                p={name: np.array([p[name] for _, _, p in points]) for name in names},
             )
-            for event, found in zip(self.events, self.found, strict=True)
+            for event, points in zip(self.events, self.recorded, strict=True)
         )
 
     def _end(self, before: IndexedSnapshot, there: IndexedRun) -> None:
@@ -230,10 +230,10 @@ class IndexedSearch:
         return [self._value(run, k) for k in range(len(self.events))]
 
     def _value(self, run: IndexedRun, k: int) -> float:
-        found = self.functions[k].value(run)
-        if not np.isfinite(found):
+        value = self.functions[k].value(run)
+        if not np.isfinite(value):
             raise EventError(f"the event function '{self.events[k].function}' is not finite at t = {run.t:.17g}")
-        return found
+        return value
 
 
 def _crosses(event: Event, old: float, new: float) -> bool:
@@ -258,12 +258,12 @@ class _Function:
         from scvi_codegen.formulas.indexed_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
-        given = run.problem.arrays
+        stored = run.problem.arrays
         numbers: dict[Any, float] = {symbol(TIME): run.t}
-        numbers |= {symbol(name): x for name, x in zip(run.interface.parameters, given.numbers, strict=True)}
+        numbers |= {symbol(name): x for name, x in zip(run.interface.parameters, stored.numbers, strict=True)}
         arrays = _arrays_of(run, self.needs)
         values = (
-            Elements(term.loops, given.sizes, given.places).values(term.formula, term.slots, arrays, numbers)
+            Elements(term.loops, stored.sizes, stored.places).values(term.formula, term.slots, arrays, numbers)
             for term in self.terms
         )
         return float(sum(np.sum(value) for value in values))
@@ -276,8 +276,8 @@ def _velocities(interface: Interface) -> dict[str, str]:
 
 def _momenta(interface: Interface) -> dict[str, str]:
     """Return the names of the momentum arrays by coordinate array."""
-    own = [array.name for array in interface.layout.momenta] or interface.momenta
-    return dict(zip(interface.coordinates, own, strict=True))
+    names = [array.name for array in interface.layout.momenta] or interface.momenta
+    return dict(zip(interface.coordinates, names, strict=True))
 
 
 def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
@@ -297,9 +297,9 @@ def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
 
 def _arrays_of(run: IndexedRun, names: set[str]) -> dict[str, NDArray[np.float64]]:
     """Return the arrays of a state that occur in ``names``."""
-    found = {**run.q, **run.problem.arrays.fields}
+    arrays = {**run.q, **run.problem.arrays.fields}
     for others, state in ((_velocities(run.interface), "velocity"), (_momenta(run.interface), "p")):
         if names & set(others.values()):
             values = getattr(run, state)
-            found |= {other: values[name] for name, other in others.items()}
-    return found
+            arrays |= {other: values[name] for name, other in others.items()}
+    return arrays

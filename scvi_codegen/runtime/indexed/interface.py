@@ -48,9 +48,9 @@ def read_arrays(
     Raises:
         StateError: if a name, shape or number is invalid, or an index would leave its array.
     """
-    places, state = read_tables(interface, tables), read_state(interface, q, "positions")
+    index_tables, state = read_tables(interface, tables), read_state(interface, q, "positions")
     shapes = [(array, state[array.name].shape) for array in interface.layout.coordinates]
-    shapes += [(table, places[table.name].shape) for table in interface.layout.tables]
+    shapes += [(table, index_tables[table.name].shape) for table in interface.layout.tables]
     argument = dict(parameters or {})
     numbers = number_values(interface, argument)
     shapes += [
@@ -60,8 +60,8 @@ def read_arrays(
     ]
     sizes = sizes_of([pair for pair in shapes if len(pair[0].axes) == len(pair[1])], interface.layout.sizes)
     fields = field_values(interface, argument, sizes)
-    check_accesses(interface.layout, sizes, places)
-    return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=places)
+    check_accesses(interface.layout, sizes, index_tables)
+    return RunArrays(sizes=sizes, state=state, numbers=numbers, fields=fields, places=index_tables)
 
 
 def read_state(interface: Interface, argument: ArrayLike | Mapping[str, ArrayLike], what: str) -> dict[str, Numbers]:
@@ -93,21 +93,21 @@ def field_values(
     interface: Interface, argument: Mapping[str, ArrayLike], sizes: Mapping[str, int]
 ) -> dict[str, Numbers]:
     """Return the field arrays by name, in full shape; a scalar fills its array."""
-    found = {}
+    fields = {}
     for array, default in zip(interface.layout.fields, interface.layout.field_defaults, strict=True):
         values = real_array(argument.get(array.name, default), array.name)
         _check_finite(values, array.name)
         shape = array.shape(sizes)
         if values.shape not in ((), shape):
             raise StateError(f"'{array.name}' must have the shape {_text(shape)} of {array}, not {values.shape}")
-        found[array.name] = _read_only(np.ascontiguousarray(np.broadcast_to(values, shape)))
-    return found
+        fields[array.name] = _read_only(np.ascontiguousarray(np.broadcast_to(values, shape)))
+    return fields
 
 
 def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) -> dict[str, IndexTable]:
     """Return read-only copies of the tables by name, so that indices cannot change after validation."""
     _check_named(argument or {}, [table.name for table in interface.layout.tables], "tables", whole=True)
-    found = {}
+    result = {}
     for table in interface.layout.tables:
         try:
             values = np.asarray((argument or {})[table.name])
@@ -127,8 +127,8 @@ def read_tables(interface: Interface, argument: Mapping[str, ArrayLike] | None) 
                 f"the indices in the table '{table.name}' must be from 0 to 2**31 - 1, "
                 f"not {values.min()} to {values.max()}"
             )
-        found[table.name] = _read_only(np.array(values, dtype=np.int32, order="C"))
-    return found
+        result[table.name] = _read_only(np.array(values, dtype=np.int32, order="C"))
+    return result
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -143,18 +143,18 @@ def sizes_of(arrays: Sequence[tuple[Array, tuple[int, ...]]], names: Sequence[st
     Raises:
         StateError: if two arrays imply different values, or none implies any.
     """
-    found: dict[str, tuple[int, Array]] = {}
+    lengths: dict[str, tuple[int, Array]] = {}
     for array, shape in arrays:
         for axis, length in zip(array.axes, shape, strict=True):
-            known, other = found.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
+            known, other = lengths.setdefault(axis.name, (length, array)) if axis.name else (axis.number, array)
             if known != length:
                 raise StateError(
                     f"{axis} must be the same in all arrays: it is {length} in {array}, {known} in {other}"
                 )
     for name in names:
-        if name not in found:
+        if name not in lengths:
             raise StateError(f"the size {name} is undetermined: pass an array that has an axis of this size")
-    return {name: length for name, (length, _) in found.items()}
+    return {name: length for name, (length, _) in lengths.items()}
 
 
 def check_accesses(layout: ArrayLayout, sizes: Mapping[str, int], tables: Mapping[str, IndexTable]) -> None:
@@ -164,34 +164,34 @@ def check_accesses(layout: ArrayLayout, sizes: Mapping[str, int], tables: Mappin
         spans = {loop.index: loop for loop in loops}
         if any(loop.end.at(sizes) <= loop.first.at(sizes) for loop in loops):
             continue  # empty loop
-        for k, place in enumerate(access.places):
-            if place.table:
-                _check_span(f"{place}", _span(spans[place.index], sizes), rows[place.table], 0, sizes)
-            span = _index_range(place, spans, sizes, tables, access.array.axes[k].at(sizes))
+        for k, subscript in enumerate(access.places):
+            if subscript.table:
+                _check_span(f"{subscript}", _span(spans[subscript.index], sizes), rows[subscript.table], 0, sizes)
+            span = _index_range(subscript, spans, sizes, tables, access.array.axes[k].at(sizes))
             _check_span(f"{access}", span, access.array, k, sizes)
 
 
 def table_limits(interface: Interface, sizes: Mapping[str, int]) -> list[tuple[str, list[int]]]:
     """Return for each table and column the length of the shortest axis that its entries index."""
-    found = {table.name: [2**31] * table.axes[1].number for table in interface.layout.tables}
+    limits_of = {table.name: [2**31] * table.axes[1].number for table in interface.layout.tables}
     for access, _ in interface.layout.accesses:
-        for axis, place in zip(access.array.axes, access.places, strict=True):
-            if place.table:
-                limits = found[place.table]
-                limits[place.column] = min(limits[place.column], axis.at(sizes))
-    return list(found.items())
+        for axis, subscript in zip(access.array.axes, access.places, strict=True):
+            if subscript.table:
+                limits = limits_of[subscript.table]
+                limits[subscript.column] = min(limits[subscript.column], axis.at(sizes))
+    return list(limits_of.items())
 
 
 def _index_range(
-    place: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, IndexTable], length: int
+    subscript: Place, spans: Mapping[str, Loop], sizes: Mapping[str, int], tables: Mapping[str, IndexTable], length: int
 ) -> tuple[int, int]:
     """Return the smallest and the largest index on an axis of a given length."""
-    if place.table:
-        column = tables[place.table][:, place.column]
+    if subscript.table:
+        column = tables[subscript.table][:, subscript.column]
         return int(column.min()), int(column.max())
-    if not place.index:
-        return (place.base.at(sizes),) * 2
-    loop, offset = spans[place.index], place.base.number
+    if not subscript.index:
+        return (subscript.base.at(sizes),) * 2
+    loop, offset = spans[subscript.index], subscript.base.number
     if loop.periodic and abs(offset) <= length:
         return 0, loop.end.at(sizes) - 1
     first, last = _span(loop, sizes)
@@ -221,8 +221,8 @@ def _of_axes(array: Array, values: Numbers, what: str) -> Numbers:
 
 def _check_finite(values: Numbers, what: str) -> None:
     if not np.all(np.isfinite(values)):
-        place = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
-        raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in place]}")
+        index = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0]
+        raise StateError(f"{what} must be finite, but is not at the index {[int(k) for k in index]}")
 
 
 def _check_named(argument: Mapping[str, object], names: Sequence[str], what: str, *, whole: bool) -> None:

@@ -69,10 +69,10 @@ def constraint_memory(binding: Binding, run: Any, problem: Any, n: int) -> dict[
     count, entries = run.constraints, run.entries
     if not 0 <= count <= entries < 2**31:
         raise StateError(f"invalid constraints ({count} with {entries} coordinates): check the bounds of their loops")
-    places = np.zeros(3 * (count + entries) + n + 3, dtype=np.int32)
-    run.places = binding.pointer(places)
+    indices = np.zeros(3 * (count + entries) + n + 3, dtype=np.int32)
+    run.places = binding.pointer(indices)
     run.pairs = binding.function("constraint_pairs")(run, problem)
     columns = np.zeros(run.pairs + 1, dtype=np.int32)
     run.columns = binding.pointer(columns)
     binding.function("constraint_pairs")(run, problem)
-    return {"places": places, "columns": columns, "held": aligned(11 * count + 2 * (entries + run.pairs))}
+    return {"places": indices, "columns": columns, "held": aligned(11 * count + 2 * (entries + run.pairs))}

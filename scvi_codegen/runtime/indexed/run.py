@@ -120,15 +120,15 @@ class IndexedRun(OneThread, RunTimeSizes):
         self._numbers["work"] = aligned(n * self._binding.constant("WORK"))
         self._find_masses()
         self._numbers["q"][:] = self._flat(state)
-        given, what = moving
-        if given is not None:
-            values = read_state(self.interface, given, what)
-            for name, array in values.items():
+        values, what = moving
+        if values is not None:
+            arrays = read_state(self.interface, values, what)
+            for name, array in arrays.items():
                 if array.shape != state[name].shape:
                     raise StateError(
                         f"{what}: '{name}' must have the shape of the positions, {state[name].shape}, not {array.shape}"
                     )
-            flat = self._flat(values)
+            flat = self._flat(arrays)
             self._numbers["p"][:] = flat if what == "momenta" else flat / self._numbers["inverse_mass"]
         self._run = self._binding.new("run *")
         self._run.t, self._run.h, self._run.threads = t, h, self.threads
@@ -140,8 +140,8 @@ class IndexedRun(OneThread, RunTimeSizes):
     def _find_masses(self) -> None:
         inverse = self._numbers["inverse_mass"]
         if self._binding.function("inverse_masses")(self.problem.struct, self._pointer("inverse_mass")):
-            place = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
-            what = f"coordinate {place} of {len(inverse)}"
+            index = int(np.argmin(np.where((inverse > 0) & np.isfinite(inverse), 1.0, -1.0)))
+            what = f"coordinate {index} of {len(inverse)}"
             raise StateError(f"{what} has no positive mass: add its kinetic energy to L, or check the parameters")
 
     @alone
@@ -269,20 +269,20 @@ class IndexedRun(OneThread, RunTimeSizes):
         return {} if self.interface.layout.momenta else self._arrays(self._numbers["inverse_mass"])
 
     def _arrays(self, flat: Numbers) -> dict[str, Numbers]:
-        found, start = {}, 0
+        arrays, start = {}, 0
         for array in self.interface.layout.coordinates:
             shape = array.shape(self.sizes)
             size = int(np.prod(shape))
-            found[array.name] = flat[start : start + size].reshape(shape).copy()
+            arrays[array.name] = flat[start : start + size].reshape(shape).copy()
             start += size
-        return found
+        return arrays
 
     @property
     def energies(self) -> tuple[float, float, float]:
         """Kinetic, potential and total energy in double-double arithmetic; 0, H, H for a Hamiltonian."""
-        found, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
-        self._binding.function("energies")(self.problem.struct, self.t, *pointers, self._binding.pointer(found))
-        return (float(found[0]), float(found[1]), float(found[2]))
+        values, pointers = np.zeros(3), map(self._pointer, ("q", "p", "inverse_mass"))
+        self._binding.function("energies")(self.problem.struct, self.t, *pointers, self._binding.pointer(values))
+        return (float(values[0]), float(values[1]), float(values[2]))
 
     @property
     def energy(self) -> float:
@@ -341,8 +341,8 @@ class IndexedRun(OneThread, RunTimeSizes):
         return saved_bytes(saved, self.problem.arrays, self.interface)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        given = (self.interface, self._binding, self.checkpoint(), self.options, self.plan, self.threads)
-        return type(self).restored, given
+        arguments = (self.interface, self._binding, self.checkpoint(), self.options, self.plan, self.threads)
+        return type(self).restored, arguments
 
     @classmethod
     def restored(
@@ -359,14 +359,14 @@ class IndexedRun(OneThread, RunTimeSizes):
         Raises:
             StateError: if the bytes are invalid or belong to another integrator or another kind of steps.
         """
-        found = read_saved(saved, interface, to_a_time=plan is not None)
+        memory = read_saved(saved, interface, to_a_time=plan is not None)
         with damage_as_state_error():
-            unset_inputs = tuple(name for name in interface.inputs if name in found["unset_inputs"].tolist())
-            problem = IndexedProblem(interface, binding, saved_arrays(found, interface), unset_inputs)
+            unset_inputs = tuple(name for name in interface.inputs if name in memory["unset_inputs"].tolist())
+            problem = IndexedProblem(interface, binding, saved_arrays(memory, interface), unset_inputs)
             shared_arguments: dict[str, Any] = {"plan": plan, "options": options, "threads": threads}
             run = cls(problem, problem.arrays.state, (None, ""), h=0.0, t=0.0, **shared_arguments)
-            restore_memory(run._run, run._numbers, found)
-            run.iterations = checked_count(found["iterations"].item(), "iterations", least=0)
+            restore_memory(run._run, run._numbers, memory)
+            run.iterations = checked_count(memory["iterations"].item(), "iterations", least=0)
         return run
 
     @alone

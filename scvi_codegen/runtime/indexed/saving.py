@@ -39,10 +39,10 @@ def saved_bytes(run: Mapping[str, Any], arrays: RunArrays, interface: Interface)
     saved: dict[str, Any] = {f"table {name}": array for name, array in arrays.places.items()}
     saved |= {f"field {name}": array for name, array in arrays.fields.items()}
     saved |= {"integrator": _integrator(interface), "parameters": arrays.numbers, **run}
-    found: dict[str, Any] = {name: np.asarray(array) for name, array in saved.items()}
+    arrays_saved: dict[str, Any] = {name: np.asarray(array) for name, array in saved.items()}
     file = io.BytesIO()
-    found[CHECKSUM] = _checksum(found)
-    np.savez(file, **found)
+    arrays_saved[CHECKSUM] = _checksum(arrays_saved)
+    np.savez(file, **arrays_saved)
     return file.getvalue()
 
 
@@ -55,26 +55,26 @@ def read_saved(saved: bytes, interface: Interface, *, to_a_time: bool) -> dict[s
     if not isinstance(saved, bytes):
         raise StateError(f"a saved run must be bytes, not {type(saved).__name__}")
     with damage_as_state_error():
-        found = dict(np.load(io.BytesIO(saved), allow_pickle=False))
-        if str(found["integrator"]) != _integrator(interface):
-            raise StateError(f"the saved run is one of '{found['integrator']}', not of '{_integrator(interface)}'")
-        if str(found.pop(CHECKSUM)) != _checksum(found):
+        arrays = dict(np.load(io.BytesIO(saved), allow_pickle=False))
+        if str(arrays["integrator"]) != _integrator(interface):
+            raise StateError(f"the saved run is one of '{arrays['integrator']}', not of '{_integrator(interface)}'")
+        if str(arrays.pop(CHECKSUM)) != _checksum(arrays):
             raise StateError("invalid saved run: the checksum differs. Save the run again")
-        if bool(found["to a time"]) == to_a_time:
-            return found
+        if bool(arrays["to a time"]) == to_a_time:
+            return arrays
     raise StateError(
         "the saved run has fixed steps: omit t_end" if to_a_time else "the saved run has adaptive steps: give t_end"
     )
 
 
-def saved_arrays(found: Mapping[str, NDArray[Any]], interface: Interface) -> RunArrays:
+def saved_arrays(arrays: Mapping[str, NDArray[Any]], interface: Interface) -> RunArrays:
     """Return the validated problem data of a saved run."""
-    numbers = dict(zip(interface.parameters, found["parameters"].tolist(), strict=True))
+    numbers = dict(zip(interface.parameters, arrays["parameters"].tolist(), strict=True))
     return read_arrays(
         interface,
-        {array.name: found[f"state {array.name}"] for array in interface.layout.coordinates},
-        numbers | {field.name: found[f"field {field.name}"] for field in interface.layout.fields},
-        {table.name: found[f"table {table.name}"] for table in interface.layout.tables},
+        {array.name: arrays[f"state {array.name}"] for array in interface.layout.coordinates},
+        numbers | {field.name: arrays[f"field {field.name}"] for field in interface.layout.fields},
+        {table.name: arrays[f"table {table.name}"] for table in interface.layout.tables},
     )
 
 
@@ -118,12 +118,12 @@ def _not_saved(reason: object) -> StateError:
 
 
 def _checksum(arrays: Mapping[str, NDArray[Any]]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
-        found.update(f"{name} {array.dtype.str} {array.shape} ".encode())
-        found.update(array.tobytes() if array.dtype.kind == "U" else array.data)
-    return found.hexdigest()
+        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        digest.update(array.tobytes() if array.dtype.kind == "U" else array.data)
+    return digest.hexdigest()
 
 
 def _integrator(interface: Interface) -> str:

@@ -144,12 +144,12 @@ class IndexedStepper(RunTimeSizes):
             consistent(run)
         return run
 
-    def _threads(self, given: int | None) -> int:
+    def _threads(self, threads: int | None) -> int:
         """Return the number of threads; systems with constraints use one."""
-        threads = checked_count(1 if given is None else given, "threads", least=1, most=MOST_THREADS)
-        if threads > 1 and self.interface.layout.constraints:
+        count = checked_count(1 if threads is None else threads, "threads", least=1, most=MOST_THREADS)
+        if count > 1 and self.interface.layout.constraints:
             raise MethodError("systems with constraints use one thread: omit threads")
-        return threads
+        return count
 
     def project(
         self,
@@ -344,23 +344,23 @@ def _plan(h: float | None, t_end: float | None, tolerance: float | None) -> Step
 
 def _with_warnings(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
     """Return the trajectory, after warnings about its step size, its energy and its error growth."""
-    found = record.trajectory()
-    check.warn(found)
-    warn_of_large_steps(found, remedy="")
+    trajectory = record.trajectory()
+    check.warn(trajectory)
+    warn_of_large_steps(trajectory, remedy="")
     if record.run.interface.conserves_energy:
-        _warn_of_energy_error(found)
-    return found
+        _warn_of_energy_error(trajectory)
+    return trajectory
 
 
-def _warn_of_energy_error(found: IndexedTrajectory) -> None:
+def _warn_of_energy_error(trajectory: IndexedTrajectory) -> None:
     """Warn of an energy error of adaptive runs, and of fixed-step runs without an error estimate.
 
     For a Hamiltonian the kinetic part, which sets the scale, is 0.
     """
-    (first, last), size = found.energies[[0, -1], 2], 2.0 * found.energies[[0, -1], 0].max()
-    if found.plan is not None:
+    (first, last), size = trajectory.energies[[0, -1], 2], 2.0 * trajectory.energies[[0, -1], 0].max()
+    if trajectory.plan is not None:
         warn_of_energies(first, last, size)
-    elif np.isnan(found.step_error):
+    elif np.isnan(trajectory.step_error):
         warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 

@@ -105,7 +105,7 @@ class IndexedTrajectory(Confirmed, RunTimeSizes):
             **{name: getattr(self, name)[rows] for name in ("t", "energies", "maps", "continuations")},
             q={name: each[rows] for name, each in self.q.items()},
             p={name: each[rows] for name, each in self.p.items()},
-            events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
+            events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
         )
 
     def at(self, t: ArrayLike) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
@@ -155,7 +155,7 @@ class IndexedTrajectory(Confirmed, RunTimeSizes):
         states = {f"{key}_{name}": values for key in "qp" for name, values in getattr(self, key).items()}
         observed = {} if self.observed is None else {"observed": self.observed}
         arrays = {"t": self.t, "energies": self.energies, "maps": self.maps, **states, **observed}
-        write_whole(path, lambda place: np.savez(place, h=self.h, **arrays))
+        write_whole(path, lambda temporary: np.savez(temporary, h=self.h, **arrays))
 
 
 class IndexedRecord:
@@ -250,13 +250,13 @@ class IndexedRecord:
             self.states.append((self.run.q, self.run.p))
             self.continuations.append(Continuation.of(self.run))
 
-    def _observed(self, given: ArrayLike) -> Numbers:
-        found, when = real_array(given, "the result of observe"), f"at t = {self.run.t:g}"
-        if self.observed and found.shape != self.observed[0].shape:
+    def _observed(self, value: ArrayLike) -> Numbers:
+        array, when = real_array(value, "the result of observe"), f"at t = {self.run.t:g}"
+        if self.observed and array.shape != self.observed[0].shape:
             raise StateError(
-                f"the result of observe must keep its shape: {found.shape} {when}, {self.observed[0].shape} before"
+                f"the result of observe must keep its shape: {array.shape} {when}, {self.observed[0].shape} before"
             )
-        return found
+        return array
 
     def trajectory(self) -> IndexedTrajectory:
         """Return the recorded trajectory."""

@@ -59,12 +59,12 @@ class DerivativesWithInputs:
         inputs and for h. Raises as :meth:`Trajectory.tangent`.
         """
         stepper = self._stepper
-        given = np.eye(2 * stepper.dimension) if directions is None else finite(directions, "directions")
-        tangents, found = self._initial_tangents(given), list[Array]()
+        columns = np.eye(2 * stepper.dimension) if directions is None else finite(directions, "directions")
+        tangents, parts = self._initial_tangents(columns), list[Array]()
         for piece in self.pieces:
             part, tangents = forward(piece, tangents)
-            found.append(part[1:] if found else part)
-        return np.concatenate(found).reshape(-1, 2 * stepper.dimension, *given.shape[1:])
+            parts.append(part[1:] if parts else part)
+        return np.concatenate(parts).reshape(-1, 2 * stepper.dimension, *columns.shape[1:])
 
     def pullback(self, cotangents: ArrayLike) -> GradientWithInputs:
         """Return the gradient of a function of the states with respect to the initial data and the inputs.
@@ -79,8 +79,8 @@ class DerivativesWithInputs:
         derivatives = checked_cotangents(self._stepper, self._end_indices[-1] + 1, cotangents)
         seeds = seeds_of(self._stepper, derivatives)
         now, by_pieces = np.zeros_like(seeds[0]), []
-        for piece, own in self._back(seeds):
-            by_pieces.append(backward(piece, own, self._without_inputs(now)))
+        for piece, piece_seeds in self._back(seeds):
+            by_pieces.append(backward(piece, piece_seeds, self._without_inputs(now)))
             now = by_pieces[-1]
         return self._gradient(by_pieces[::-1], derivatives.shape[2:])
 
@@ -95,16 +95,16 @@ class DerivativesWithInputs:
             curvatures: (n, 2m, 2m) Hessian of the function with respect to (q, p) of each state.
         """
         derivatives, hessian_blocks = checked_function(self._stepper, self._end_indices[-1] + 1, cotangents, curvatures)
-        given = finite(directions, "directions")
-        at_starts = [self._initial_tangents(given)]
+        columns = finite(directions, "directions")
+        at_starts = [self._initial_tangents(columns)]
         for piece in self.pieces[:-1]:
             at_starts.append(forward(piece, at_starts[-1])[1])
         now, by_pieces = np.zeros((2, *at_starts[0].shape)), []
         backward_pieces = zip(self._back(derivatives), self._back(hessian_blocks), reversed(at_starts), strict=True)
-        for (piece, own), (_, curved), tangents in backward_pieces:
-            now = second_order_adjoints(piece, own, curved, tangents, self._without_inputs(now))
+        for (piece, piece_seeds), (_, curved), tangents in backward_pieces:
+            now = second_order_adjoints(piece, piece_seeds, curved, tangents, self._without_inputs(now))
             by_pieces.append(now[1])
-        return self._gradient(by_pieces[::-1], given.shape[1:])
+        return self._gradient(by_pieces[::-1], columns.shape[1:])
 
     @property
     def _stepper(self) -> LinearisedMethod:
@@ -129,13 +129,13 @@ class DerivativesWithInputs:
 
     def _back(self, along: Array) -> list[tuple[SavedStates, Array]]:
         """Return the pieces in reverse with the rows of their states; a shared state belongs to the earlier piece."""
-        found: list[tuple[SavedStates, Array]] = []
+        result: list[tuple[SavedStates, Array]] = []
         for piece, (first, last) in zip(self.pieces, pairwise(self._end_indices), strict=True):
-            own = along[first : last + 1].copy()
-            if found:
-                own[0] = 0.0
-            found.append((piece, own))
-        return found[::-1]
+            piece_seeds = along[first : last + 1].copy()
+            if result:
+                piece_seeds[0] = 0.0
+            result.append((piece, piece_seeds))
+        return result[::-1]
 
     def _without_inputs(self, derivatives: Array) -> Array:
         """Return adjoints without those of inputs and h, which differ in the previous piece."""
@@ -146,9 +146,9 @@ class DerivativesWithInputs:
     def _gradient(self, by_pieces: Sequence[Array], shape: tuple[int, ...]) -> GradientWithInputs:
         """Construct from (k, variables) adjoints at the start of each piece."""
         stepper, m = self._stepper, self._stepper.dimension
-        found = by_pieces[0].T.copy()
-        found[self._input_indices] = np.nan
-        found = found.reshape(stepper._input_size, *shape)
+        gradient = by_pieces[0].T.copy()
+        gradient[self._input_indices] = np.nan
+        gradient = gradient.reshape(stepper._input_size, *shape)
         inputs = {}
         for name in stepper.interface.inputs:
             first = stepper.parameters.index(f"{name}_0")
@@ -159,5 +159,10 @@ class DerivativesWithInputs:
             )
             inputs[name] = np.add.reduceat(rows, starts).reshape(len(starts), COEFFICIENTS, *shape)
         return GradientWithInputs(
-            q=found[:m], p=found[m : 2 * m], parameters=found[2 * m : -2], t=found[-2], h=None, inputs=inputs
+            q=gradient[:m],
+            p=gradient[m : 2 * m],
+            parameters=gradient[2 * m : -2],
+            t=gradient[-2],
+            h=None,
+            inputs=inputs,
         )

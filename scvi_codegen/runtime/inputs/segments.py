@@ -68,8 +68,8 @@ class Input:
     def parameters(self, t: float, part: slice = ALL) -> Array:
         """Return the (5,) parameters of the piece that contains t, or (k, 5) for the trajectories ``part``."""
         piece = int(self.breakpoints.searchsorted(t, side="right")) - 1
-        found: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
-        return found[part] if found.ndim == 2 else found
+        coefficients: Array = self.pieces[min(max(piece, 0), len(self.pieces) - 1)]
+        return coefficients[part] if coefficients.ndim == 2 else coefficients
 
 
 def checked_inputs(
@@ -205,8 +205,8 @@ def record_pieces(
     report = None if progress is None else lambda _: progress(run.steps - first)
     for steps in prepared_segments(run, inputs, t_end, values):
         piece = run.record(steps, save_every=save_every, progress=report)
-        run._crossed = tuple(n + len(found) for n, found in zip(run._crossed, piece.events, strict=True))
-        terminal = [int(found.event.terminal) for found in piece.events]
+        run._crossed = tuple(n + len(crossings) for n, crossings in zip(run._crossed, piece.events, strict=True))
+        terminal = [int(crossings.event.terminal) for crossings in piece.events]
         ended = any(0 < last <= count for last, count in zip(terminal, run._crossed, strict=True))
         pieces.append(piece if ended else with_final_state(piece, run))
         if ended:
@@ -271,18 +271,18 @@ class Segment(NamedTuple):
 
 def planned_segments(t: float, t_end: float, h: float, inputs: Mapping[str, Input]) -> list[Segment]:
     """Return the segments from t to t_end: steps of h, and a shorter one before each breakpoint and the end."""
-    forward, now, found = np.sign(t_end - t), (t, 0.0), []
+    forward, now, segments = np.sign(t_end - t), (t, 0.0), []
     negligible = NEGLIGIBLE_STEP * min(abs(h), abs(t_end - t))
     for end in breakpoints_until(t, t_end, inputs):
         middle = now[0] + 0.5 * (end - now[0])
         if whole := int(np.floor(((end - now[0]) - now[1]) / h + NEGLIGIBLE_STEP)):
-            found.append(Segment(whole, h, now, middle))
+            segments.append(Segment(whole, h, now, middle))
             now = time_after_steps(now, h, whole)
         rest = (end - now[0]) - now[1]
         if forward * rest > negligible:
-            found.append(Segment(1, rest, now, middle))
+            segments.append(Segment(1, rest, now, middle))
             now = time_after_steps(now, rest, 1)
-    return found
+    return segments
 
 
 def time_after_steps(now: tuple[float, float], h: float, steps: int) -> tuple[float, float]:

@@ -154,16 +154,16 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
 
     def momentum_errors(self) -> Array:
         """Return (n, k) changes of the momentum maps since the first state, relative to their largest term."""
-        found = [
+        errors = [
             self.stepper._momentum_maps_and_sizes(piece.q, piece.p, piece.t, piece.parameters) for piece in self.pieces
         ]
-        values, sizes = (_concatenated(part) for part in zip(*found, strict=True))
+        values, sizes = (_concatenated(part) for part in zip(*errors, strict=True))
         return relative_changes(values, sizes)
 
     def constraint_values(self) -> tuple[Array, Array]:
         """Return (n, c) constraint residuals and (n, c) rates at the states."""
-        found = zip(*(piece.constraint_values() for piece in self.pieces), strict=True)
-        g, rate = (_concatenated(part) for part in found)
+        values = zip(*(piece.constraint_values() for piece in self.pieces), strict=True)
+        g, rate = (_concatenated(part) for part in values)
         return g, rate
 
     def multipliers(self) -> Array:
@@ -200,15 +200,15 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
 
     def states(self, units: Mapping[str, str] | None = None) -> States:
         """Return the states for :mod:`scvi_codegen.files.export`; the parameters of inputs are omitted."""
-        own = {self.stepper.parameters[k] for k in columns_of_inputs(self.stepper.interface)}
-        found = [quantities(self.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
-        joined_quantities = {name: _concatenated([each[name] for each in found]) for name in found[0]}
+        input_parameters = {self.stepper.parameters[k] for k in columns_of_inputs(self.stepper.interface)}
+        by_piece = [quantities(self.stepper, piece.parameters, piece.t, piece.q, piece.p) for piece in self.pieces]
+        joined_quantities = {name: _concatenated([each[name] for each in by_piece]) for name in by_piece[0]}
         common, piece = self.pieces[0].states(units), (self.t, self.q, self.p, self.iterations)
         return replace(
             common,
             count=len(self),
             pieces=lambda: iter([piece]),
-            parameters={name: value for name, value in common.parameters.items() if name not in own},
+            parameters={name: value for name, value in common.parameters.items() if name not in input_parameters},
             quantities=lambda *_: joined_quantities,
         )
 
@@ -229,10 +229,10 @@ class DrivenTrajectory(DerivativesWithInputs, Confirmed):
         return _concatenated([part(piece) for piece in self.pieces])
 
     def _summed(self, part: Callable[[Trajectory], Array]) -> Array:
-        found = [part(piece) for piece in self.pieces]
-        for before, after in pairwise(found):
+        parts = [part(piece) for piece in self.pieces]
+        for before, after in pairwise(parts):
             after += before[-1]
-        return _concatenated(found)
+        return _concatenated(parts)
 
 
 def _concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
@@ -241,7 +241,7 @@ def _concatenated(parts: Sequence[NDArray[Number]]) -> NDArray[Number]:
     return np.concatenate([first, *(other[1:] for other in others)])
 
 
-def _joined_crossings(found: Sequence[Crossings]) -> Crossings:
+def _joined_crossings(crossings: Sequence[Crossings]) -> Crossings:
     """Concatenate the crossings of one event over all pieces."""
-    t, q, p = (np.concatenate([getattr(each, name) for each in found]) for name in ("t", "q", "p"))
-    return Crossings(event=found[0].event, t=t, q=q, p=p)
+    t, q, p = (np.concatenate([getattr(each, name) for each in crossings]) for name in ("t", "q", "p"))
+    return Crossings(event=crossings[0].event, t=t, q=q, p=p)

@@ -185,20 +185,20 @@ class _OrbitSearch:
 
     def orbit(self, guess: Array) -> PeriodicOrbit:
         """Return the orbit near a guess."""
-        z, found, iterations = self._iterated(*self._by_segments(guess))
-        m, motion = self.stepper.dimension, found.motion
+        z, equations, iterations = self._iterated(*self._by_segments(guess))
+        m, motion = self.stepper.dimension, equations.motion
         size = float(np.abs([z[:-1], guess[:-1]]).max())
         allowed = CLOSED * max(1.0, float(np.linalg.norm(motion.monodromy, 2)))
-        if not found.error <= allowed * size:
+        if not equations.error <= allowed * size:
             raise OrbitError(
                 f"no periodic orbit was found near the guess: after {iterations} iterations the closing error is "
-                f"{found.error:.1e}. Give a better initial guess, or more steps"
+                f"{equations.error:.1e}. Give a better initial guess, or more steps"
             )
-        self._check_energy(found, allowed * size)
+        self._check_energy(equations, allowed * size)
         if np.linalg.norm(motion.by_period) * z[-1] <= EQUILIBRIUM_MOTION * size:
             raise OrbitError("the iteration converged to an equilibrium: give a better initial guess")
         if motion.by_time.any():
-            self._check_repeats(z, found, allowed * size)
+            self._check_repeats(z, equations, allowed * size)
         return PeriodicOrbit(
             q=z[:m],
             p=z[m:-1],
@@ -206,7 +206,7 @@ class _OrbitSearch:
             period=float(z[-1]),
             steps=self.steps,
             monodromy=motion.monodromy,
-            residual=found.error,
+            residual=equations.error,
             iterations=iterations,
             parameters=self.parameters,
             stepper=self.stepper,
@@ -239,22 +239,24 @@ class _OrbitSearch:
         """Return the (count + 1,) numbers of the steps at which segments begin and end."""
         return np.linspace(0, self.steps, count + 1).round().astype(np.intp)
 
-    def _iterated(self, z: Array, found: _ClosingEquations, iterations: int) -> tuple[Array, _ClosingEquations, int]:
+    def _iterated(
+        self, z: Array, equations: _ClosingEquations, iterations: int
+    ) -> tuple[Array, _ClosingEquations, int]:
         """Iterate until no step helps; return the unknowns, their equations, and the number of all iterations."""
-        while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, found)) is not None:
-            (z, found), iterations = nearer, iterations + 1
-        return z, found, iterations
+        while iterations < MOST_ITERATIONS and (nearer := self._newton_iterate(z, equations)) is not None:
+            (z, equations), iterations = nearer, iterations + 1
+        return z, equations, iterations
 
-    def _check_energy(self, found: _ClosingEquations, allowed: float) -> None:
+    def _check_energy(self, equations: _ClosingEquations, allowed: float) -> None:
         """Raise :class:`OrbitError` if a closed orbit has another energy; ``allowed`` is the error of its state."""
-        away, partials = float(found.defects[-1]), found.partials[-1]
+        away, partials = float(equations.defects[-1]), equations.partials[-1]
         if self.energy is not None and not abs(away) <= allowed * max(1.0, float(np.linalg.norm(partials))):
             raise OrbitError(
                 f"the periodic orbit near the guess has the energy {self.energy + away:.10g}, not {self.energy:.10g}: "
                 "fix fewer entries of the state, or give a better initial guess"
             )
 
-    def _check_repeats(self, z: Array, found: _ClosingEquations, allowed: float) -> None:
+    def _check_repeats(self, z: Array, equations: _ClosingEquations, allowed: float) -> None:
         """Raise an error unless the system is periodic in time: the orbit must also close in the next period."""
         period = float(z[-1])
         if -1 not in self.fixed_indices:
@@ -263,23 +265,23 @@ class _OrbitSearch:
                 "with fixed_period=True"
             )
         later = replace(self, t=self.t + period)._closing(z)
-        away = max(float(np.abs(later.motion.states[-1] - found.motion.states[-1]).max()), later.error)
+        away = max(float(np.abs(later.motion.states[-1] - equations.motion.states[-1]).max()), later.error)
         if not away <= allowed:
             raise OrbitError(
                 f"the orbit from t = {self.t:g} does not close in the next period (error {away:.1e}): "
                 f"'{self.stepper.interface.system}' is not periodic in time with the period {period:.10g}"
             )
 
-    def _newton_iterate(self, z: Array, found: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
+    def _newton_iterate(self, z: Array, equations: _ClosingEquations) -> tuple[Array, _ClosingEquations] | None:
         """Return the damped Newton iterate, or ``None`` if no step length succeeds or the step is negligible.
 
         A step length is accepted if the simplified Newton correction with the same Jacobian decreases (Deuflhard's
         natural monotonicity test), which is independent of the unstable direction that dominates the residuals.
         """
         free = np.delete(np.arange(len(z)), self.fixed_indices)
-        inverse = np.zeros((len(z), len(found.defects)))
-        inverse[free] = np.linalg.pinv(found.partials[:, free], NULL_SINGULAR_VALUE)
-        change = inverse @ found.defects
+        inverse = np.zeros((len(z), len(equations.defects)))
+        inverse[free] = np.linalg.pinv(equations.partials[:, free], NULL_SINGULAR_VALUE)
+        change = inverse @ equations.defects
         if np.linalg.norm(change) <= SETTLED * np.linalg.norm(z):
             return None
         for shortened in 0.5 ** np.arange(MOST_HALVINGS):
@@ -289,7 +291,7 @@ class _OrbitSearch:
             with suppress(StepFailedError):
                 at = self._closing(trial)
                 less = np.linalg.norm(inverse @ at.defects) < (1.0 - shortened / 4.0) * np.linalg.norm(change)
-                if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(found.defects):
+                if less and np.linalg.norm(at.defects) < MOST_INCREASE * np.linalg.norm(equations.defects):
                     return trial, at
         return None
 

@@ -139,13 +139,13 @@ def warn_of_energy_errors(ensemble: EnsembleEnergyData) -> None:
     plans, stepper = ensemble.plans, ensemble.stepper
     if not plans or not stepper.interface.conserves_energy or not _warnings_enabled.get():
         return
-    found = {}
+    by_trajectory = {}
     for j, (t, q, p, _, _) in islice(enumerate(ensemble.each()), 0, None, -(-len(plans) // MOST_CHECKED)):
         if len(t) and (energies := _changed_energies(stepper, t, q, p, ensemble.parameters[j])):
-            found[j] = energies
-    worst = max(found, key=lambda j: relative_energy_change(*found[j]), default=None)
+            by_trajectory[j] = energies
+    worst = max(by_trajectory, key=lambda j: relative_energy_change(*by_trajectory[j]), default=None)
     if worst is not None:
-        warn_of_energies(*found[worst], where=f" of trajectory {worst}")
+        warn_of_energies(*by_trajectory[worst], where=f" of trajectory {worst}")
 
 
 def warn_of_energies(

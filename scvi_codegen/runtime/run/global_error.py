@@ -210,10 +210,10 @@ def confirmed_run(
     with without_accuracy_warnings():
         while True:
             last, runs = tolerance < LEAST, runs + 1
-            found, tolerance, others = _accurate(tight, tolerance, last=last)
+            trajectory, tolerance, others = _accurate(tight, tolerance, last=last)
             result = None
-            for number, each in enumerate(others if found is not None else ()):
-                compared = _compared(partial(other, each, number), found, start)
+            for number, each in enumerate(others if trajectory is not None else ()):
+                compared = _compared(partial(other, each, number), trajectory, start)
                 result, runs = _estimated(wanted, tolerance, compared, result, start, runs + 1), runs + 1
                 if not (result.confirmed or last):
                     break
@@ -228,7 +228,7 @@ def confirmed_run(
             f"the last place differ by up to about {result.estimate:.1e}. End the run there, or give a larger error",
             AccuracyWarning,
         )
-    return cast(Result, replace(cast(Any, found), confirmation=result))
+    return cast(Result, replace(cast(Any, trajectory), confirmation=result))
 
 
 def _accurate(
@@ -246,12 +246,12 @@ def _accurate(
         return (run(0.0), 0.0, RELAXED) if last else (None, tolerance, ())
 
 
-def _compared(run: Callable[[float], Any], found: Any, start: float) -> tuple[Array, Array]:
+def _compared(run: Callable[[float], Any], trajectory: Any, start: float) -> tuple[Array, Array]:
     """Return times, and the relative differences of the returned run and another one that ends at the last time."""
-    q, p = _rows(found.q), _rows(found.p)
+    q, p = _rows(trajectory.q), _rows(trajectory.p)
     most = max(2, min(MOST_SAMPLES, MOST_NUMBERS // q.shape[1]))
-    chosen = np.unique(np.linspace(0, len(found.t) - 1, most).astype(int))
-    t, q, p = found.t[chosen], q[chosen], p[chosen]
+    chosen = np.unique(np.linspace(0, len(trajectory.t) - 1, most).astype(int))
+    t, q, p = trajectory.t[chosen], q[chosen], p[chosen]
     end = float(t[-1])
     if end == start:
         return t, np.zeros(len(t))

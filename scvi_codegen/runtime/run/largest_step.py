@@ -85,17 +85,17 @@ class _Pilot(NamedTuple):
 
 def _longest(pilot: Callable[[float], _Pilot], h: float, allowed: float) -> float:
     """Bracket the step by doubling or halving, then refine it geometrically."""
-    found = pilot(h)
+    trial = pilot(h)
     for _ in range(MOST_HALVINGS):
-        if found.error <= allowed and found.steps <= 1:
+        if trial.error <= allowed and trial.steps <= 1:
             return h
-        if found.error <= allowed:
+        if trial.error <= allowed:
             longer = pilot(2.0 * h)
             if longer.error > allowed:
                 break
-            h, found = 2.0 * h, longer
+            h, trial = 2.0 * h, longer
         else:
-            h, found = h / 2.0, pilot(h / 2.0)
+            h, trial = h / 2.0, pilot(h / 2.0)
     else:
         raise StateError(
             f"no step of tau has an error below {allowed:.1e}: use another time transformation or a larger tolerance"

@@ -97,10 +97,10 @@ class Observation:
         except StepFailedError as failure:
             failure.trajectory = self.trajectory()
             raise
-        found = self.trajectory()
+        trajectory = self.trajectory()
         if self.times is None and not self.ended:
-            run.iterations = self.iterations - int(found.iterations.sum())
-        return found
+            run.iterations = self.iterations - int(trajectory.iterations.sum())
+        return trajectory
 
     def _advance_chunk(self, size: int) -> None:
         """Advance by one chunk, search it for events and save it; a failure after a terminal event is ignored."""
@@ -124,7 +124,7 @@ class Observation:
     def _ended(self, part: Trajectory) -> Trajectory:
         """Return the chunk with the state of the terminal event appended."""
         assert self.search is not None
-        last = self.search.found[-1][-1]
+        last = self.search.recorded[-1][-1]
         _, _, tau = self._state_within_step(part, float(last["t"]))
         return self._with_state(part, part.step_sizes, last["t"], last["q"], last["p"], tau)
 

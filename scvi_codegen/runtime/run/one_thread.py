@@ -48,12 +48,12 @@ def alone(method: Called) -> Called:
     """Decorate a method to lock its run; the method raises as :meth:`OneThread.alone`."""
 
     @functools.wraps(method)
-    def locked(self: Any, *given: Any, **named: Any) -> Any:
+    def locked(self: Any, *arguments: Any, **keywords: Any) -> Any:
         lock = self._lock
         if not lock.acquire(False):
             raise in_use()
         try:
-            return method(self, *given, **named)
+            return method(self, *arguments, **keywords)
         finally:
             lock.release()
 

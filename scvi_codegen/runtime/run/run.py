@@ -35,8 +35,8 @@ class Run(Memory):
     def _reused(cls, stepper: Integrator) -> Self:
         """Return a released run of the stepper, to be started, or a new one if all are in use."""
         try:
-            found: Self = stepper._released_runs.pop()
-            return found
+            run: Self = stepper._released_runs.pop()
+            return run
         except IndexError:
             pass
         return cls(stepper)

@@ -95,11 +95,11 @@ def record(
     except StepFailedError as failure:
         failure.trajectory = recorder.trajectory()
         raise
-    found = recorder.trajectory()
-    if found.tau is not None:
-        memory.longest = float(np.abs(np.diff(found.t)).max(initial=memory.longest))
-        check_energy_surface(found, memory.longest)
-    return found
+    trajectory = recorder.trajectory()
+    if trajectory.tau is not None:
+        memory.longest = float(np.abs(np.diff(trajectory.t)).max(initial=memory.longest))
+        check_energy_surface(trajectory, memory.longest)
+    return trajectory
 
 
 class _StateRecorder:

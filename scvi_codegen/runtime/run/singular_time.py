@@ -60,15 +60,15 @@ def check_energy_surface(states: Trajectory, longest: float) -> None:
     if not len(short):
         return
     stepper = states.stepper
-    level = states.parameters[stepper.parameters.index(stepper.interface.energy_parameter)]
-    given = states.q[short], states.p[short], states.t[short], states.parameters
-    moving = np.abs((states.p[short] * stepper.velocity(*given)).sum(axis=1))
-    energies = stepper.energy(*given)
-    wrong = np.flatnonzero(~(np.abs(energies - level) <= ENERGY_ERROR * (abs(level) + moving)))
+    energy = states.parameters[stepper.parameters.index(stepper.interface.energy_parameter)]
+    arguments = states.q[short], states.p[short], states.t[short], states.parameters
+    moving = np.abs((states.p[short] * stepper.velocity(*arguments)).sum(axis=1))
+    energies = stepper.energy(*arguments)
+    wrong = np.flatnonzero(~(np.abs(energies - energy) <= ENERGY_ERROR * (abs(energy) + moving)))
     if not len(wrong):
         return
     first = int(wrong[0])
-    evidence = f"the energy there is {energies[first]:g}, not {level:g}"
+    evidence = f"the energy there is {energies[first]:g}, not {energy:g}"
     failure = _singular_time_error(
         stepper, float(states.t[short][first]), states.steps - len(states) + 1 + int(short[first]), evidence
     )

@@ -76,9 +76,9 @@ def tangent_vectors(states: SavedStates, directions: ArrayLike | None) -> Array:
         StateError: if the directions have another shape, or the states are not at whole steps.
     """
     size = 2 * states.stepper.dimension
-    given = np.eye(size) if directions is None else finite(directions, "directions")
-    found, _ = forward(states, tangents_from_directions(states.stepper, given))
-    return found[:, :size].reshape(len(states), size, *given.shape[1:])
+    columns = np.eye(size) if directions is None else finite(directions, "directions")
+    vectors, _ = forward(states, tangents_from_directions(states.stepper, columns))
+    return vectors[:, :size].reshape(len(states), size, *columns.shape[1:])
 
 
 def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Array:
@@ -87,13 +87,13 @@ def tangents_from_directions(stepper: LinearisedMethod, directions: Array) -> Ar
     Raises:
         StateError: if the directions have another shape.
     """
-    size, given = 2 * stepper.dimension, stepper._input_size
-    if directions.ndim not in (1, 2) or len(directions) not in (size, given):
+    size, input_size = 2 * stepper.dimension, stepper._input_size
+    if directions.ndim not in (1, 2) or len(directions) not in (size, input_size):
         raise StateError(
-            f"directions must have shape ({size},) or ({size}, k), of (q, p), or ({given},) or ({given}, k), of (q, p, "
-            f"parameters, t, h), not {directions.shape}"
+            f"directions must have shape ({size},) or ({size}, k), of (q, p), or ({input_size},) or ({input_size}, k), "
+            f"of (q, p, parameters, t, h), not {directions.shape}"
         )
-    tangents = np.zeros((directions[0].size, given))
+    tangents = np.zeros((directions[0].size, input_size))
     tangents[:, : len(directions)] = directions.reshape(len(directions), -1).T
     return tangents
 
@@ -108,8 +108,8 @@ def vector_jacobian_product(states: SavedStates, cotangents: ArrayLike) -> Gradi
     """Return the vector-Jacobian product of the run with (n, 2m) or (n, 2m, c) cotangents of the states."""
     derivatives = checked_cotangents(states.stepper, len(states), cotangents)
     seeds = seeds_of(states.stepper, derivatives)
-    found = backward(states, seeds, np.zeros_like(seeds[0]))
-    return gradient_of(states, found.T.reshape(states.stepper._input_size, *derivatives.shape[2:]))
+    result = backward(states, seeds, np.zeros_like(seeds[0]))
+    return gradient_of(states, result.T.reshape(states.stepper._input_size, *derivatives.shape[2:]))
 
 
 def seeds_of(stepper: LinearisedMethod, derivatives: Array) -> Array:
@@ -152,21 +152,21 @@ def checked_cotangents(stepper: LinearisedMethod, count: int, cotangents: ArrayL
     return derivatives
 
 
-def gradient_of(states: SavedStates, found: Array) -> Gradient:
+def gradient_of(states: SavedStates, columns: Array) -> Gradient:
     """Construct from (variables, ..) derivatives."""
     m = states.stepper.dimension
     return Gradient(
-        q=found[:m],
-        p=found[m : 2 * m],
-        parameters=found[2 * m : -2],
-        t=found[-2],
-        h=found[-1] if _has_fixed_step_size(states) else None,
+        q=columns[:m],
+        p=columns[m : 2 * m],
+        parameters=columns[2 * m : -2],
+        t=columns[-2],
+        h=columns[-1] if _has_fixed_step_size(states) else None,
     )
 
 
-def finite(given: ArrayLike, name: str) -> Array:
+def finite(values: ArrayLike, name: str) -> Array:
     """Return a validated array of finite numbers."""
-    array = real_array(given, name)
+    array = real_array(values, name)
     if not np.isfinite(array).all():
         raise StateError(f"{name} must be finite")
     return array
@@ -176,17 +176,17 @@ def forward(states: SavedStates, tangents: Array) -> tuple[Array, Array]:
     """Return (n, outputs, count) tangent vectors at the states and (count, variables) at the end of the run."""
     time, outputs = time_of(states), states.stepper._output_indices
     states, now = time.states, time.initial_tangents(tangents)
-    found = np.empty((len(states), len(outputs), len(now)))
-    found[0] = now[:, outputs].T
+    result = np.empty((len(states), len(outputs), len(now)))
+    result[0] = now[:, outputs].T
     for first, last in pieces(states):
         starts, numbers = starts_of(states, first, last)
         vectors = np.zeros((len(numbers), *now.shape))
         vectors[0] = now
         propagate(states, starts, numbers, vectors, back=False)
         saved = np.flatnonzero(numbers[1:] > 0) + 1
-        found[numbers[saved]] = vectors[saved][:, :, outputs].transpose(0, 2, 1)
+        result[numbers[saved]] = vectors[saved][:, :, outputs].transpose(0, 2, 1)
         now = vectors[-1]
-    return time.final_tangents(found, now, tangents)
+    return time.final_tangents(result, now, tangents)
 
 
 def propagate(states: SavedStates, starts: Starts, numbers: NDArray[np.intp], vectors: Array, *, back: bool) -> None:

@@ -37,11 +37,11 @@ def hessian_product(
         curvatures: (n, 2m, 2m) F'' at each state.
     """
     derivatives, hessian_blocks = checked_function(states.stepper, len(states), cotangents, curvatures)
-    given = finite(directions, "directions")
+    columns = finite(directions, "directions")
     states.stepper._second_derivatives  # noqa: B018  (raises MethodError if unavailable)
-    tangents = tangents_from_directions(states.stepper, given)
-    found = second_order_adjoints(states, derivatives, hessian_blocks, tangents, np.zeros((2, *tangents.shape)))
-    return gradient_of(states, found[1].T.reshape(states.stepper._input_size, *given.shape[1:]))
+    tangents = tangents_from_directions(states.stepper, columns)
+    adjoints = second_order_adjoints(states, derivatives, hessian_blocks, tangents, np.zeros((2, *tangents.shape)))
+    return gradient_of(states, adjoints[1].T.reshape(states.stepper._input_size, *columns.shape[1:]))
 
 
 def checked_function(
@@ -89,14 +89,14 @@ def second_order_adjoints(
 
 def _tangents_at_starts(states: SavedStates, between: list[tuple[int, int]], tangents: Array) -> list[Array]:
     """Return the tangent vectors at the start of each segment."""
-    found = [tangents]
+    tangents_at = [tangents]
     for first, last in between[:-1]:
         starts, numbers = starts_of(states, first, last)
         moved = np.zeros((len(numbers), *tangents.shape))
-        moved[0] = found[-1]
+        moved[0] = tangents_at[-1]
         propagate(states, starts, numbers, moved, back=False)
-        found.append(moved[-1])
-    return found if between else []
+        tangents_at.append(moved[-1])
+    return tangents_at if between else []
 
 
 def _seeds(derivatives: Array, hessian_blocks: Array, moved: Array) -> Array:

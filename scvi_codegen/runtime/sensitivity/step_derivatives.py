@@ -139,16 +139,18 @@ class LinearisedMethod(CompiledMethod):
         Raises:
             StateError: if the gradient is undefined.
         """
-        found, name = np.zeros(self._input_size), self.interface.energy_parameter
+        gradient, name = np.zeros(self._input_size), self.interface.energy_parameter
         if not name:
-            return found
+            return gradient
         others = dict(zip(self.parameters, parameters.tolist(), strict=True))
         del others[name]
         binding, values = self.tangent, self._parameters_at(q, p, others)
-        status = binding.function("energy_gradient")(*map(binding.pointer, (q, p, values, found)), binding.workspace())
+        status = binding.function("energy_gradient")(
+            *map(binding.pointer, (q, p, values, gradient)), binding.workspace()
+        )
         if status:
             raise StateError(f"the energy gradient at q = {q}, p = {p} cannot be computed: {REASONS[status]}")
-        return found
+        return gradient
 
     def jacobian(
         self,
@@ -186,8 +188,8 @@ class LinearisedMethod(CompiledMethod):
         Raises as :meth:`jacobian`. Inputs are parameters, five each. If constraints depend on parameters, the initial
         state is not projected again. In transformed time ``times`` contains the derivatives of t1.
         """
-        found = self._products(q, p, h, t, parameters, options, np.eye(self._input_size))
-        return Sensitivity.of(found[:, self._output_indices].T.copy(), self.dimension)
+        products = self._products(q, p, h, t, parameters, options, np.eye(self._input_size))
+        return Sensitivity.of(products[:, self._output_indices].T.copy(), self.dimension)
 
     def jvp(
         self,
@@ -210,8 +212,8 @@ class LinearisedMethod(CompiledMethod):
             Variations of (q1, p1), of the shape of ``tangents``.
         """
         seeds = self._seeds(tangents, "tangents")
-        found = self._products(q, p, h, t, parameters, options, np.atleast_2d(seeds))
-        return found[:, : 2 * self.dimension].reshape(seeds.shape)
+        products = self._products(q, p, h, t, parameters, options, np.atleast_2d(seeds))
+        return products[:, : 2 * self.dimension].reshape(seeds.shape)
 
     def vjp(
         self,
@@ -234,14 +236,14 @@ class LinearisedMethod(CompiledMethod):
             Their derivatives with respect to (q0, p0), of the shape of ``cotangents``.
         """
         seeds = self._seeds(cotangents, "cotangents")
-        found = self._products(q, p, h, t, parameters, options, np.atleast_2d(seeds), transpose=True)
-        return found[:, : 2 * self.dimension].reshape(seeds.shape)
+        products = self._products(q, p, h, t, parameters, options, np.atleast_2d(seeds), transpose=True)
+        return products[:, : 2 * self.dimension].reshape(seeds.shape)
 
     def _seeds(self, values: ArrayLike, name: str) -> Array:
-        found, size = real_array(values, name), 2 * self.dimension
-        if found.ndim not in (1, 2) or found.shape[-1] != size:
-            raise StateError(f"{name} must have the shape ({size},) or (k, {size}), not {found.shape}")
-        return found
+        array, size = real_array(values, name), 2 * self.dimension
+        if array.ndim not in (1, 2) or array.shape[-1] != size:
+            raise StateError(f"{name} must have the shape ({size},) or (k, {size}), not {array.shape}")
+        return array
 
     def _products(
         self,
@@ -270,10 +272,10 @@ class LinearisedMethod(CompiledMethod):
         if own_energy and not transpose:
             vectors[0, :, self._energy_index] += seeds @ self._energy_gradient(q0, p0, values)[:size]
         self._propagate(starts, vectors, values, options, transpose=transpose)
-        found: Array = vectors[int(not transpose)]
+        products: Array = vectors[int(not transpose)]
         if own_energy and transpose:
-            found += np.outer(found[:, self._energy_index], self._energy_gradient(q0, p0, values))
-        return found
+            products += np.outer(products[:, self._energy_index], self._energy_gradient(q0, p0, values))
+        return products
 
     def _propagate(
         self,

@@ -38,9 +38,9 @@ class PhysicalTime:
         """Return (k, variables) variations of the variables of the first step, from those of the initial data."""
         return tangents
 
-    def final_tangents(self, found: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
+    def final_tangents(self, vectors: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
         """Return (n, outputs, k) variations of all states and (k, variables) at the end, from those of the steps."""
-        return found, now
+        return vectors, now
 
     def step_cotangents(self, seeds: Array) -> Array:
         """Return (n, k, variables) cotangents of ends from those of states: transpose of :meth:`final_tangents`."""
@@ -71,7 +71,7 @@ class TransformedTime(PhysicalTime):
         return cls(_before_last(states) if repeated else states, end_is_fixed, repeated)
 
     @cached_property
-    def level(self) -> Array:
+    def energy_gradient(self) -> Array:
         """(variables,) gradient of the energy with respect to the initial data."""
         states = self.states
         return states.stepper._energy_gradient(states.q[0], states.p[0], states.parameters)
@@ -79,11 +79,11 @@ class TransformedTime(PhysicalTime):
     @cached_property
     def last_step(self) -> Array:
         """(variables,) derivative of the end by the size of the last step, divided by that of the time; 0 if free."""
-        states, given = self.states, self.states.stepper._input_size
+        states, input_size = self.states, self.states.stepper._input_size
         if not self.end_time_fixed or len(states) < 2:
-            return np.zeros(given)
+            return np.zeros(input_size)
         span = states.stepped[-1:] - states.stepped[-2:-1]
-        vectors = np.zeros((2, 1, given))
+        vectors = np.zeros((2, 1, input_size))
         vectors[0, 0, -1] = 1.0
         starts = Starts(states.t[-2:-1].copy(), span, states.q[-2:].copy(), states.p[-2:].copy())
         states.stepper._propagate(starts, vectors, states.parameters, states.options)
@@ -92,32 +92,32 @@ class TransformedTime(PhysicalTime):
 
     def initial_tangents(self, tangents: Array) -> Array:
         """Add the variation of the energy; see :meth:`PhysicalTime.initial_tangents`."""
-        found = tangents.copy()
-        found[:, self.states.stepper._energy_index] += tangents @ self.level
-        found[:, T] = 0.0
-        return found
+        result = tangents.copy()
+        result[:, self.states.stepper._energy_index] += tangents @ self.energy_gradient
+        result[:, T] = 0.0
+        return result
 
-    def final_tangents(self, found: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
+    def final_tangents(self, vectors: Array, now: Array, tangents: Array) -> tuple[Array, Array]:
         """Project the variation of the end onto the fixed final time; see :meth:`PhysicalTime.final_tangents`."""
         now = now - now[:, T, np.newaxis] * self.last_step
         last = now[:, self.states.stepper._output_indices].T[np.newaxis]
-        found = np.concatenate([found if self.repeated else found[:-1], last])
-        found[:, -1] += tangents[:, T]
-        return found, now
+        vectors = np.concatenate([vectors if self.repeated else vectors[:-1], last])
+        vectors[:, -1] += tangents[:, T]
+        return vectors, now
 
     def step_cotangents(self, seeds: Array) -> Array:
         """Apply the transpose of :meth:`final_tangents`; see :meth:`PhysicalTime.step_cotangents`."""
-        found = seeds.copy()
-        found[-1, :, T] -= seeds[-1] @ self.last_step
+        result = seeds.copy()
+        result[-1, :, T] -= seeds[-1] @ self.last_step
         if self.repeated:
-            found[-2] += found[-1]
-        return found[: len(self.states)]
+            result[-2] += result[-1]
+        return result[: len(self.states)]
 
     def initial_cotangents(self, derivatives: Array, seeds: Array) -> Array:
         """Apply the transpose of :meth:`initial_tangents`; see :meth:`PhysicalTime.initial_cotangents`."""
-        found = derivatives + derivatives[:, self.states.stepper._energy_index, np.newaxis] * self.level
-        found[:, T] = seeds[:, :, T].sum(axis=0)
-        return found
+        result = derivatives + derivatives[:, self.states.stepper._energy_index, np.newaxis] * self.energy_gradient
+        result[:, T] = seeds[:, :, T].sum(axis=0)
+        return result
 
 
 def time_of(states: SavedStates) -> PhysicalTime:

@@ -16,11 +16,11 @@ __all__ = ["quantities"]
 
 def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> dict[str, Array]:
     """Return the velocity (n, m), energy (n,) and, if there are any, momentum_map (n, c) of n states."""
-    given = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
+    rows_of_states = np.flatnonzero(np.isfinite(q).all(axis=1) & np.isfinite(p).all(axis=1))
 
     def energies(rows: NDArray[np.intp]) -> Array:
-        found: Array = stepper.energy(q[rows], p[rows], t[rows], parameters)
-        return found
+        result: Array = stepper.energy(q[rows], p[rows], t[rows], parameters)
+        return result
 
     def maps(rows: NDArray[np.intp]) -> Array:
         return stepper.momentum_maps(q[rows], p[rows], t[rows], parameters)
@@ -29,16 +29,16 @@ def quantities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Ar
         return stepper.rates(q[rows], p[rows], parameters)
 
     per_time = np.full(len(t), np.nan)
-    _fill(per_time, given, rates)
-    found = {
+    _fill(per_time, rows_of_states, rates)
+    result = {
         "velocity": _velocities(stepper, parameters, t, q, p) / per_time[:, np.newaxis],
         "energy": np.full(len(t), np.nan),
     }
-    _fill(found["energy"], given, energies)
+    _fill(result["energy"], rows_of_states, energies)
     if names := stepper.momentum_map_names:
-        found["momentum_map"] = np.full((len(t), len(names)), np.nan)
-        _fill(found["momentum_map"], given, maps)
-    return found
+        result["momentum_map"] = np.full((len(t), len(names)), np.nan)
+        _fill(result["momentum_map"], rows_of_states, maps)
+    return result
 
 
 def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.intp]], Array]) -> None:
@@ -53,11 +53,11 @@ def _fill(into: Array, rows: NDArray[np.intp], compute: Callable[[NDArray[np.int
 def _velocities(stepper: Integrator, parameters: Array, t: Array, q: Array, p: Array) -> Array:
     """Return (n, m) velocities by unchecked C calls, for exports with many millions of states."""
     binding, (n, m) = stepper.binding, q.shape
-    found = np.full((n, m), np.nan)
+    result = np.full((n, m), np.nan)
     positions, momenta = np.ascontiguousarray(q), np.ascontiguousarray(p)
     velocity, workspace, values = binding.function("velocity"), binding.workspace(), binding.pointer(parameters)
-    q0, p0, v0 = (binding.pointer(array) for array in (positions, momenta, found))
+    q0, p0, v0 = (binding.pointer(array) for array in (positions, momenta, result))
     for row, time in enumerate(t.tolist()):
         if velocity(time, q0 + row * m, p0 + row * m, values, v0 + row * m, workspace):
-            found[row] = np.nan
-    return found
+            result[row] = np.nan
+    return result

@@ -39,14 +39,14 @@ def recomputed_steps(
     for k, (start, length, end) in enumerate(
         zip(states.t[:-1].tolist(), states.step_sizes[:-1].tolist(), states.t[1:].tolist(), strict=True)
     ):
-        count, given = steps_between(length, end - start), []
+        count, outputs = steps_between(length, end - start), []
         q, p = states.q[k], states.p[k]
         for j in range(count):
-            q, p, found = step(q, p, length if count > 1 else end - start, start + j * length)
-            given.append(found)
+            q, p, output = step(q, p, length if count > 1 else end - start, start + j * length)
+            outputs.append(output)
         known = np.concatenate([states.q[k : k + 2], states.p[k : k + 2]], axis=1)
         check_recomputed(states.t[k : k + 1], np.concatenate([q, p])[np.newaxis], known[1:], known[:1])
-        yield given
+        yield outputs
 
 
 def steps_between(length: float, span: float) -> int:
@@ -59,17 +59,17 @@ def steps_between(length: float, span: float) -> int:
     return max(1, count)
 
 
-def check_recomputed(t: Array, found: Array, known: Array, before: Array) -> None:
+def check_recomputed(t: Array, recomputed: Array, known: Array, before: Array) -> None:
     """Raise :class:`StateError` for the first of n recomputed steps that converged to a spurious root.
 
     Deviations are relative to the largest entry of a state, since entries that are 0 contain only rounding errors.
 
     Args:
         t: (n,) start times of the steps.
-        found, known: (n, 2m) recomputed and saved states at their ends.
+        recomputed, known: (n, 2m) recomputed and saved states at their ends.
         before: (n, 2m) states at their starts.
     """
-    apart = found - known
+    apart = recomputed - known
     lengths = (np.einsum("ij,ij->i", x, x) for x in (apart, known))
     near = np.less(known.shape[1] * next(lengths), SAME_STATE**2 * next(lengths))  # sufficient, cheaper than maxima
     rows = np.flatnonzero(~near)

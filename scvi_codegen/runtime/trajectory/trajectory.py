@@ -104,7 +104,7 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
             **{name: getattr(self, name)[rows] for name in ("t", "q", "p", "iterations")},
             tau=None if self.tau is None else self.tau[rows],
             step_sizes=lengths,
-            events=tuple(found.chosen((found.t >= low) & (found.t <= high)) for found in self.events),
+            events=tuple(crossings.chosen((crossings.t >= low) & (crossings.t <= high)) for crossings in self.events),
         )
 
     @classmethod
@@ -180,9 +180,9 @@ class Trajectory(TrajectoryDerivatives, Confirmed):
     @property
     def ended_by(self) -> Event | None:
         """Terminal event that ended the run, whose crossing is the last state; or ``None``."""
-        for found in self.events:
-            if found.event.terminal and len(found) >= int(found.event.terminal):
-                return found.event
+        for crossings in self.events:
+            if crossings.event.terminal and len(crossings) >= int(crossings.event.terminal):
+                return crossings.event
         return None
 
     @property

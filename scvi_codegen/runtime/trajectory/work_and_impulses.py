@@ -24,6 +24,6 @@ def work_and_impulses_until(states: SavedStates) -> Array:
     def step(q: Array, p: Array, h: float, t: float) -> tuple[Array, Array, Array]:
         return stepper.work_and_impulses(q, p, h, t, states.parameters, options=states.options)
 
-    for k, given in enumerate(recomputed_steps(states, step)):
-        total[k + 1] = sum(given, total[k])
+    for k, outputs in enumerate(recomputed_steps(states, step)):
+        total[k + 1] = sum(outputs, total[k])
     return total
