@@ -46,13 +46,8 @@ class Kind:
             self.sum("(y - x)**2/2 + (z - x)**2/2", "(q[i] - x)**2/2"),
         )
         text = f"x_dot**2/2 + {moving} - k*x**2/2 - x**4/9 - {springs}{kinetic}"
-<<<<<<< Updated upstream
         arguments = {"parameters": {"k": 1}, **arguments}
         return sc.LagrangianSystem.from_text("bodies", self.coordinates, text, **arguments)
-=======
-        given = {"parameters": {"k": 1}, **arguments}
-        return sc.LagrangianSystem.from_text("bodies", self.coordinates, text, **given)
->>>>>>> Stashed changes
 
     @cache  # noqa: B019  (three objects in all)
     def stepper(self) -> Any:

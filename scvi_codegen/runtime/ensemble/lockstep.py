@@ -116,6 +116,7 @@ class Ensemble:
             self.segments = planned_segments(self.t0, t_end, self.h, self.inputs) or self.segments
         self.ends = list(accumulate(segment.steps for segment in self.segments))
         self.steps, self.save_every = self.ends[-1], checked_count(save_every, "save_every", least=1)
+        empty_array((self.steps // self.save_every + 1,))  # rejects numbers of states beyond any memory
         multiples = np.arange(0, self.steps + 1, self.save_every)
         self.numbers = multiples if t_end is None else np.union1d(multiples, self.ends)
         start_q, start_p, self.parameters = start_of_ensemble(stepper, q, p, self.t0, parameters)
