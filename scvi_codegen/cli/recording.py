@@ -19,8 +19,9 @@ from scvi_codegen.cli.progress import interruptions, progress_bar
 from scvi_codegen.cli.running import conserved, final_state
 from scvi_codegen.errors import ModelFileError, StepFailedError
 from scvi_codegen.files import export
-from scvi_codegen.models.model import Model, whole_steps_in
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model, parse_model
+from scvi_codegen.models.time_span import whole_steps_in
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.results.recording import RecordedRun, load_run, record_run, resume_run
 from scvi_codegen.runtime.run.run import Run

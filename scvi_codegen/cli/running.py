@@ -16,7 +16,7 @@ from scvi_codegen.cli.memory import check_memory, check_run_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
 from scvi_codegen.methods.method import is_symplectic
-from scvi_codegen.models.model import Model, allowed_error
+from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
@@ -154,7 +154,7 @@ def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutco
 
 def _missed(model: Model, trajectory: Trajectory | DrivenTrajectory) -> str | None:
     """Return a message if later steps exceed the error for which the step of tau was chosen at the start."""
-    allowed = allowed_error(model)
+    allowed = model.allowed_error
     if allowed is None or not model.has_time_transformation:
         return None
     return accuracy_message(trajectory.step_error, trajectory.worst_step_time, allowed)

@@ -18,7 +18,6 @@ from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.model import allowed_error
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
 from scvi_codegen.runtime.indexed.interface import Numbers
@@ -193,7 +192,7 @@ def _numbers(model: IndexedModel, outcome: IndexedOutcome) -> dict[str, Any]:
         "sizes": run.sizes,
         "steps": run.steps,
         "h": model.h,
-        "tolerance": allowed_error(model),
+        "tolerance": model.allowed_error,
         "states": len(trajectory.t),
         "seconds": outcome.seconds,
         "preparation_seconds": outcome.preparation,

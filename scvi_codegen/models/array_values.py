@@ -28,7 +28,7 @@ from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.vectorized import on_arrays
 from scvi_codegen.indices import Array
 from scvi_codegen.models.csv_tables import parse_table
-from scvi_codegen.models.model import real
+from scvi_codegen.models.time_span import real
 from scvi_codegen.native.arguments import real_array
 
 __all__ = ["INDICES", "is_filled", "read_array"]

@@ -55,7 +55,6 @@ from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.array_values import is_filled, read_array
 from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.model import real
 from scvi_codegen.models.sections import (
     Document,
     Section,
@@ -70,6 +69,7 @@ from scvi_codegen.models.sections import (
     required,
     text_of,
 )
+from scvi_codegen.models.time_span import real
 from scvi_codegen.validation.counts import checked_count
 
 __all__ = ["read_indexed"]

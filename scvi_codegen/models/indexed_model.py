@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -11,20 +10,9 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.lowering.arrays import SOLVERS, check_solver
 from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.models.model import (
-    check_adaptive,
-    check_at_most_one,
-    check_error,
-    check_one_of,
-    check_step,
-    is_whole,
-    real,
-    steps_in,
-    whole_steps_in,
-)
+from scvi_codegen.models.time_span import TimeSpan
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.validation.argument_types import check_kind
-from scvi_codegen.validation.counts import checked_count
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
@@ -37,7 +25,7 @@ __all__ = ["IndexedModel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedModel:
+class IndexedModel(TimeSpan):
     """Indexed system with a method, an initial state and a time span.
 
     Attributes:
@@ -46,13 +34,7 @@ class IndexedModel:
         solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
         q: initial positions by the name of their array; their shapes determine the sizes.
         p, velocity: initial momenta or velocities by the same names, at most one of both; default: 0.
-        h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps.
-        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off.
-        error: instead of both, bound of the relative global error of all states, as of :class:`Model`.
-        span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
-        steps: number of steps, or ``None`` if ``span`` is given.
-        save_every: stride of saved states, in steps.
-        t: initial time.
+        h, tolerance, error, span, steps, save_every, t: as of :class:`~scvi_codegen.models.time_span.TimeSpan`.
         parameters: numbers, and arrays of them, by name; others keep their defaults.
         tables: index tables of shape (rows, columns), by name.
         document: the sections of the file that it was read from.
@@ -65,15 +47,8 @@ class IndexedModel:
     method: Method
     q: Mapping[str, Any]
     solver: str = SOLVERS[0]
-    h: float | None = None
-    tolerance: float | None = None
-    error: float | None = None
     p: Mapping[str, Any] | None = None
     velocity: Mapping[str, Any] | None = None
-    span: float | None = None
-    steps: int | None = None
-    save_every: int = 1
-    t: float = 0.0
     parameters: Mapping[str, Any] = field(default_factory=dict)
     tables: Mapping[str, Any] = field(default_factory=dict)
     document: Mapping[str, Any] | None = field(default=None, repr=False)
@@ -83,19 +58,7 @@ class IndexedModel:
         check_solver(self.solver, ModelFileError)
         if self.p is not None and self.velocity is not None:
             raise ModelFileError("give p or velocity (q_dot), not both")
-        check_at_most_one(self.h, self.tolerance, self.error)
-        check_one_of("span", self.span, "steps", self.steps)
-        for name in ("h", "tolerance", "error", "t", "span"):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, real(value, name))
-        if self.h is None:
-            check_adaptive(self.tolerance, self.span)
-            check_error(self.error, has_time_transformation=False)
-        else:
-            check_step(self.h, self.span)
-        if self.steps is not None:
-            checked_count(self.steps, "steps", least=0, error=ModelFileError)
-        checked_count(self.save_every, "save_every", least=1, error=ModelFileError)
+        self._check_time_span(has_time_transformation=False)
 
     REQUIRES_SIZES: ClassVar[str] = (
         "the sizes of its arrays are known at run time only. Write sizes as numbers, coordinates = ['q[8]']"
@@ -104,32 +67,6 @@ class IndexedModel:
     def __repr__(self) -> str:
         steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"
         return clipped(f"<IndexedModel of {self.system.name}: {self.method.name}, {steps}>", LONGEST)
-
-    @property
-    def step(self) -> float:
-        """Fixed step size h; ModelFileError for adaptive steps."""
-        if self.h is None:
-            raise ModelFileError(
-                "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
-            )
-        return self.h
-
-    @property
-    def step_count(self) -> int:
-        """Number of fixed steps: ``steps``, or ``span`` / h rounded up, as the last step may be shorter."""
-        if self.steps is not None:
-            return self.steps
-        assert self.span is not None  # by construction
-        return steps_in(self.span, self.step)
-
-    def whole_step_count(self) -> int:
-        """Return the number of steps of a run that cannot end with a shorter step, as of :class:`Model`."""
-        return self.step_count if self.span is None else whole_steps_in(self.span, self.step, self.t)
-
-    @property
-    def has_shorter_last_step(self) -> bool:
-        """True if the span is not a whole number of fixed steps, so that the last step is shorter."""
-        return not (self.span is None or self.h is None or is_whole(self.span, self.h))
 
     def segments(self, run: IndexedRun) -> Iterator[int | None]:
         """Prepare a run of this model for each segment of equal steps, and yield its number of steps.
@@ -144,14 +81,6 @@ class IndexedModel:
         for segment in planned_segments(run.t, self.t + self.covered, run.h, {}):
             run.update(h=segment.h)
             yield segment.steps
-
-    @property
-    def covered(self) -> float:
-        """Time span, negative for a run backward in time."""
-        if self.h is None:
-            assert self.span is not None  # by construction
-            return self.span
-        return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
 
     def stepper(self) -> IndexedStepper:
         """Compile a stepper for runs of any size; raises as :func:`~scvi_codegen.compile_stepper`."""

@@ -21,7 +21,7 @@ from scvi_codegen.errors import ModelFileError
 from scvi_codegen.files.numpy_files import loaded
 from scvi_codegen.models.csv_tables import CsvTable, parse_table
 from scvi_codegen.models.input_tables import InputTable
-from scvi_codegen.models.model import real
+from scvi_codegen.models.time_span import real
 from scvi_codegen.native.arguments import real_array
 
 __all__ = ["read_input"]

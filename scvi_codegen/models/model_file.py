@@ -77,7 +77,7 @@ from scvi_codegen.mechanics.reparametrisation import with_time_transformation
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 from scvi_codegen.methods import fitted
-from scvi_codegen.models.model import Model, check_length, real
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_document import document_of, motion_of
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.sections import (
@@ -96,6 +96,7 @@ from scvi_codegen.models.sections import (
     required,
     text_of,
 )
+from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 
 if TYPE_CHECKING:

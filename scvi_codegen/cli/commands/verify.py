@@ -15,7 +15,7 @@ from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
 from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.indexed_package import load_sums
-from scvi_codegen.models.model import Model, allowed_error
+from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
 from scvi_codegen.runtime.core.stepper import Stepper
@@ -97,7 +97,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
         h=model.first_step(stepper),
         t=model.t,
         stepper=stepper,
-        tolerance=allowed_error(model),
+        tolerance=model.allowed_error,
         solver=solver,
     )
 

@@ -1,0 +1,211 @@
+"""Time span and step size of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+from scvi_codegen.errors import MethodWarning, ModelFileError, warn
+from scvi_codegen.validation.counts import LARGEST_COUNT, check_tolerance, checked_count
+
+__all__ = ["TimeSpan", "check_length", "check_one_of", "real", "whole_steps_in"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TimeSpan:
+    """Step size or tolerance, and time span or number of steps; models derive from it.
+
+    Attributes:
+        h: step size, not 0, negative for a run backward in time; or ``None`` for adaptive steps. With a time
+            transformation, the step size in tau.
+        tolerance: relative error allowed to each adaptive step, below 1, or ``None`` for round-off. With a time
+            transformation, :func:`largest_step` chooses the step size in tau for it.
+        error: instead of both, bound of the relative global error of all states: runs choose their local tolerance as
+            ``integrate(error=)`` does, and warn if the bound is not confirmed. Requires adaptive steps.
+        span: time span, positive, or ``None`` if ``steps`` is given. With adaptive steps negative for a run backward.
+        steps: number of fixed steps, or ``None`` if ``span`` is given.
+        save_every: stride of saved states, in steps.
+        t: initial time.
+    """
+
+    h: float | None = None
+    tolerance: float | None = None
+    error: float | None = None
+    span: float | None = None
+    steps: int | None = None
+    save_every: int = 1
+    t: float = 0.0
+
+    def _check_time_span(self, *, has_time_transformation: bool) -> None:
+        """Raise :class:`ModelFileError`, naming the field, for invalid values, and convert the others."""
+        check_at_most_one(self.h, self.tolerance, self.error)
+        check_one_of("span", self.span, "steps", self.steps)
+        for name in ("h", "tolerance", "error", "t", "span"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, real(value, name))
+        if self.h is None:
+            check_adaptive(self.tolerance, self.span)
+            check_error(self.error, has_time_transformation=has_time_transformation)
+        else:
+            check_step(self.h, self.span)
+        for name, least in (("steps", 0), ("save_every", 1)):
+            if (count := getattr(self, name)) is not None:
+                object.__setattr__(self, name, checked_count(count, name, least=least, error=ModelFileError))
+
+    @property
+    def ends_at_time(self) -> bool:
+        """True if the run ends at a time, after a number of steps that is not known in advance."""
+        return self.h is None
+
+    @property
+    def _varies_steps(self) -> bool:
+        """True if a controller varies the step size h."""
+        return False
+
+    @property
+    def step(self) -> float:
+        """Fixed step size h; ModelFileError for adaptive steps."""
+        if self.h is None:
+            raise ModelFileError(
+                "this requires a fixed step size, but the model has adaptive steps: give a step h (--step, [run] step)"
+            )
+        if self._varies_steps:
+            raise ModelFileError(
+                "this requires a fixed step size, but the reversible controller varies it: leave out the controller"
+            )
+        return self.h
+
+    @property
+    def step_count(self) -> int:
+        """Number of fixed steps: ``steps``, or ``span`` / h rounded up, as the last step may be shorter.
+
+        Raises:
+            ModelFileError: if the number is not known in advance, because the run ends at a time.
+        """
+        if self.steps is not None:
+            return self.steps
+        step = self.step
+        if self.ends_at_time:
+            raise ModelFileError(
+                "the number of steps in tau for a time span is not known in advance: give steps (--steps)"
+            )
+        assert self.span is not None  # by construction
+        return steps_in(self.span, step)
+
+    def whole_step_count(self) -> int:
+        """Return the number of steps of a run that cannot end with a shorter step; see :func:`whole_steps_in`."""
+        return self.step_count if self.span is None else whole_steps_in(self.span, self.step, self.t)
+
+    @property
+    def has_shorter_last_step(self) -> bool:
+        """True if the span is not a whole number of fixed steps, so that the last step is shorter."""
+        return not (self.span is None or self.ends_at_time or is_whole(self.span, self.step))
+
+    @property
+    def covered(self) -> float:
+        """Time span, negative for a run backward in time."""
+        if self.h is None:
+            assert self.span is not None  # by construction
+            return self.span
+        return self.h * self.step_count if self.span is None else math.copysign(self.span, self.h)
+
+    @property
+    def allowed_error(self) -> float | None:
+        """Relative error allowed to each adaptive step, 0 for round-off; ``None`` for a fixed step size."""
+        return None if self.h is not None else self.tolerance or 0.0
+
+
+def check_step(h: float, span: float | None) -> None:
+    """Raise an error for a step size of 0, and a span that is not a positive number of steps."""
+    if h == 0.0:
+        raise ModelFileError("the step size is 0: it must be positive, or negative for a run backward in time")
+    if span is not None and not 0.0 < span / abs(h) <= LARGEST_COUNT:
+        raise ModelFileError(
+            f"span is {span:g} with a step size of {h:g}: it must be positive, also for a run "
+            "backward in time, and less than 2^53 steps"
+        )
+
+
+def check_adaptive(tolerance: float | None, span: float | None) -> None:
+    """Raise an error for an invalid tolerance or span of adaptive steps."""
+    if tolerance is not None:
+        check_tolerance(tolerance, ModelFileError)
+    if span is None:
+        raise ModelFileError("adaptive steps require a time span: give span, not steps")
+    if span == 0.0:
+        raise ModelFileError("span is 0: it must be positive, or negative for a run backward in time")
+
+
+def is_whole(span: float, h: float) -> bool:
+    """Return True if a span is a whole number of steps, up to rounding."""
+    from scvi_codegen.runtime.run.times import WHOLE  # imported here: not needed for reading a model
+
+    steps = span / abs(h)
+    return round(steps) > 0 and abs(steps - round(steps)) <= WHOLE * max(1.0, steps)
+
+
+def steps_in(span: float, h: float) -> int:
+    """Return the number of steps in a span of which the last may be shorter."""
+    return round(span / abs(h)) if is_whole(span, h) else math.ceil(span / abs(h))
+
+
+def whole_steps_in(span: float, h: float, t: float) -> int:
+    """Return the number (at least 1) of equal steps nearest to a span; warn of the end of the run if it differs."""
+    steps = max(1, round(span / abs(h)))
+    if not is_whole(span, h):
+        warn(
+            f"span {span:g} is not a whole number of steps of {abs(h):g}, and recorded runs and C programs have equal "
+            f"steps: {steps} steps end at t = {t + steps * h:.12g}, not {t + math.copysign(span, h):g}; give a step "
+            "that divides the span",
+            MethodWarning,
+        )
+    return steps
+
+
+def check_length(values: Sequence[object], names: Sequence[str], where: str) -> None:
+    """Raise an error unless there is one value per name."""
+    if len(values) != len(names):
+        shown = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        raise ModelFileError(f"{where} must have {len(names)} numbers for ({shown}), not {len(values)}")
+
+
+def check_at_most_one(h: float | None, tolerance: float | None, error: float | None) -> None:
+    """Raise an error for several step-size options; none means adaptive steps with errors at round-off level."""
+    if sum(each is not None for each in (h, tolerance, error)) > 1:
+        raise ModelFileError(
+            "give only one of h (step: fixed step size), tolerance (error of each adaptive step) and "
+            "error (error of the whole run)"
+        )
+
+
+def check_error(error: float | None, *, has_time_transformation: bool) -> None:
+    """Raise an error for an invalid bound of the global error, and for one with a time transformation."""
+    if error is not None and not 0.0 < error < 1.0:
+        raise ModelFileError(f"error is {error:g}: the bound of the relative global error must be between 0 and 1")
+    if error is not None and has_time_transformation:
+        raise ModelFileError(
+            f"error = {error:g} requires adaptive steps, but a time transformation has fixed steps in "
+            "tau: give tolerance or step instead"
+        )
+
+
+def check_one_of(one: str, first: object, other: str, second: object) -> None:
+    """Raise an error unless exactly one of two fields is given."""
+    if (first is None) == (second is None):
+        raise ModelFileError(f"give exactly one of {one} and {other}")
+
+
+def real(value: Any, where: str) -> float:
+    """Return a finite number, or raise an error that begins with ``where``."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ModelFileError(f"{where} must be a number, not {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ModelFileError(f"{where} is {number}: it must be a finite number")
+    return number
