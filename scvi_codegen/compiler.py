@@ -249,12 +249,12 @@ class _Sources:
         """
         if second and (self.system.integrands or self.system.damping):
             return None
-        found = self.program(fallback=True)
-        if not found.newton:  # explicit steps
-            found = self._derived(solver="newton")
+        program = self.program(fallback=True)
+        if not program.newton:  # explicit steps
+            program = self._derived(solver="newton")
         stages = discretise(self.system, self.method)
         with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
-            return render_derivatives(derivatives_of(self.system, stages, found, second=second))
+            return render_derivatives(derivatives_of(self.system, stages, program, second=second))
 
     def changes(self, count: int) -> Source | None:
         """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
@@ -329,8 +329,8 @@ class _ArraySources:
             control = control_of(self.program)
             return render(self.program, control).to_json() if control else ""
 
-        found = self._remembered("indexed controlled", text)
-        return Source.from_json(found) if found else None
+        document = self._remembered("indexed controlled", text)
+        return Source.from_json(document) if document else None
 
     def _remembered(self, what: str, make: Callable[[], str]) -> str:
         return cached_source((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
@@ -410,8 +410,8 @@ def generate_source(
     control = density_of(system, g) if g is not None else control_of(program) if controlled else None
     source = render_embedded(program, embedded, control) if embedded else render(program, control)
     interface = describe(program, system, method, g=g)
-    found = with_events(source, interface, functions) if functions else source
-    return (found.amalgamated() if amalgamate else found), interface
+    complete = with_events(source, interface, functions) if functions else source
+    return (complete.amalgamated() if amalgamate else complete), interface
 
 
 def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
@@ -441,12 +441,12 @@ def program_of(
     """
     name = c_identifier(prefix or f"{system.name}_{method.name}")
     tracked = all_symmetries(system, symmetries)
-    found = partial(
+    program_part = partial(
         _program, method=method, solver=solver, prefix=name, symmetries=tracked, lanes=lanes, fallback=fallback
     )
     parts = rolled(system)
-    looped = with_sums(found(parts.rest), parts) if parts else None
-    return looped or found(system)
+    looped = with_sums(program_part(parts.rest), parts) if parts else None
+    return looped or program_part(system)
 
 
 def _program(
@@ -508,7 +508,7 @@ def describe(
         has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
         momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
         time_transformation="" if g is None else str(g),
-        exchange_names=program.quantities.exchanges,
+        exchange_names=program.quantities.work_and_impulses,
         constraints=program.constraints.formulas if program.constraints else (),
         inputs=system.inputs,
         conserves_energy=not system.changes_energy and not system.inputs,

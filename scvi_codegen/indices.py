@@ -77,7 +77,7 @@ class Array:
     @property
     def elements(self) -> tuple[str, ...]:
         """Names of the entries of an array of known sizes, ``q_0``, .., the last axis running fastest."""
-        return tuple("_".join([self.name, *map(str, place)]) for place in product(*map(range, self.shape({}))))
+        return tuple("_".join([self.name, *map(str, index)]) for index in product(*map(range, self.shape({}))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +140,7 @@ class Access:
     @property
     def indices(self) -> frozenset[str]:
         """Loop indices that occur in the access."""
-        return frozenset(place.index for place in self.places if place.index)
+        return frozenset(each.index for each in self.places if each.index)
 
     def __str__(self) -> str:
         return f"{self.array.name}[{', '.join(map(str, self.places))}]" if self.places else self.array.name

@@ -76,7 +76,7 @@ def casadi_step(
     *rows, p1 = written.rows()
     values, weights = written.along(along) if along else (ca.SX(0, 0), ca.SX(0, 1))
     results = [written.end_position(), p1, ca.vertcat(*rows), values, written.h * values @ weights]
-    step = ca.Function("step", written.given, results, [*ARGUMENTS], [*RESULTS])
+    step = ca.Function("step", written.arguments, results, [*ARGUMENTS], [*RESULTS])
     return _solved(ca, EndConditions(ca, system), stages, step) if solved else step
 
 
@@ -112,8 +112,8 @@ class _StageExpressions:
         m, sizes = system.dimension, stages.block_sizes(system.dimension)
         lengths = ((m, 1), (m, 1), (sum(sizes), 1), (len(system.inputs), degree + 1), (len(own_parameters(system)), 1))
         shapes = (*lengths, (1, 1), (1, 1))
-        self.given = [ca.SX.sym(name, *shape) for name, shape in zip(ARGUMENTS, shapes, strict=True)]
-        self.q, self.p, unknowns, self.inputs, self.parameters, self.t, self.h = self.given
+        self.arguments = [ca.SX.sym(name, *shape) for name, shape in zip(ARGUMENTS, shapes, strict=True)]
+        self.q, self.p, unknowns, self.inputs, self.parameters, self.t, self.h = self.arguments
         blocks = [unknowns[start:end] for start, end in pairwise(accumulate(sizes, initial=0))]
         powers = (block.power for block in stages.blocks)
         self.columns = ((0, self.q), *zip(powers, blocks, strict=True))

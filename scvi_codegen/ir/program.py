@@ -169,7 +169,7 @@ class Quantities:
         momentum_kernel: their values at (q, p), then the sums of the squares of their terms; ``None`` if there are
             none.
         integrals: functions integrated along a run, or ``None``; the first one gives the time.
-        exchanges: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
+        work_and_impulses: names of work and impulses of forces: of the energy, and momentum maps; none without forces.
     """
 
     legendre: Kernel | None = None
@@ -179,7 +179,7 @@ class Quantities:
     momentum_maps: tuple[MomentumMap, ...] = ()
     momentum_kernel: Kernel | None = None
     integrals: Integrals | None = None
-    exchanges: tuple[str, ...] = ()
+    work_and_impulses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,7 +303,7 @@ class Program:
         """Number of sums along a curve of Newton's method: the action, or work and impulses."""
         if not self.newton:
             return 0
-        return len(self.quantities.exchanges) if self.quantities.exchanges else int(self.action)
+        return len(self.quantities.work_and_impulses) if self.quantities.work_and_impulses else int(self.action)
 
     @property
     def memory(self) -> int:

@@ -152,11 +152,11 @@ def _over_terms(
     """Return the loop over the terms of a group."""
     kernel = lower_kernel(
         name,
-        arguments=(*group.slots, *group.given),
+        arguments=(*group.slots, *group.constants),
         time=system.time,
         parameters=system.parameters,
         values=values,
-        constants=len(group.given),
+        constants=len(group.constants),
     )
     index = {parameter: k for k, parameter in enumerate(system.parameters)}
     given = tuple(

@@ -34,7 +34,7 @@ from scvi_codegen.lowering.unknown_layout import layout_of
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.work_and_impulse import exchanges
+from scvi_codegen.mechanics.work_and_impulse import work_rates
 from scvi_codegen.methods.constraints import END_VELOCITY
 from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
 from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
@@ -111,7 +111,7 @@ def lower(
         momentum_maps=tuple(_momentum_map(each, method) for each in symmetries),
         momentum_kernel=_momentum_kernel(system, symmetries),
         integrals=_integrals(system, method, stages),
-        exchanges=_exchanges(system, stages),
+        work_and_impulses=_work_and_impulse_names(system, stages),
     )
     return Program(
         prefix=prefix,
@@ -211,10 +211,10 @@ def _integrals(system: MechanicalSystem, method: Method, stages: StageSystem) ->
     return Integrals(kernel=kernel, weights=lower_vector(stages.shape.weights))
 
 
-def _exchanges(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
+def _work_and_impulse_names(system: MechanicalSystem, stages: StageSystem) -> tuple[str, ...]:
     """Return the names of work and impulses of forces, if the method integrates along a curve."""
     integrates = any(group.in_action for group in stages.stage_groups)
-    return tuple(each.name for each in exchanges(system)) if integrates else ()
+    return tuple(each.name for each in work_rates(system)) if integrates else ()
 
 
 def _legendre_kernel(system: MechanicalSystem) -> Kernel:

@@ -17,7 +17,7 @@ from scvi_codegen.lowering.unknown_layout import UnknownLayout
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.work_and_impulse import exchanges
+from scvi_codegen.mechanics.work_and_impulse import work_rates
 from scvi_codegen.methods.stage_system import Gather, StageGroup
 from scvi_codegen.tables.precision import mp
 
@@ -86,7 +86,7 @@ def _results(group: StageGroup, names: tuple[str, ...]) -> str:
 
 def _integrand(system: MechanicalSystem, group: StageGroup, u: str) -> Kernel | None:
     """Return the kernel that is summed along the curve: work and impulses of forces, or the action."""
-    if given := exchanges(system):
+    if given := work_rates(system):
         rates, purpose = [each.rate for each in given], f"Power and impulse rates of the forces at {u}."
         return system_kernel(system, "exchanges", rates, of=group.arguments, purpose=purpose)
     if not has_action(system):

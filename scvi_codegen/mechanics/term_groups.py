@@ -34,16 +34,16 @@ class TermGroup:
     """Group of similar terms.
 
     Attributes:
-        formula: of one term, in ``slots``, ``given``, the constants common to all terms, and time.
+        formula: of one term, in ``slots``, ``constants``, the symbols common to all terms, and time.
         slots: symbols of coordinates.
-        given: symbols of the constants that differ between terms.
+        constants: symbols of the constants that differ between terms.
         places: indices of the coordinates in ``slots``, for each term.
-        values: numbers or parameters, for each of ``given`` and each term.
+        values: numbers or parameters, for each of ``constants`` and each term.
     """
 
     formula: Expr
     slots: tuple[Symbol, ...]
-    given: tuple[Symbol, ...]
+    constants: tuple[Symbol, ...]
     places: tuple[tuple[int, ...], ...]
     values: tuple[tuple[Expr, ...], ...]
 
@@ -113,7 +113,7 @@ class SimilarTerms:
         return TermGroup(
             formula=sign * first.substituted(self.terms[0], slot, symbols),
             slots=tuple(slot("", k) for k in range(len(first.places))),
-            given=tuple(symbols[k] for k in varying),
+            constants=tuple(symbols[k] for k in varying),
             places=tuple(tuple(each.places) for each in self.leaves),
             values=tuple(columns[k] for k in varying),
         )
@@ -152,11 +152,11 @@ def _merged(groups: Sequence[TermGroup]) -> tuple[TermGroup, ...]:
     for group in groups:
         other = merged.setdefault(group.places, group)
         if other is not group:
-            constants = tuple(symbol(f"{each.name}_{len(other.given)}") for each in group.given)
+            constants = tuple(symbol(f"{each.name}_{len(other.constants)}") for each in group.constants)
             merged[group.places] = replace(
                 other,
-                formula=other.formula + group.formula.xreplace(dict(zip(group.given, constants, strict=True))),
-                given=(*other.given, *constants),
+                formula=other.formula + group.formula.xreplace(dict(zip(group.constants, constants, strict=True))),
+                constants=(*other.constants, *constants),
                 values=(*other.values, *group.values),
             )
     return tuple(merged.values())

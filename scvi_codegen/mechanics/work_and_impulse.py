@@ -23,7 +23,7 @@ from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.mechanics.system import MechanicalSystem
 
-__all__ = ["WorkRate", "exchanges"]
+__all__ = ["WorkRate", "work_rates"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +34,7 @@ class WorkRate:
     rate: Expr
 
 
-def exchanges(system: MechanicalSystem) -> tuple[WorkRate, ...]:
+def work_rates(system: MechanicalSystem) -> tuple[WorkRate, ...]:
     """Return the power, then the rate of each momentum map that forces or damping change; empty without forces."""
     if not system.forces and system.damping == 0:
         return ()

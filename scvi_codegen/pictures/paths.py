@@ -152,12 +152,19 @@ def _draw_image(axes: Axes, motion: DrawnMotion) -> None:
     """Draw many coordinates as an image: one row each, colour for the value."""
     every = max(1, len(motion.t) // 2000)
     values = motion.q[::every].T
-    bound = float(np.abs(values).max()) or 1.0
+    largest = float(np.abs(values).max()) or 1.0
     first, last = sorted((float(motion.t[0]), float(motion.t[-1])))
     span = (first, last if last > first else first + 1.0, 0.5, values.shape[0] + 0.5)
     drawn = values if motion.h > 0 else values[:, ::-1]
     image = axes.imshow(
-        drawn, aspect="auto", origin="lower", extent=span, cmap="RdBu_r", vmin=-bound, vmax=bound, interpolation="none"
+        drawn,
+        aspect="auto",
+        origin="lower",
+        extent=span,
+        cmap="RdBu_r",
+        vmin=-largest,
+        vmax=largest,
+        interpolation="none",
     )
     axes.grid(visible=False)
     axes.set(xlabel="t", ylabel="coordinate", title="q over time")

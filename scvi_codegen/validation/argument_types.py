@@ -126,22 +126,24 @@ def checks_arguments(
         known = dict.fromkeys(name for name in names if name not in ("self", "cls"))
         open_ended = any(each.kind is Parameter.VAR_KEYWORD for each in parameters.values())
         optional = {name for name in names if parameters[name].default is None}
-        places = [(names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()]
+        positions = [
+            (names.index(name) if name in names else MOST_ARGUMENTS, name, kind) for name, kind in kinds.items()
+        ]
 
         @functools.wraps(function)
-        def checked(*given: Any, **named: Any) -> Any:
-            if not (open_ended or named.keys() <= known.keys()):
-                name = next(name for name in named if name not in known)
+        def checked(*arguments: Any, **keywords: Any) -> Any:
+            if not (open_ended or keywords.keys() <= known.keys()):
+                name = next(name for name in keywords if name not in known)
                 raise ArgumentError(f"{function.__qualname__}() takes no {name!r}{keyword_hint(name, known)}")
-            for place, name, kind in places:
-                if place < len(given) or name in named:
-                    value = given[place] if place < len(given) else named[name]
+            for position, name, kind in positions:
+                if position < len(arguments) or name in keywords:
+                    value = arguments[position] if position < len(arguments) else keywords[name]
                     if not (value is None and name in optional):
                         reason = getattr(type(value), "REQUIRES_SIZES", "")
                         if reason and not kind.accepts(value):
                             raise error(f"{function.__qualname__}() is not available for {value!r:.60}: {reason}")
                         check_kind(kind, value, name, error)
-            return function(*given, **named)
+            return function(*arguments, **keywords)
 
         for of_a_cache in ("cache_clear", "cache_info"):
             if hasattr(function, of_a_cache):

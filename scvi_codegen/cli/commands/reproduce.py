@@ -71,7 +71,7 @@ def reproduce(names: tuple[str, ...], output: str, html: str | None, jobs: int |
         raise click.BadParameter(f"'{folder}' is not a folder", param_hint="'-o'")
     if html is not None:
         check_writable(Path(html), "'--html'")
-    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs, say=tell)
+    done = reproduce_experiments(names, folder, Path(html) if html is not None else None, jobs, report=tell)
     tell(f"\n{done.summary()}" if done.files else "", **done.numbers())
     if done.interrupted:
         raise CommandFailure("interrupted; files written before remain", INTERRUPTED)
@@ -140,11 +140,11 @@ def reproduce_experiments(
     jobs: int | None,
     *,
     module: str = CATALOGUE,
-    say: Callable[[str], None] = click.echo,
+    report: Callable[[str], None] = click.echo,
 ) -> Reproduction:
     """Run experiments and those they depend on; write the files of each result, and the page at the end.
 
-    Each result is a line passed to ``say``. Ctrl-C ends the run; files written before remain.
+    Each result is a line passed to ``report``. Ctrl-C ends the run; files written before remain.
 
     Raises:
         StateError: for an unknown name.
@@ -158,11 +158,11 @@ def reproduce_experiments(
     done, width = Reproduction(), max(map(len, chosen), default=0)
     try:
         with (
-            _progress(len(chosen), say) as progress,
+            _progress(len(chosen), report) as progress,
             closing(run_experiments(chosen, jobs, module=module, watch=progress.show)) as outcomes,
         ):
             for outcome in outcomes:
-                progress.say(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
+                progress.report(f"{outcome.name:{width}}  {_add(done, outcome, folder)}")
         if html is not None:
             done.files.append(_write_page(sorted(done.results, key=lambda r: list(experiments).index(r.name)), html))
     except KeyboardInterrupt:
@@ -194,10 +194,10 @@ def _write_page(results: Sequence[Result], path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Progress bar of experiments: ``show`` displays the running ones, ``say`` prints a line and counts one as done."""
+    """Progress bar of experiments: ``show`` shows the running ones, ``report`` prints a line and counts one."""
 
     show: Callable[[Sequence[str]], None]
-    say: Callable[[str], None]
+    report: Callable[[str], None]
 
 
 @contextmanager
@@ -212,7 +212,7 @@ def _progress(length: int, report: Callable[[str], None]) -> Iterator[_Progress]
         bar.current_item = text if len(text) <= SHOWN_NAMES else text[: SHOWN_NAMES - 2] + ".."
         bar.render_progress()
 
-    def say_above(line: str) -> None:
+    def report_above(line: str) -> None:
         click.echo("\r\x1b[K", nl=False, err=True)
         report(line)
         bar.update(1)
@@ -220,4 +220,4 @@ def _progress(length: int, report: Callable[[str], None]) -> Iterator[_Progress]
     with click.progressbar(
         length=length, label="reproducing", show_eta=False, item_show_func=lambda item: item, file=sys.stderr
     ) as bar:
-        yield _Progress(show, say_above)
+        yield _Progress(show, report_above)

@@ -34,9 +34,9 @@ def page_template(name: str, **filters: Callable[..., object]) -> Template:
     environment = _environment()
     if not filters:
         return environment.get_template(name)
-    own = environment.overlay()
-    own.filters = environment.filters | filters
-    return own.get_template(name)
+    overlay = environment.overlay()
+    overlay.filters = environment.filters | filters
+    return overlay.get_template(name)
 
 
 def style_sheet(*names: str) -> Markup:

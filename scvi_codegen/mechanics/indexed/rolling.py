@@ -179,5 +179,5 @@ class _Rolled:
 
     def fields(self, defaults: Mapping[Symbol, float]) -> Iterator[tuple[Array, NDArray[np.float64]]]:
         """Yield the arrays of constants with their values."""
-        for slot, column in zip(self.group.given, self.group.values, strict=True):
+        for slot, column in zip(self.group.constants, self.group.values, strict=True):
             yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])

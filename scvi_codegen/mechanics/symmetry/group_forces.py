@@ -45,7 +45,7 @@ def array_forces(
     for term_group in term_groups:
         indices, values = np.array(term_group.places, dtype=int).reshape(-1, len(term_group.slots)), dict(known)
         values |= {slot: q[indices[:, k]] for k, slot in enumerate(term_group.slots)}
-        for symbol, column in zip(term_group.given, term_group.values, strict=True):
+        for symbol, column in zip(term_group.constants, term_group.values, strict=True):
             values[symbol] = np.array([known[x] if x in known else np.full(count, float(x)) for x in column])
         for k, derivative in enumerate(term_group.partials):
             np.add.at(force, indices[:, k], array_value(derivative, values) + np.zeros((len(indices), count)))
@@ -59,7 +59,7 @@ def exact_forces(
     force: list[Number] = [mp.zero] * len(coordinates)
     for term_group in term_groups:
         shared_symbols = [symbol for symbol in known if symbol not in coordinates]
-        tape = Tape(term_group.partials, (*term_group.slots, *term_group.given, *shared_symbols))
+        tape = Tape(term_group.partials, (*term_group.slots, *term_group.constants, *shared_symbols))
         shared, numbers = [known[symbol] for symbol in shared_symbols], dict[Expr, Number]()
         for row, *constants in zip(term_group.places, *term_group.values, strict=True):
             for x in constants:

@@ -177,7 +177,7 @@ class _Recorder:
         self.folder, self.manifest, self.run = folder, manifest, run
         self.seconds, self.steps = seconds, steps
         self.number, self.written, self.written_t = 0, -1, run.t
-        self.kept: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.checkpoint())
+        self.pending: tuple[list[Piece], int, float, bytes] = ([], run.steps, run.t, run.checkpoint())
 
     def load_last_file(self, folder: Path) -> None:
         """Load the last file in order to complete it."""
@@ -185,7 +185,7 @@ class _Recorder:
         chunk = read_chunk(paths[-1])
         full = len(chunk) == self.manifest.rows
         self.number = len(paths) - 1 + full
-        self.kept = ([] if full else [chunk.piece], chunk.step, self.run.t, chunk.memory)
+        self.pending = ([] if full else [chunk.piece], chunk.step, self.run.t, chunk.memory)
         self.written = chunk.step
 
     def advance(self, progress: Callable[[int], None] | None, stop: Callable[[], bool] | None) -> None:
@@ -243,11 +243,11 @@ class _Recorder:
         return self.steps is not None and self.run.steps % self.steps == 0
 
     def _rows(self) -> int:
-        return sum(len(piece[0]) for piece in self.kept[0])
+        return sum(len(piece[0]) for piece in self.pending[0])
 
     def keep(self, piece: Piece) -> None:
         """Store states and memory in one assignment, so that they stay consistent after an interruption."""
-        self.kept = ([*self.kept[0], piece], self.run.steps, self.run.t, self.run.checkpoint())
+        self.pending = ([*self.pending[0], piece], self.run.steps, self.run.t, self.run.checkpoint())
 
     def checkpoint(self) -> None:
         """Write the states computed since the last checkpoint.
@@ -260,7 +260,7 @@ class _Recorder:
 
     def write(self) -> None:
         """Replace the current file, and begin the next one if it is full."""
-        pieces, step, reached, memory = self.kept
+        pieces, step, reached, memory = self.pending
         if step == self.written:
             return
         t, q, p, iterations = map(np.concatenate, zip(no_states(self.run.stepper.dimension), *pieces, strict=True))
@@ -268,7 +268,7 @@ class _Recorder:
         write_chunk(self.folder, self.number, Chunk(piece, step, memory))
         self.written, self.written_t = step, reached
         full = len(t) == self.manifest.rows
-        self.number, self.kept = self.number + full, ([] if full else [piece], step, reached, memory)
+        self.number, self.pending = self.number + full, ([] if full else [piece], step, reached, memory)
 
     @contextmanager
     def reporting_recovery(self) -> Iterator[None]:

@@ -119,7 +119,7 @@ def verify_arrays(
 def _subject(start: WholeStart) -> SystemUnderTest:
     """Return the loops on a few indices as an integrator of the unrolled system."""
     small = small_start(start.stepper.interface, start.arrays, start.p)
-    arrays = small.given
+    arrays = small.arrays
     names = [parameter.name for parameter in start.system.parameters]
     numbers = dict(zip(names, arrays.numbers, strict=True))
     written = unroll_sums(start.system, arrays.sizes, tables=arrays.places, parameters={**numbers, **arrays.fields})

@@ -33,7 +33,7 @@ MAX_COORDINATES = 9
 class SmallStart:
     """Arrays of small sizes and their momenta, as of :meth:`IndexedStepper.start`."""
 
-    given: RunArrays
+    arrays: RunArrays
     p: dict[str, Numbers]
 
 
@@ -47,10 +47,10 @@ def small_start(interface: Interface, arrays: RunArrays, p: Mapping[str, Numbers
     for window, rows in CUT_SIZES:
         start = _cut(interface, arrays, p, _indices_to_keep(interface, arrays, p, window, rows))
         try:
-            check_accesses(interface.layout, start.given.sizes, start.given.places)
+            check_accesses(interface.layout, start.arrays.sizes, start.arrays.places)
         except StateError:
             continue
-        count = sum(values.size for values in start.given.state.values())
+        count = sum(values.size for values in start.arrays.state.values())
         if count <= MAX_COORDINATES:
             return start
         result = result or start
@@ -142,7 +142,7 @@ class SmallStepper:
     interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
 
     def __init__(self, stepper: IndexedStepper, start: SmallStart, unrolled: MechanicalSystem) -> None:
-        self.stepper, self.arrays, self.unrolled = stepper, start.given, unrolled
+        self.stepper, self.arrays, self.unrolled = stepper, start.arrays, unrolled
         self.defaults = [float(value) for value in unrolled.defaults]
 
     def integrate(
