@@ -150,7 +150,7 @@ class TestAchievedErrors:
 
 
 def cost(advice: Advice, points: int) -> float:
-    """Evaluations for a unit of time, with three iterations' worth beside those of each step."""
+    """Evaluations for a unit of time, with those of three iterations in addition to those of each step."""
     (row,) = (row for row in advice.evidence if row.h == pytest.approx(advice.h))
     return (row.iterations + 3.0) * math.ceil(points / 8) * 8 / advice.h
 

@@ -1,4 +1,4 @@
-"""The benchmark of sums over indices: contenders move as ours do, and what is measured comes out."""
+"""The benchmark of indexed systems: all contenders compute the same motion, and measurements are reported."""
 
 import numpy as np
 import pytest

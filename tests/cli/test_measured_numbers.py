@@ -1,4 +1,4 @@
-"""Numbers that ``bench`` and ``reproduce`` print, recomputed by other code from the raw figures beside them.
+"""Numbers that ``bench`` and ``reproduce`` print, recomputed independently from the raw figures in the same output.
 
 Errors of positions and energies come from Runge-Kutta methods written out here and from SciPy's DOP853.
 """
@@ -155,7 +155,7 @@ def test_errors_of_bench_are_those_of_its_settings():
 
 
 def test_tables_of_bench_follow_from_methods_written_out():
-    """Errors of Tables 6 and 7 from the methods in NumPy; ratios and verdicts from the times beside them."""
+    """Errors of Tables 6 and 7 from the methods in NumPy; ratios and verdicts from the times in the same table."""
     text = output_of("bench", "tables", "hand-written", "--quick", "--peers", "", "-o", "report.json")
     tables, by_hand = json.loads(Path("report.json").read_text())["tables"]
     rows = {(row["table"], row["scheme"]): row for row in tables["rows"]}
@@ -214,7 +214,7 @@ def verlet(x: Array, h: float, steps: int) -> Array:
 
 
 def test_reproduced_numbers_of_keplers_problem():
-    """Energies and areas of figure 1 from the four methods in NumPy; its text from the table beside it."""
+    """Energies and areas of figure 1 from the four methods in NumPy; its text from its table."""
     text = output_of("reproduce", "figure-1", "--jobs", "1", "-o", "out") and Path("out/figure-1.txt").read_text()
     text = " ".join(text.split())
     with Path("out/figure-1.csv").open(newline="") as file:

@@ -582,7 +582,7 @@ def test_every_field_and_line_of_a_recorded_run_is_correct(springs):
         "folder": lambda x: x == "long.run",
         "steps": lambda x: x == 90,
         "states": lambda x: x == 31,
-        "final": lambda x: x == memory["final"],  # held against the saved states above
+        "final": lambda x: x == memory["final"],  # compared with the saved states above
         "finished": lambda x: x is True,
         "failure": lambda x: x is None,
         "missed": lambda x: x is None,

@@ -31,7 +31,7 @@ MODELS = {
 }
 REST = '[method]\nmethod = "svi"\ndegree = 4\n[run]\nspan = 1.0\n'
 WORDS = {"H": "0.1", "X": "1e-2", "G": "2+cos(q)", "FILE": "many.csv", "NAME": "made", "FOLDER": "made"}
-"""What stands for the capitals of the table."""
+"""Values of the placeholders in capitals of the table."""
 BUILT = "here the compiler would be called"
 
 

@@ -1,4 +1,4 @@
-"""The commands with a model of sums over indices."""
+"""The commands with a model of an indexed system."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ def assert_pattern_is_of_jacobian(system: sc.LagrangianSystem, method: Any) -> N
 
 
 def swing(**more: Any) -> sc.LagrangianSystem:
-    """A point that falls, and what acts on it beside that."""
+    """A falling point with a further force."""
     formula = "(x_dot**2 + y_dot**2)/2 - y"
     return sc.LagrangianSystem.from_text(
         name="swing", coordinates=["x", "y"], lagrangian=formula, parameters={"c": 0.1}, **more

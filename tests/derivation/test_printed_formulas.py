@@ -98,7 +98,7 @@ class Case:
         for letter, scalar in (("S", S), ("L'", along(L))):
             for name, xs in (("q", q), ("v", v), ("a", a)):
                 found[f"{letter}_{name}"] = [sympy.diff(scalar, x) for x in xs]
-        if self.forces:  # the adjoint of their linearisation, as the page says
+        if self.forces:  # the adjoint of their linearisation, as on the page
             pushed = [
                 [sum((sympy.diff(each, x) * m for x, m in zip(xs, lam, strict=True))) for each in f] for xs in (q, v)
             ]
@@ -782,7 +782,7 @@ CAPTIONS = {
     "rn,j": "r", "un,j": "u", "(bA)j": "bA", "βj": "beta", "γj": "gamma", "s1n,j": "s1", "s2n,j": "s2", "s3n,j": "s3",
     "s4n,j": "s4", "s5n,j": "s5",
 }  # fmt: skip
-"""Beginnings of what stands above tables of entries, and prefixes of their names."""
+"""First words of the text above tables of entries, and prefixes of the entries' names."""
 
 
 def cell_number(cell: Any) -> Any:
@@ -905,7 +905,7 @@ def test_text_is_the_same_equations(name):
             else:
                 assert part == "first guess", line
                 printed_guess = next(v for k, v in derived(name).initial_guess.items() if k.name == label)
-                assert found == of_python(str(printed_guess), numbers_of)  # held against the line in the page's test
+                assert found == of_python(str(printed_guess), numbers_of)  # compared with the line in the page's test
     assert next(ends, None) is None
     assert parts["equations"] == len(x)
 

@@ -1,4 +1,4 @@
-"""MathML: what stands there is the expression, symbol by symbol, and browsers can read it."""
+"""MathML equals the expression, symbol by symbol, and browsers can read it."""
 
 from __future__ import annotations
 

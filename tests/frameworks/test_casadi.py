@@ -125,7 +125,7 @@ def test_second_derivatives_are_those_of_runs():
 
 
 def test_ipopt_needs_fewer_iterations_with_the_exact_hessian():
-    """Multiple shooting of a rendezvous on a larger circle, ten impulses least in the mean square: 5, beside 25."""
+    """Multiple shooting of a rendezvous on a larger circle, ten impulses of least mean square: 5 instead of 25."""
     arcs, angle, radius, found = 10, 3.2, 1.3, {}
     end = ca.DM([radius * np.cos(angle), radius * np.sin(angle)])
     speed = ca.DM([-np.sin(angle), np.cos(angle)]) / np.sqrt(radius)

@@ -1,4 +1,4 @@
-"""LU factors in a band, with room for what exchanges of rows fill in: beside NumPy's of the full matrix."""
+"""LU factors in a band, with room for the fill-in of row exchanges, compared with NumPy's of the full matrix."""
 
 from __future__ import annotations
 

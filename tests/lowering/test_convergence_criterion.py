@@ -1,4 +1,4 @@
-"""Sweeps that contract slowly end at round-off, as fast ones do: held against the same equations in 60 digits."""
+"""Slowly converging iterations end at round-off, as fast ones do: compared with the same equations in 60 digits."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def header(folder: Path, after: int):
 ON, DONE, GIVEN_UP = 0, 1, -1
 ROUNDED = 2.0**-53
 TABLE = [
-    # change, the one before, tolerance, absolute, sweep; verdict; perhaps the change before both
+    # change, the one before, tolerance, absolute, iteration; verdict; perhaps the change before both
     ("shrinking", 1e-6, 1e-4, ROUNDED, 0, 3, ON),
     ("shrinking, but slowly where sweeps are far from rest", 0.8e-6, 1e-6, ROUNDED, 0, 5, GIVEN_UP),
     ("slowly in one sweep, but not in two", 0.8e-6, 1e-6, ROUNDED, 0, 5, ON, 2e-6),

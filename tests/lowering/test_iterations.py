@@ -35,7 +35,7 @@ EXPECTED = {
 """Of so many steps of the case's h, of an eighth of it, and so on."""
 ONE_ITERATION = SolverOptions(tolerance=1e300)
 CONTINUED = {"kepler/svi-3": 2, "cart/svi": 1 / 16, "field/gauss": 1 / 16, "double/sc": 1 / 16, "chain/svi-4": 1 / 2}
-"""Parts of the case's h at which sweeps are continued from two steps, and something is left to be done."""
+"""Fractions of the case's h at which iterates are extrapolated from two steps and further iterations are needed."""
 
 
 @cache

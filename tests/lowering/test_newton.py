@@ -1,4 +1,4 @@
-"""Newton's iteration: the band, its order, exchanges of rows within it, and factors kept from step to step."""
+"""Newton's iteration: the band, its order, row exchanges within it, and factors reused from step to step."""
 
 import random
 from dataclasses import replace
@@ -74,7 +74,7 @@ def test_the_order_of_the_coordinates_does_not_matter(seed):
 
 @pytest.mark.parametrize("method", [SVI(2), SCVI(2), SpectralCollocation(2)], ids=lambda method: method.name)
 def test_rows_are_pivoted_within_the_band(method):
-    """Masses x_dot y_dot have no diagonal: no pivot stands where it is needed. In u = x + y, w = x - y they have."""
+    """Masses x_dot y_dot have no diagonal: every diagonal pivot is zero. In u = x + y, w = x - y they have."""
     pairs = range(8)
     kinetic = " + ".join(f"x{i}_dot*y{i}_dot" for i in pairs)
     springs = "".join(f" - x{i}*y{i} - (x{i} - y{i + 1})**2/3" for i in list(pairs)[:-1])

@@ -33,7 +33,7 @@ def bodies(name: str, count: int, **extra: object) -> sc.LagrangianSystem:
 
 
 def driven(name: str, count: int) -> sc.LagrangianSystem:
-    """Forces, damping and time beside the families."""
+    """Forces, damping and time dependence in addition to the term groups."""
     forces = {"x0": "-c*x0_dot**3", "y1": "c*x1*cos(t)"}
     return bodies(name, count, forces=forces, damping="c/5")
 

@@ -56,7 +56,7 @@ def test_predictor_follows_a_polynomial_across_step_size_changes(method):
     system = sc.problem("double-pendulum").system
     fixed_point = program_of(system, method).fixed_point
     predictor, points = predictor_of(fixed_point), np.array(fixed_point.guess.abscissae, dtype=float)
-    accelerations = fixed_point.kept is StoredValues.ACCELERATIONS  # z = h a is kept
+    accelerations = fixed_point.kept is StoredValues.ACCELERATIONS  # z = h a is stored
 
     def curve(t):
         return 1.0 + t - 2.0 * t**3 + t**5

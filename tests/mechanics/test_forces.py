@@ -1,4 +1,4 @@
-"""Forces beside the potential: how they are given, and what is made of them."""
+"""Nonconservative forces: their definition and their derived expressions."""
 
 from __future__ import annotations
 

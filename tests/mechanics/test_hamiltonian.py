@@ -238,7 +238,7 @@ def test_compositions_accept_a_separable_hamiltonian(sample) -> None:
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_hamiltonian_without_a_lagrangian(method, error) -> None:
-    """q' = q, p' = -p; q p is a quadratic invariant, kept by the symplectic methods to round-off."""
+    """q' = q, p' = -p; q p is a quadratic invariant, conserved by the symplectic methods to round-off."""
     stepper = compile_stepper(hyperbolic(), method, flags=QUICK)
     run = stepper.integrate([1.0], [1.0], h=0.1, steps=10)
     assert abs(run.q[-1, 0] - np.e) < error

@@ -1,4 +1,4 @@
-"""Systems of sums over indices: their form, their symmetries, and what they are written out."""
+"""Indexed systems: their form, their symmetries, and their unrolled systems."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Written-out Lagrangians gathered into sums over indices: the same motion, few families, and what is refused."""
+"""Lagrangians rolled into indexed sums: the same motion, few term groups, and errors."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Constraints beside another solution: multipliers as unknowns of a differential-algebraic equation, by IDA."""
+"""Constraints compared with IDA: multipliers as unknowns of a differential-algebraic equation."""
 
 from __future__ import annotations
 

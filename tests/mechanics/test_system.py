@@ -351,7 +351,7 @@ def test_large_coupled_mass_matrix_is_accepted() -> None:
 
 
 def test_rates_along_a_curve_are_those_of_its_taylor_series():
-    """dL/dt and d2L/dt2 of a system with velocities in every term, beside L along a given curve of time."""
+    """dL/dt and d2L/dt2 of a system with velocities in every term, compared with L along a prescribed curve of time."""
     system = LagrangianSystem.from_text(
         name="twisted",
         coordinates=["x", "y"],

@@ -1,4 +1,4 @@
-"""Motions beside small changes of them: the variational equations of what can be written down."""
+"""Variational equations of systems, compared with differences of motions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Holonomic constraints: orders against minimal coordinates, what is kept, and what keeps it."""
+"""Holonomic constraints: orders against minimal coordinates, conserved quantities."""
 
 import re
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The mechanisms of ``examples/joints.py`` beside closed forms, reduced coordinates and the statics of trusses."""
+"""The mechanisms of ``examples/joints.py`` against closed forms, reduced coordinates and the statics of trusses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ran(mechanism: Any, steps: int = 200) -> Any:
 
 
 def reduced(lagrangian: str, start: list[float], velocity: list[float], t: np.ndarray, **parameters: float) -> Any:
-    """(n, m) positions of the same motion in coordinates that need no constraint, by steps of their own lengths."""
+    """(n, m) positions of the same motion in coordinates that need no constraint, by adaptive steps."""
     names = [f"u{k}" for k in range(len(start))]
     system = LagrangianSystem.from_text(
         name="reduced", coordinates=names, lagrangian=lagrangian, parameters={"g": G, **parameters}

@@ -1,4 +1,4 @@
-"""Constraints of velocities: order 2s, closed forms of sleigh and disk, what is kept, what they go with."""
+"""Nonholonomic constraints: order 2s, closed forms of sleigh and disk, conserved quantities, combinations."""
 
 import numpy as np
 import pytest

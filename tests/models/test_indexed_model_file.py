@@ -1,4 +1,4 @@
-"""Model files of sums over indices: arrays by number, list, file and formula; sizes; what is refused."""
+"""Model files of indexed systems: arrays by number, list, file and formula; sizes; errors."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ steps = 4
 
 @pytest.fixture
 def net(tmp_path: Path) -> Path:
-    """A model file with a table beside it."""
+    """A model file with a table in the same folder."""
     path = tmp_path / "net.toml"
     path.write_text(NET.replace('r = { file = "start.npz" }\n', ""))
     (tmp_path / "bonds.csv").write_text("a,b\n0,1\n1,2\n")
@@ -225,7 +225,7 @@ def test_tolerance_selects_adaptive_steps(net: Path) -> None:
 def test_generated_example_frees_memory_and_rejects_indices_out_of_range(
     net: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tables are files beside the program: whoever edits them gets a message, and no access outside an array."""
+    """Tables are files next to the program: invalid edits give a message, and no access outside an array."""
     monkeypatch.chdir(net.parent)
     invoked = CliRunner().invoke(main, ["generate", str(net), "-o", "net_svi"])
     assert invoked.exit_code == 0, invoked.output

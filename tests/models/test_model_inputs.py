@@ -41,7 +41,7 @@ T, U = (0.0, 0.37, 0.9, 1.41, 2.05, 2.6), (0.0, 1.2, -0.7, 0.4, 1.9, -1.0)
 
 @pytest.fixture
 def file(tmp_path):
-    """A model file with its table in a folder beside it."""
+    """A model file with its table in a neighbouring folder."""
     (tmp_path / "tables").mkdir()
     _write(tmp_path / "tables" / "u.csv", "t,u")
     (tmp_path / "model.toml").write_text(MODEL)

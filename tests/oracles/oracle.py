@@ -143,7 +143,7 @@ def differences(residual: Callable[[np.ndarray], np.ndarray], x: np.ndarray, wid
 def newton(
     residual: Callable[[np.ndarray], np.ndarray], guess: np.ndarray, *, digits: int = 40, width: str = "1e-15"
 ) -> np.ndarray:
-    """The zero near ``guess``; the Jacobian is kept once the updates are small."""
+    """Return the zero near ``guess``; the Jacobian is reused once the updates are small."""
     x, size = guess.copy(), mp.inf
     for _ in range(60):
         if size > mp.mpf("1e-5"):

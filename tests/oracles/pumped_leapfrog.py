@@ -16,7 +16,7 @@ ROWS = np.array(
     ]
 )
 STEPS, EVERY = 150, 50
-"""Three pieces of at most 64 steps; kept states do not stand at their ends."""
+"""Three segments of at most 64 steps; no saved state is at their ends."""
 
 
 def stepper():

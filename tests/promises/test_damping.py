@@ -154,7 +154,7 @@ def test_momentum_maps_decay_exactly_and_work_is_reported():
 
 
 def test_damping_with_adaptive_steps_ensembles_and_hamiltonians():
-    """Lanes with rates of their own; H, its Lagrangian, forces beside; what is held by constraints."""
+    """Lanes with different rates; H, its Lagrangian, additional forces; constrained systems."""
     hamiltonian = HamiltonianSystem.from_text(
         name="damped from H",
         coordinates=["x"],

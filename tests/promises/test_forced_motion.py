@@ -1,4 +1,4 @@
-"""Forced motion: the order of every method is that without forces, momentum maps that forces do not touch are kept.
+"""Forced motion: the order of every method is that without forces, momentum maps unaffected by forces are conserved.
 
 The reference is SciPy's DOP853 on accelerations that SymPy solves for, which shares nothing with the package.
 """

@@ -96,7 +96,7 @@ def imports(tree: ast.Module) -> Iterator[str]:
 
 
 def own_module(name: str) -> str | None:
-    """The module of this package that a dotted name stands in, or None."""
+    """Return the module of this package that defines a dotted name, or None."""
     package, *parts = name.split(".")
     if package != PACKAGE.name:
         return None

@@ -29,7 +29,7 @@ def fresh() -> dict[str, str]:
 
 
 def stored() -> dict[str, str]:
-    """Text by file name, as it stands in the folder."""
+    """Return the text of each file of the folder, by name."""
     return {
         path.relative_to(FOLDER).as_posix(): path.read_bytes().decode("utf-8")
         for path in sorted(FOLDER.glob("**/*.[ch]"))

@@ -1,4 +1,4 @@
-"""Text of integrators of sums over indices: strict C99, in style, as long for any number of coordinates."""
+"""Source of integrators of indexed systems: strict C99, formatted, of the same length for any number of coordinates."""
 
 import subprocess
 from pathlib import Path

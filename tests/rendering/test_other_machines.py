@@ -73,7 +73,7 @@ def test_folder_compiles_to_a_program_for_another_machine(target, tmp_path):
     ids=lambda each: each if isinstance(each, str) else type(each).__name__,
 )
 def test_an_arm_processor_computes_the_same_bits(name, method, tmp_path):
-    """One libm, roundings fixed by flags: 17 digits of every state, and steps of their own lengths, too."""
+    """One libm, roundings fixed by flags: 17 digits of every state, also with adaptive steps."""
     needs(QEMU)
     sources = [str(source) for source in sorted(folder_for(name, method, tmp_path).glob("*.c"))]
     message = {}

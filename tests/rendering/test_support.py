@@ -42,7 +42,7 @@ def output_of(program: str, folder: Path, *flags: str) -> str:
 
 
 def written(source: Source, folder: Path) -> str:
-    """The source as one file, beside its header; its prefix."""
+    """Return the source as one file with its header, and its prefix."""
     alone = source.amalgamated()
     (folder / f"{alone.prefix}.h").write_text(alone.header)
     (folder / f"{alone.prefix}.c").write_text(alone.code)

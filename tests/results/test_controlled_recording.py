@@ -1,4 +1,4 @@
-"""Runs in a folder whose steps choose their length: continued bit for bit, extended, read, and on the command line."""
+"""Recorded runs with adaptive steps: continued bit for bit, extended, read, and on the command line."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def test_an_exponent_of_henon_and_heiles_is_the_published_one(galaxy):
 
 
 def test_a_saddle_has_the_exponents_of_its_linear_motion():
-    """x'' = a^2 x beside y'' = -b^2 y: a, 0, 0, -a; by a method of high order."""
+    """Exponents of x'' = a^2 x with y'' = -b^2 y are a, 0, 0, -a; by a method of high order."""
     saddle = LagrangianSystem.from_text(
         name="saddle", coordinates=["x", "y"], lagrangian="(x_dot**2 + y_dot**2 + 0.09*x**2 - 4*y**2)/2"
     )

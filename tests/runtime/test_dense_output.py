@@ -1,4 +1,4 @@
-"""States between steps: continuous, of the method's order, the kept ones at both ends; and the solve_ivp-like call."""
+"""Dense output: continuous, of the method's order, equal to the saved states at both ends; the solve_ivp-like call."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ensembles whose steps choose their length: each trajectory its own steps and its own end."""
+"""Ensembles with adaptive steps: each trajectory has its own steps and its own end."""
 
 from __future__ import annotations
 

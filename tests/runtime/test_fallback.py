@@ -22,7 +22,7 @@ from scvi_codegen.runtime.core.stepper import Stepper
 pytestmark = pytest.mark.usefixtures("as_users_compile")
 
 LONG = 0.2
-"""A step of the double pendulum on which sweeps fail now and then, and Newton's iteration does not."""
+"""A step of the double pendulum at which the fixed-point iteration sometimes fails and Newton's iteration converges."""
 
 each_method = pytest.mark.parametrize(
     "method",

@@ -1,4 +1,4 @@
-"""Integrators of sums over indices, held against those of the systems written out, which are derived on another way."""
+"""Integrators of indexed systems, compared with those of the unrolled systems, which are derived independently."""
 
 import pickle
 from dataclasses import dataclass
@@ -124,7 +124,7 @@ def test_array_system_equals_the_unrolled_system(name: str, method: str) -> None
 
 @pytest.mark.parametrize("method", ["svi:4", "gauss:3", "svi:9"])
 def test_hamiltonian_array_system_equals_the_unrolled_system(method: str) -> None:
-    """The discrete nonlinear Schroedinger equation on a net; its norm, an angular momentum of all phases, is kept."""
+    """Discrete nonlinear Schroedinger equation on a net; its norm, the angular momentum of all phases, is conserved."""
     field = sc.HamiltonianSystem.from_text(
         name="field",
         coordinates=["q[N]"],

@@ -1,4 +1,4 @@
-"""Constraints of sums over indices: rods and pins over tables, beside the system written out, and SciPy."""
+"""Constraints of indexed systems: rods and pins over tables, compared with the unrolled system and SciPy."""
 
 import subprocess
 

@@ -1,4 +1,4 @@
-"""Runs of sums over indices beside those written out: controlled steps, events, inputs, states between."""
+"""Runs of indexed systems compared with unrolled ones: controlled steps, events, inputs, dense output."""
 
 import math
 import pickle
@@ -83,7 +83,7 @@ class TestControlledSteps:
         stepper, other = steppers
         run = stepper.integrate(Q, velocity=V, t_end=10.0, tolerance=tolerance)
         exact = other.integrate(Q, velocity=V, t_end=10.0).q[-1]
-        assert run.step_error <= 2.0 ** (14 / 4) * tolerance  # what a rung too many of order 12 does
+        assert run.step_error <= 2.0 ** (14 / 4) * tolerance  # one level of the step-size grid too many, at order 12
         error = np.abs(run.q["q"][-1] - exact).max() / np.abs(exact).max()
         assert error < 10.0 * run.steps * tolerance
         assert error > 1e-3 * tolerance  # no more work than was asked for

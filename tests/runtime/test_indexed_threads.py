@@ -1,4 +1,4 @@
-"""Threads that share the steps of sums over indices: no bit depends on their number, and every term is counted once."""
+"""Threads that share the steps of indexed systems: no bit depends on their number, and every term is counted once."""
 
 import os
 import signal
@@ -147,7 +147,7 @@ def test_terms_are_distributed_over_threads(name: str) -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("name", CASES)
 def test_every_term_is_counted_once(name: str, threads: int) -> None:
-    """A leapfrog step beside NumPy's forces."""
+    """A leapfrog step compared with one by NumPy's forces."""
     case, q, h = CASES[name], start_of(name), 1e-3
     run = stepper_of(name, "stoermer-verlet").integrate(q, h=h, steps=1, threads=threads, **case.given)
     there = q + h * (h / 2 * case.forces(q))

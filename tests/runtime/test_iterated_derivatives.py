@@ -24,7 +24,7 @@ RUBBED = LagrangianSystem.from_text(
     forces={"x": "-r*x_dot*(1 + a**2)", "a": "r*x*x_dot - a_dot*r/2"},
     parameters={"m": 2.0, "r": 0.4},
 )
-"""Forces of velocities, so that no matrix of slopes is symmetric."""
+"""Velocity-dependent forces, so that no Jacobian is symmetric."""
 
 CASES = {
     "whirl": (WHIRL, SVI(2, "gauss-lobatto:5"), 0.2),

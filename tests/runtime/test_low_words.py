@@ -257,7 +257,7 @@ def test_coefficients_and_their_low_words_are_exact(text: str) -> None:
 
 
 def test_work_is_the_sum_over_steps() -> None:
-    """Beside the exact sum, over steps that are taken again between kept states."""
+    """Comparison with the exact sum, over steps recomputed between saved states."""
     system = sc.LagrangianSystem.from_text(
         name="rubbed", coordinates=["x"], lagrangian="x_dot**2 - x**2", forces={"x": "sin(3*t) - x_dot/5"}
     )
@@ -294,5 +294,5 @@ def test_low_words_enter_everywhere_the_state_does(name: str) -> None:
         own.run.advance(1)
         q, p, low_q, low_p = own.words()
         ends.append(np.concatenate([q + low_q, p + low_p]))
-    last = 2e-6 if name == "array" else 1e-14  # sweeps over arrays take the low word in from the second on
+    last = 2e-6 if name == "array" else 1e-14  # iterations over arrays take the low word in from the second on
     assert np.abs(ends[1] - ends[0]).max() < last

@@ -236,7 +236,7 @@ def test_missing_inputs_are_not_zero_and_time_transformations_not_fixed_steps():
 
 
 def test_names_of_a_state_are_unique():
-    """A coordinate called p_x beside x: the momentum of x has another name."""
+    """A coordinate called p_x in addition to x: the momentum of x has another name."""
     plane = LagrangianSystem.from_text(
         name="plane", coordinates=["x", "p_x"], lagrangian="(x_dot**2 + p_x_dot**2)/2 - x**2/2 - p_x**2"
     )

@@ -1,4 +1,4 @@
-"""The estimate of a step's error beside the error: also where a coefficient of the curve passes through zero."""
+"""The error estimate of a step compared with the error, also where a coefficient of the curve passes through zero."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_newton_and_fixed_point_error_estimates_agree_for_momentum_unknowns():
     errors = [each.integrate(vortices.q, vortices.p, h=0.1, steps=1).step_error for each in steppers]
     assert errors[0] == pytest.approx(errors[1], rel=1e-9)
     with pytest.warns(sc.AccuracyWarning, match="too large"):
-        assert steppers[0].integrate(vortices.q, vortices.p, h=0.5, steps=50).step_error > 1e-3  # sweeps fail there
+        assert steppers[0].integrate(vortices.q, vortices.p, h=0.5, steps=50).step_error > 1e-3  # iterations fail
 
 
 @pytest.mark.parametrize("method", [sc.SVI(4), sc.SCVI(3), sc.Gauss(4)])

@@ -10,7 +10,7 @@ from scvi_codegen import SVI, StateError, compile_stepper, problem
 
 
 def test_runs_propagate_tangent_vectors():
-    """A chain of steps against differences of whole runs; with steps between kept states, and of their own lengths."""
+    """Tangents of a run against difference quotients of runs; with several steps per saved state and adaptive steps."""
     stepper = compile_stepper(problem("double-pendulum").system, SVI(4))
     start = np.array([0.9, -0.6, 1.0, 0.5])
     run = stepper.integrate(start[:2], start[2:], h=0.05, steps=40)
@@ -36,7 +36,7 @@ def test_kepler_orbit_has_the_exact_shear_after_a_period():
     run = stepper.integrate([0.5, 0.0], [0.0, np.sqrt(3.0)], h=2 * np.pi / 64, steps=64)
     monodromy = run.tangent()[-1]
     assert np.linalg.matrix_rank(monodromy - np.eye(4), tol=1e-4) == 1
-    gradient = np.array([4.0, 0.0, 0.0, np.sqrt(3.0)])  # of the energy: it is kept
+    gradient = np.array([4.0, 0.0, 0.0, np.sqrt(3.0)])  # of the energy, which is conserved
     assert_allclose(gradient @ monodromy, gradient, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Time is carried along: t + n h to the last bit, by runs, ensembles and the arithmetic beside them."""
+"""Compensated time: t + n h to the last bit, in runs, ensembles and the arithmetic of the test."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ MATH = re.compile(r"<math.*?</math>", re.DOTALL)
 
 @dataclass(frozen=True)
 class Entry:
-    """A formula with where it stands: section, title of the pair, the paragraph before it, and number."""
+    """A formula with its location: section, title of the pair, the paragraph before it, and number."""
 
     section: str
     pair: str

@@ -88,7 +88,7 @@ class Case:
 
     @property
     def options(self) -> SolverOptions | None:
-        """No defaults, beside parameters that are none."""
+        """Options that are not the defaults, if the parameters are not."""
         return SolverOptions(max_iterations=60) if self.given.own else None
 
     @property
@@ -242,7 +242,7 @@ def work_and_impulses(case: Case) -> None:
 
 
 def between(case: Case) -> None:
-    """Dense output, as states between those kept and as ``t_eval``."""
+    """Dense output, by ``states`` between the saved states and by ``t_eval``."""
     run = case.run
     low, high = sorted((run.t[0], run.t[-1]))
     times = np.random.default_rng(1).uniform(low, high, 7)
@@ -270,7 +270,7 @@ def _as_array(case: Case, text: str) -> str:
 
 
 def events(case: Case) -> None:
-    """Times and states of crossings; a terminal event, and where a run stands behind it."""
+    """Times and states of crossings; a terminal event, and the state of the run after it."""
     far = 3 if case.given.back else 10  # back in time friction makes motions grow
     steps, end = far * STEPS, case.given.t + far * case.span
     plan = {"t_end": end} if case.kind == "reversible" else {"steps": steps, "h": case.h}
@@ -500,7 +500,7 @@ SHORT = 9
 
 
 def derivatives(case: Case) -> None:
-    """Sensitivities, tangents and pullbacks of a run in several pieces, beside difference quotients of whole runs."""
+    """Sensitivities, tangents and pullbacks of a run in several segments, compared with difference quotients of it."""
     m = len(case.problem.q)
     names = [f"{k} {i}" for k in "qp" for i in range(m)]
     names += [f"parameter {name}" for name in case.values if name != STOP] + ["t", "h"]
@@ -527,7 +527,7 @@ def derivatives(case: Case) -> None:
 
 
 def hessians(case: Case) -> None:
-    """Products with the Hessian beside difference quotients of pullbacks."""
+    """Products with the Hessian compared with difference quotients of pullbacks."""
     m, width = len(case.problem.q), 1e-3
     seeds = np.random.default_rng(3).normal(size=(SHORT // case.given.save_every + 1, 2 * m))
     direction = np.random.default_rng(4).normal(size=2 * m)

@@ -18,7 +18,7 @@ import pytest
 __all__ = ["REQUIRED", "UndeclaredProgramError", "audit", "forget", "needs"]
 
 REQUIRED = frozenset(Path(__file__).with_name("required_programs.txt").read_text(encoding="utf-8").split())
-"""Names of the programs that the test command of the README may call on any machine, beside Python."""
+"""Names of the programs that the test command of the README may call on any machine, in addition to Python."""
 
 TRIED_BY_LIBRARIES = frozenset(["fc-list", "ldconfig"])
 """Programs that libraries call if they are there, and do without: Matplotlib's fonts, ``ctypes.util.find_library``."""

@@ -30,7 +30,7 @@ PACKAGE = "scvi_codegen."
 METHOD = scvi_codegen.SVI(2, "gauss-lobatto:3")
 """Of headers: one that keeps constraints."""
 PLAIN = (int, float, str, type, type(None))
-"""Defaults that are told; "there is none" is a type."""
+"""Defaults that are printed; "there is none" is a type."""
 
 
 def public() -> str:

@@ -1,4 +1,4 @@
-"""Random single steps of systems and methods: the error of each beside the estimate that its run reports.
+"""Random single steps of systems and methods: the error of each compared with the estimate that its run reports.
 
 A trial is a state and a step size, log-uniform over five decades up to three periods. Its reference is the motion by
 short steps of SVI(12), kept where SVI(9) agrees; their difference, and what a change of the state by rounding makes of
@@ -160,7 +160,7 @@ def compiled(name: str, method: Any, solver: str = "auto") -> Any:
 
 
 def displaced(q: Array, end: Array, other: Array) -> float:
-    """The difference of two ends of a step beside the state, as estimates are.
+    """Return the difference of two ends of a step relative to the state, as estimates are.
 
     The displacement is the larger of both: a step of three periods through a kick at its start may end at 200 times the
     distance of the motion, and so do its half steps, which the estimate compares it with.

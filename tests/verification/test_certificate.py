@@ -110,7 +110,7 @@ def test_inputs_are_certified_between_breakpoints() -> None:
         assert not certificate.not_measured
 
 
-# What a certificate says.
+# Contents of a certificate.
 
 
 def pendulum_certificate(**changes: object) -> Certificate:

@@ -1,4 +1,4 @@
-"""Certificates of sums over indices: whole integrators pass, faults of what has loops are caught."""
+"""Certificates of indexed systems: correct integrators pass, faults in their loops are detected."""
 
 from __future__ import annotations
 
