@@ -47,13 +47,13 @@ from scvi_codegen.frameworks.rebound import from_rebound as from_rebound
 from scvi_codegen.frameworks.rebound import to_rebound as to_rebound
 from scvi_codegen.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.frameworks.torch import torch_flow as torch_flow
+from scvi_codegen.mechanics.arrays.rolling import RolledSums as RolledSums
+from scvi_codegen.mechanics.arrays.rolling import roll_sums as roll_sums
+from scvi_codegen.mechanics.arrays.unrolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
-from scvi_codegen.mechanics.indexed.rolling import RolledSums as RolledSums
-from scvi_codegen.mechanics.indexed.rolling import roll_sums as roll_sums
-from scvi_codegen.mechanics.indexed.unrolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry as check_symmetry
@@ -75,8 +75,8 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
+from scvi_codegen.models.array_model import IndexedModel as IndexedModel
 from scvi_codegen.models.fmu import generate_fmu as generate_fmu
-from scvi_codegen.models.indexed_model import IndexedModel as IndexedModel
 from scvi_codegen.models.model import Model as Model
 from scvi_codegen.models.model_file import load_model as load_model
 from scvi_codegen.models.model_file import save_model as save_model
@@ -98,6 +98,9 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
+from scvi_codegen.runtime.arrays.run import IndexedRun as IndexedRun
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper as IndexedStepper
+from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory as IndexedTrajectory
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.runtime.core.stepper import Stepper as Stepper
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory as EnsembleTrajectory
@@ -105,9 +108,6 @@ from scvi_codegen.runtime.estimation.fitting import Fit as Fit
 from scvi_codegen.runtime.estimation.fitting import fit as fit
 from scvi_codegen.runtime.events.event import Crossings as Crossings
 from scvi_codegen.runtime.events.event import Event as Event
-from scvi_codegen.runtime.indexed.run import IndexedRun as IndexedRun
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper as IndexedStepper
-from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory as IndexedTrajectory
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory as DrivenTrajectory
 from scvi_codegen.runtime.orbits.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from scvi_codegen.runtime.orbits.solver import periodic_orbit as periodic_orbit

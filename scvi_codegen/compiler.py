@@ -48,10 +48,10 @@ from scvi_codegen.lowering.solvers.rattle import rattle_of
 from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of
 from scvi_codegen.lowering.solvers.splitting import splitting_of
 from scvi_codegen.lowering.step_density import density_of
+from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.arrays.unrolling import unroll_sums
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
-from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import rolled
@@ -73,10 +73,10 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.validation.argument_types import MAPPING, SWITCH, TEXT, TEXTS, checks_arguments
 
 __all__ = ["c_identifier", "compile_stepper", "describe", "generate_array_source", "generate_source", "program_of"]

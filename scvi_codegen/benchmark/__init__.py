@@ -22,7 +22,7 @@
     control_loop        cost of a control step, and of the bare C function
     lattices            indexed systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
     large_cases         the indexed systems; threads: their steps with several threads
-    indexed_energies    their energies over a hundred thousand steps
+    array_energies    their energies over a hundred thousand steps
     thousand_bodies     a thousand bodies; REBOUND
     compilers           the same source with several compilers, and for several processors
 
@@ -41,6 +41,7 @@ from typing import Any
 
 from scvi_codegen.benchmark.adaptive import run_adaptive
 from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
+from scvi_codegen.benchmark.array_energies import run_energies
 from scvi_codegen.benchmark.cases import CASES
 from scvi_codegen.benchmark.cold_start import run_cold_start
 from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
@@ -54,7 +55,6 @@ from scvi_codegen.benchmark.control_loop import run_control_loop
 from scvi_codegen.benchmark.drift import run_drift
 from scvi_codegen.benchmark.forced_cases import FORCED_CASES
 from scvi_codegen.benchmark.hand_written import run_hand_written
-from scvi_codegen.benchmark.indexed_energies import run_energies
 from scvi_codegen.benchmark.lattices import run_growth, run_lattices
 from scvi_codegen.benchmark.machine import machine
 from scvi_codegen.benchmark.mechanisms import run_mechanisms

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scvi_codegen.benchmark.cases import Array
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 
 __all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "waves"]
 

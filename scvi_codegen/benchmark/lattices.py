@@ -257,7 +257,7 @@ def _growth(plan: Plan, report_activity: ReportActivity) -> Iterator[dict[str, A
                 command = [
                     sys.executable,
                     "-m",
-                    "scvi_codegen.benchmark.contenders.indexed_process",
+                    "scvi_codegen.benchmark.contenders.array_process",
                     method,
                     name,
                     str(size),

@@ -12,7 +12,7 @@ from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, cloth, ri
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.runtime.indexed.run import IndexedRun
+from scvi_codegen.runtime.arrays.run import IndexedRun
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["run_threads"]

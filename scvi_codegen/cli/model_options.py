@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.reparametrisation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
-from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, read_model_file
 from scvi_codegen.models.problems import PROBLEMS, problem

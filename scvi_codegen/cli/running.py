@@ -18,8 +18,8 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
 from scvi_codegen.runtime.core.validation import Array
-from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
 from scvi_codegen.runtime.run.accuracy import TOLERABLE_ERROR, without_accuracy_warnings

@@ -13,7 +13,7 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.formatting import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
-from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run.global_error import GlobalError

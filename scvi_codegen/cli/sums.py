@@ -17,13 +17,13 @@ from scvi_codegen.cli.memory import check_state_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
-from scvi_codegen.runtime.indexed.interface import Numbers
-from scvi_codegen.runtime.indexed.run import IndexedRun
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
-from scvi_codegen.runtime.indexed.trajectory import IndexedRecord, IndexedTrajectory, check_npz
+from scvi_codegen.runtime.arrays.interface import Numbers
+from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.trajectory import IndexedRecord, IndexedTrajectory, check_npz
 
 __all__ = ["reject_options", "run_indexed", "with_solver"]
 

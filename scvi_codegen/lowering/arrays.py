@@ -17,8 +17,8 @@ from scvi_codegen.lowering.solvers.rattle import constrained_steps
 from scvi_codegen.lowering.solvers.selection import iteration_of
 from scvi_codegen.lowering.solvers.separable import separable_iteration
 from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.discretise import discretise

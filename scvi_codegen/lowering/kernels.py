@@ -7,13 +7,13 @@ from dataclasses import replace
 
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.indexed import IndexedTerm
-from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.formulas.array_forces import IndexedForce
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
-from scvi_codegen.mechanics.indexed.masses import MassTerm
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.masses import MassTerm
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
 __all__ = ["comment_text", "damping_kernel", "integrand_kernel", "looped_kernel", "system_kernel"]

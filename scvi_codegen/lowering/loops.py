@@ -8,9 +8,9 @@ from functools import partial
 
 from sympy import Add, Expr, S, Symbol
 
+from scvi_codegen.formulas.array_forces import IndexedForce
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedTerm
-from scvi_codegen.formulas.indexed_forces import IndexedForce
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.constraints import ConstrainedSteps
 from scvi_codegen.ir.kernel import Constant, Load, LoopedKernel
@@ -18,7 +18,7 @@ from scvi_codegen.ir.numbers import exact_number
 from scvi_codegen.ir.program import LoopedTerms, Program
 from scvi_codegen.lowering.kernels import looped_kernel
 from scvi_codegen.lowering.lattices import reach_of
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 

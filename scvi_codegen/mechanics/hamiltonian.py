@@ -21,11 +21,11 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.translation import Translation, sympy_expression
+from scvi_codegen.mechanics.arrays.elements import unrolled_fields
+from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.constraints import constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import forces_by_coordinate
-from scvi_codegen.mechanics.indexed.elements import unrolled_fields
-from scvi_codegen.mechanics.indexed.system import ArrayHamiltonian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import legendre_dual
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes

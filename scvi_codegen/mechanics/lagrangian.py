@@ -15,11 +15,11 @@ from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
 from scvi_codegen.formulas.translation import Translation, sympy_expression
+from scvi_codegen.mechanics.arrays.elements import unrolled_fields
+from scvi_codegen.mechanics.arrays.system import ArrayLagrangian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.constraints import check_constraints, constraints_of
 from scvi_codegen.mechanics.damping import damping_rate
 from scvi_codegen.mechanics.forces import dissipative_forces, forces_by_coordinate
-from scvi_codegen.mechanics.indexed.elements import unrolled_fields
-from scvi_codegen.mechanics.indexed.system import ArrayLagrangian, ArraySystem, are_arrays
 from scvi_codegen.mechanics.plausibility import warn_of_mistakes
 from scvi_codegen.mechanics.regularity import null_direction, singular_part
 from scvi_codegen.mechanics.system import MechanicalSystem, named_parameters
@@ -119,7 +119,7 @@ class LagrangianSystem(MechanicalSystem):
     ) -> LagrangianSystem:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
-        With arrays the grammar is that of :mod:`scvi_codegen.formulas.indexed`. If all their sizes are numbers, their
+        With arrays the grammar is that of :mod:`scvi_codegen.formulas.arrays`. If all their sizes are numbers, their
         entries are coordinates q_0, q_1, .. like all others. Otherwise the sizes follow from the arrays of a run, or
         from ``sizes`` of :func:`~scvi_codegen.compile_stepper`.
 

@@ -52,7 +52,7 @@ entries of ``[initial]`` and ``[run]`` are the catalogue's. Written files are co
 
 Arrays whose sizes are numbers, ``coordinates = ["x", "q[3]"]``, have values by entry or by name,
 ``q = { x = 0.0, q = [1, 2, 3] }`` and ``"m[3]" = [1, 1, 2]``. Arrays whose sizes are names, ``["q[N]"]``, are those of
-:mod:`scvi_codegen.models.indexed_file`.
+:mod:`scvi_codegen.models.array_file`.
 
 Further sections, such as command-line options, can be merged over those of a file: they add and replace entries.
 '''
@@ -100,7 +100,7 @@ from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.indexed_model import IndexedModel
+    from scvi_codegen.models.array_model import IndexedModel
     from scvi_codegen.models.input_tables import InputTable
 
 __all__ = [
@@ -183,7 +183,7 @@ def _parsed(text: str, changes: Document | None, folder: str | os.PathLike[str])
         if not isinstance(content, dict):
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     if _has_arrays(document):
-        from scvi_codegen.models.indexed_file import read_indexed  # imported here: other models are read without NumPy
+        from scvi_codegen.models.array_file import read_indexed  # imported here: other models are read without NumPy
 
         return read_indexed(document, changes or {}, folder)
     for name in ARRAY_SECTIONS:

@@ -31,7 +31,7 @@ from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentT
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
-    from scvi_codegen.models.indexed_model import IndexedModel
+    from scvi_codegen.models.array_model import IndexedModel
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.program_source import Embedded, ExampleRun
 
@@ -80,10 +80,10 @@ def generate_package(
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
-    from scvi_codegen.models.indexed_model import IndexedModel  # imported here: folders are loaded without SymPy
+    from scvi_codegen.models.array_model import IndexedModel  # imported here: folders are loaded without SymPy
 
     if isinstance(model, IndexedModel):
-        from scvi_codegen.models.indexed_package import generate_sums
+        from scvi_codegen.models.array_package import generate_sums
 
         if embedded or single_file:
             option = "embedded" if embedded else "single_file"

@@ -20,15 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.indexed.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import checked_vector
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, checks_arguments, of
 from scvi_codegen.verification.certificate import Certificate, Check, Outcome, issued
@@ -157,7 +157,7 @@ def verify(
 def _of_arrays(
     system: ArraySystem, method: Method | str, q: Any, p: Any, *, h: Any, tolerance: float | None, **others: Any
 ) -> Certificate:
-    from scvi_codegen.verification.indexed import verify_arrays  # imported here: it imports modules of this package
+    from scvi_codegen.verification.arrays import verify_arrays  # imported here: it imports modules of this package
 
     if tolerance is not None:
         raise MethodError(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import indexed_energies, lattices, thousand_bodies, threads
+from scvi_codegen.benchmark import array_energies, lattices, thousand_bodies, threads
 from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
 from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
 from scvi_codegen.compiler import compile_stepper
@@ -89,7 +89,7 @@ def test_threads_are_measured():
 
 @pytest.mark.full
 def test_energies_stay_at_rounding():
-    for row in indexed_energies.run_energies(QUICK, quiet).rows:
+    for row in array_energies.run_energies(QUICK, quiet).rows:
         exact = row["by"].endswith("svi:8")
         assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from scvi_codegen import SVI, load_model
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.models.indexed_package import load_sums
+from scvi_codegen.models.array_package import load_sums
 from scvi_codegen.native.compilers import find_compiler
 
 RING = """
@@ -229,7 +229,7 @@ def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
     """Line in time, bodies in space, and a plane."""
     pytest.importorskip("matplotlib")
     from scvi_codegen.pictures.arrays import plot_arrays
-    from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
 
     shape = {"q[N]": (3, 4), "q[N, 2]": (3, 4, 2), "q[N, M]": (3, 4, 5)}[axes]
     values = np.arange(np.prod(shape), dtype=float).reshape(shape)

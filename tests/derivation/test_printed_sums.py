@@ -10,7 +10,7 @@ import pytest
 from printed_formulas import mp, tree_of_latex, value
 
 import scvi_codegen as sc
-from scvi_codegen.derivation.indexed import derive_sums
+from scvi_codegen.derivation.arrays import derive_sums
 
 COUNT, H, T, K = 5, 0.125, 0.375, 0.6875
 MASSES = [1.25, 0.75, 1.5, 2.0, 0.875]

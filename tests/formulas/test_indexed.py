@@ -3,7 +3,7 @@
 import pytest
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
-from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.arrays import IndexedTerm, parse_array, parse_indexed
 from scvi_codegen.formulas.symbols import symbol
 
 ARRAYS = [parse_array(text) for text in ("q[N]", "r[N, 3]", "u[NX, NY]", "k[B]")]

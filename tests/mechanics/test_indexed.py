@@ -5,10 +5,10 @@ import pytest
 import sympy
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
+from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.unrolling import unroll_sums
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import ArraySystem
-from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
 GRAVITY = "sum(i in N, m[i]*sum(a in 3, r_dot[i, a]**2)/2) + "

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.formulas.indexed import parse_array
+from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.models.array_values import read_array
 from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.native.compilers import find_compiler

@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import minimize
 
 import scvi_codegen as sc
-from scvi_codegen.derivation.indexed import derive_sums
+from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, SystemDefinitionError
-from scvi_codegen.models.indexed_package import generate_sums
+from scvi_codegen.models.array_package import generate_sums
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52

@@ -13,8 +13,8 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.indexed import saving as indexed_saving
-from scvi_codegen.runtime.indexed.memory import RUN_FIELDS
+from scvi_codegen.runtime.arrays import saving as indexed_saving
+from scvi_codegen.runtime.arrays.memory import RUN_FIELDS
 
 BONDS = [[0, 1], [1, 2]]
 Q = [1.0, 2.5, 3.0]

@@ -10,7 +10,7 @@ import pytest
 from random_steps import FAMILIES, WANTED, compiled, displaced, outcome, trials
 
 import scvi_codegen as sc
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.runtime.core.compiled_method import Variants
 
 QUICK = {

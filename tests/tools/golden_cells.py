@@ -20,8 +20,8 @@ from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_d
 
 from scvi_codegen.compiler import _ArraySources, _Sources, generate_source
 from scvi_codegen.lowering.arrays import one_coordinate
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.system import ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem

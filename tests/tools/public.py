@@ -20,7 +20,7 @@ import click
 import scvi_codegen
 from scvi_codegen.cli import main
 from scvi_codegen.methods import ARGUMENTS
-from scvi_codegen.models import indexed_file, model_file
+from scvi_codegen.models import array_file, model_file
 from scvi_codegen.runtime import distributed
 
 __all__ = ["RECORDED", "public"]
@@ -104,7 +104,7 @@ def _command_line(command: click.Command, words: str) -> Iterator[str]:
 
 def _model_files() -> Iterator[str]:
     """Sections and their keys; in brackets of a method those that it takes."""
-    for of, file in (("", model_file), (" of sums", indexed_file)):
+    for of, file in (("", model_file), (" of sums", array_file)):
         for section in file.SECTIONS:
             yield from (f"[{section}]{of} {key}".rstrip() for key in ("", *file.KEYS.get(section, ())))
     for method, keys in ARGUMENTS.items():

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import scvi_codegen as sc
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 
 Array = NDArray[np.float64]
 PERIODS, DECADES = 3.0, 5.0

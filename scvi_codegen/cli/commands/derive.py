@@ -11,10 +11,10 @@ from scvi_codegen.cli.command_group import check_writable, emit, reporting
 from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import reject_options
 from scvi_codegen.derivation import Start, derivation_html
+from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
-from scvi_codegen.derivation.indexed import derive_sums
-from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.array_model import IndexedModel
 
 __all__ = ["derive"]
 

@@ -9,8 +9,8 @@ import click
 from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import reject_options
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.fmu import generate_fmu
-from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.cross import TARGETS
 from scvi_codegen.rendering.program_source import Embedded

@@ -13,13 +13,13 @@ from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writab
 from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.indexed_model import IndexedModel
-from scvi_codegen.models.indexed_package import load_sums
+from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_package import load_sums
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.verification import Certificate
 
 __all__ = ["verify"]

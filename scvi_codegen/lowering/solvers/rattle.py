@@ -38,15 +38,15 @@ from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
 from scvi_codegen.lowering.solvers.velocity_tables import velocity_tables
-from scvi_codegen.mechanics.constraints import constraint_jacobian, nonholonomic_expressions
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.indexed.constraints import (
+from scvi_codegen.mechanics.arrays.constraints import (
     constraint_gradient,
     constraint_second_rate,
     constraint_text,
     coordinate_accesses,
 )
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.constraints import constraint_jacobian, nonholonomic_expressions
+from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Velocities

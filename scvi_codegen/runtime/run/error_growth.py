@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
+from scvi_codegen.runtime.arrays.run import IndexedRun
 from scvi_codegen.runtime.constraints.projection import projected
-from scvi_codegen.runtime.indexed.run import IndexedRun
 from scvi_codegen.runtime.run.accuracy import warnings_wanted
 from scvi_codegen.runtime.run.memory import Memory
 from scvi_codegen.runtime.run.step_plan import StepPlan

@@ -5,7 +5,7 @@
 Only the kernels l_f are differentiated, so neither compile time nor code size depends on the number of coordinates,
 which is determined by the arrays that a run starts from; kinetic energy is then a sum of m v**2/2 with constant m that
 may differ between elements. With known sizes they are systems of named coordinates
-(:mod:`scvi_codegen.mechanics.indexed.elements`), without restrictions.
+(:mod:`scvi_codegen.mechanics.arrays.elements`), without restrictions.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from typing import Any, ClassVar
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.array_constraints import parse_constraint
+from scvi_codegen.formulas.array_forces import IndexedForce, parse_force
+from scvi_codegen.formulas.array_latex import latex_sum
+from scvi_codegen.formulas.array_sympy import indexed_text
+from scvi_codegen.formulas.arrays import IndexedTerm, parse_array, parse_coordinate, parse_indexed
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
-from scvi_codegen.formulas.indexed import IndexedTerm, parse_array, parse_coordinate, parse_indexed
-from scvi_codegen.formulas.indexed_constraints import parse_constraint
-from scvi_codegen.formulas.indexed_forces import IndexedForce, parse_force
-from scvi_codegen.formulas.indexed_latex import latex_sum
-from scvi_codegen.formulas.indexed_sympy import indexed_text
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop, Size
+from scvi_codegen.mechanics.arrays.constraints import check_constraint, constraint_text
+from scvi_codegen.mechanics.arrays.masses import MassTerm, check_form, masses_of, terms_at_rest
 from scvi_codegen.mechanics.damping import check_damping, damping_rate
-from scvi_codegen.mechanics.indexed.constraints import check_constraint, constraint_text
-from scvi_codegen.mechanics.indexed.masses import MassTerm, check_form, masses_of, terms_at_rest
 from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
@@ -58,7 +58,7 @@ class ArraySystem:
         terms: of the Lagrangian or the Hamiltonian.
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
-        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.indexed.constraints`).
+        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.constraints`).
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
     """
 
@@ -155,7 +155,7 @@ class ArraySystem:
         inputs: Sequence[str] = (),
         constraints: Sequence[str] = (),
     ) -> ArraySystem:
-        """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.indexed`.
+        """Read L or H from text of the grammar in :mod:`scvi_codegen.formulas.arrays`.
 
         Args:
             name: name of the system.

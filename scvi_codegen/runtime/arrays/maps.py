@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scvi_codegen.indices import IndexedMap
-from scvi_codegen.runtime.indexed.interface import Numbers
+from scvi_codegen.runtime.arrays.interface import Numbers
 
 __all__ = ["momentum_of"]
 

@@ -15,12 +15,12 @@ from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.runtime.arrays.dense_output import Continuation, states_between
+from scvi_codegen.runtime.arrays.events import IndexedCrossings, IndexedSearch
+from scvi_codegen.runtime.arrays.interface import Numbers
+from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.events.event import Event
-from scvi_codegen.runtime.indexed.dense_output import Continuation, states_between
-from scvi_codegen.runtime.indexed.events import IndexedCrossings, IndexedSearch
-from scvi_codegen.runtime.indexed.interface import Numbers
-from scvi_codegen.runtime.indexed.run import IndexedRun
-from scvi_codegen.runtime.indexed.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.dense_output import checked_times

@@ -6,16 +6,16 @@ from collections.abc import Iterator, Sequence
 
 from sympy import Expr, latex
 
-from scvi_codegen.formulas.indexed_latex import latex_entry, latex_sums
+from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.ir.constraints import ConstrainedSteps
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import lower_arrays
-from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms, constraint_text
-from scvi_codegen.mechanics.indexed.symmetry import momentum_maps
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.constraints import constraint_force_terms, constraint_text
+from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods.method import Method
 
 __all__ = ["derive_sums"]

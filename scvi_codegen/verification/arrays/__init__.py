@@ -18,20 +18,20 @@ from numpy.typing import ArrayLike
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.lowering.arrays import one_coordinate
-from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
-from scvi_codegen.mechanics.indexed.unrolling import unroll_sums
+from scvi_codegen.mechanics.arrays.system import ARRAYS, ArraySystem
+from scvi_codegen.mechanics.arrays.unrolling import unroll_sums
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
+from scvi_codegen.runtime.arrays.interface import read_arrays
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.runtime.core.stepper import Stepper
-from scvi_codegen.runtime.indexed.interface import read_arrays
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments, of
+from scvi_codegen.verification.arrays.small import SmallStepper, small_start
+from scvi_codegen.verification.arrays.whole import WholeStart, whole_checks
 from scvi_codegen.verification.certificate import Certificate, Finding, checked, issued
 from scvi_codegen.verification.convergence import convergence_checks
-from scvi_codegen.verification.indexed.small import SmallStepper, small_start
-from scvi_codegen.verification.indexed.whole import WholeStart, whole_checks
 from scvi_codegen.verification.stepping import step_checks
 from scvi_codegen.verification.structure import structure_checks
 from scvi_codegen.verification.system_under_test import State, SystemUnderTest

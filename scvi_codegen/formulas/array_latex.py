@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sympy import latex
 
-from scvi_codegen.formulas.indexed import IndexedTerm
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop, Place
 
@@ -14,7 +14,7 @@ __all__ = ["latex_entry", "latex_sum", "latex_sums"]
 def latex_sum(term: IndexedTerm) -> str:
     r"""Return a term in LaTeX.
 
-    >>> from scvi_codegen.formulas.indexed import parse_array, parse_indexed
+    >>> from scvi_codegen.formulas.arrays import parse_array, parse_indexed
     >>> (term,) = parse_indexed("sum(i in 0..N-2, (q[i+1] - q[i])**2/2)", [parse_array("q[N]")], {})
     >>> print(latex_sum(term))
     \sum_{i=0}^{N-2} \left(\frac{\left(q_{i+1} - q_{i}\right)^{2}}{2}\right)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.models.indexed_model import IndexedModel
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.model_document import method_section
 from scvi_codegen.models.sections import Section
 

@@ -48,13 +48,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.errors import ModelFileError
-from scvi_codegen.formulas.indexed import parse_array
+from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.indices import Array
 from scvi_codegen.lowering.arrays import SOLVERS, one_coordinate
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods import fitted
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.array_values import is_filled, read_array
-from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.models.sections import (
     Document,
     Section,

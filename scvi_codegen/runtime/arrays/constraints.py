@@ -11,9 +11,9 @@ from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, warn
 from scvi_codegen.indices import Loop
 from scvi_codegen.native.options import REASONS, STATUS, SolverOptions
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
+from scvi_codegen.runtime.arrays.interface import Numbers
+from scvi_codegen.runtime.arrays.problem import IndexedProblem
 from scvi_codegen.runtime.constraints.rank import rank_deficiency
-from scvi_codegen.runtime.indexed.interface import Numbers
-from scvi_codegen.runtime.indexed.problem import IndexedProblem
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
 

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.interface import Numbers, check_accesses
+from scvi_codegen.runtime.arrays.memory import IndexedSnapshot
+from scvi_codegen.runtime.arrays.run import IndexedRun
 from scvi_codegen.runtime.events.event import ACCUMULATED, Event
-from scvi_codegen.runtime.indexed.interface import Numbers, check_accesses
-from scvi_codegen.runtime.indexed.memory import IndexedSnapshot
-from scvi_codegen.runtime.indexed.run import IndexedRun
 
 if TYPE_CHECKING:
-    from scvi_codegen.formulas.indexed import IndexedTerm
+    from scvi_codegen.formulas.arrays import IndexedTerm
 
 __all__ = ["IndexedCrossings", "IndexedSearch"]
 
@@ -255,7 +255,7 @@ class _Function:
         self.needs = {access.array.name for access, _ in accesses}
 
     def value(self, run: IndexedRun) -> float:
-        from scvi_codegen.formulas.indexed_values import Elements  # here, because it imports SymPy
+        from scvi_codegen.formulas.array_symbols import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
         stored = run.problem.arrays
@@ -281,7 +281,7 @@ def _momenta(interface: Interface) -> dict[str, str]:
 
 
 def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
-    from scvi_codegen.formulas.indexed import parse_indexed  # here, because it imports SymPy
+    from scvi_codegen.formulas.arrays import parse_indexed  # here, because it imports SymPy
     from scvi_codegen.formulas.symbols import TIME, symbol
 
     axes = {array.name: array.axes for array in interface.layout.coordinates}

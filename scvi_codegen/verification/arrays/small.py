@@ -15,9 +15,9 @@ from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.indexed.interface import RunArrays, check_accesses
-from scvi_codegen.runtime.indexed.run import IndexedRun
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses
+from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 
 __all__ = ["SmallStepper", "small_start"]
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from sympy import Expr, Symbol
 
+from scvi_codegen.formulas.arrays import Bound, IndexedParser, term_of
 from scvi_codegen.formulas.grammar import parsed
-from scvi_codegen.formulas.indexed import Bound, IndexedParser, term_of
 from scvi_codegen.indices import Access, Array, Loop, Size
 
 __all__ = ["IndexedForce", "parse_force"]
@@ -55,7 +55,7 @@ def parse_force(
     Raises:
         ExpressionError: as :func:`parse_indexed`.
 
-    >>> from scvi_codegen.formulas.indexed import parse_array
+    >>> from scvi_codegen.formulas.arrays import parse_array
     >>> from scvi_codegen.formulas.symbols import symbol
     >>> q, v = parse_array("q[N]"), parse_array("q_dot[N]")
     >>> [str(force) for force in parse_force("q[i]", "-c*q_dot[i]", [q], [q, v], {"c": symbol("c")})]

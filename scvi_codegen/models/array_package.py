@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from scvi_codegen.compiler import generate_array_source
+from scvi_codegen.models.array_document import model_texts
+from scvi_codegen.models.array_model import IndexedModel
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.generated_folders import prefix_of, source_in
-from scvi_codegen.models.indexed_document import model_texts
-from scvi_codegen.models.indexed_model import IndexedModel
 from scvi_codegen.rendering.program_source import render_array_example
-from scvi_codegen.runtime.indexed.interface import read_arrays, read_state, table_limits
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, checks_arguments, of
 
 __all__ = ["generate_sums", "load_sums"]

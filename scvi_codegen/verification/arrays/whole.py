@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.formulas.indexed_values import Elements
+from scvi_codegen.formulas.array_symbols import Elements
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods.method import Method
-from scvi_codegen.runtime.indexed.interface import RunArrays
-from scvi_codegen.runtime.indexed.run import IndexedRun
-from scvi_codegen.runtime.indexed.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.interface import RunArrays
+from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.stepper import IndexedStepper
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
 __all__ = ["WholeStart", "whole_checks"]

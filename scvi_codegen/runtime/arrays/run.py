@@ -13,20 +13,20 @@ from scvi_codegen.native.arguments import checked_step
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.native.options import FAILURES, NOT_CONVERGED, SolverOptions, step_failure
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.core.validation import missing_input
-from scvi_codegen.runtime.indexed.constraints import check_reachable, constraint_values, multipliers
-from scvi_codegen.runtime.indexed.interface import Numbers, read_state
-from scvi_codegen.runtime.indexed.maps import momentum_of
-from scvi_codegen.runtime.indexed.memory import RUN_FIELDS, STATE, IndexedSnapshot, aligned, constraint_memory
-from scvi_codegen.runtime.indexed.problem import IndexedProblem
-from scvi_codegen.runtime.indexed.run_time_sizes import RunTimeSizes
-from scvi_codegen.runtime.indexed.saving import (
+from scvi_codegen.runtime.arrays.constraints import check_reachable, constraint_values, multipliers
+from scvi_codegen.runtime.arrays.interface import Numbers, read_state
+from scvi_codegen.runtime.arrays.maps import momentum_of
+from scvi_codegen.runtime.arrays.memory import RUN_FIELDS, STATE, IndexedSnapshot, aligned, constraint_memory
+from scvi_codegen.runtime.arrays.problem import IndexedProblem
+from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
+from scvi_codegen.runtime.arrays.saving import (
     damage_as_state_error,
     read_saved,
     restore_memory,
     saved_arrays,
     saved_bytes,
 )
+from scvi_codegen.runtime.core.validation import missing_input
 from scvi_codegen.runtime.run.descriptions import describe_run, short_title
 from scvi_codegen.runtime.run.one_thread import OneThread, alone
 from scvi_codegen.runtime.run.run import Run
@@ -291,7 +291,7 @@ class IndexedRun(OneThread, RunTimeSizes):
 
     @property
     def momentum_maps(self) -> Numbers:
-        """(count,) conserved quantities (:func:`~scvi_codegen.mechanics.indexed.symmetry.momentum_maps`)."""
+        """(count,) conserved quantities (:func:`~scvi_codegen.mechanics.arrays.symmetry.momentum_maps`)."""
         q, p = self.q, self.p
         return np.array([momentum_of(q[each.array], p[each.array], each) for each in self.interface.layout.maps])
 

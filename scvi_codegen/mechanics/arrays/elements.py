@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.indexed import IndexedTerm
-from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.formulas.array_forces import IndexedForce
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 
 __all__ = ["unrolled_fields"]
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays, field_values, number_values
 from scvi_codegen.runtime.core.validation import inputs_not_given, no_input
-from scvi_codegen.runtime.indexed.interface import Numbers, RunArrays, field_values, number_values
 
 __all__ = ["IndexedProblem"]
 

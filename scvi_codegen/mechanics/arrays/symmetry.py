@@ -18,8 +18,8 @@ from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, IndexedMap, Place, Size
-from scvi_codegen.mechanics.indexed.constraints import constraint_force_terms
-from scvi_codegen.mechanics.indexed.system import ArraySystem
+from scvi_codegen.mechanics.arrays.constraints import constraint_force_terms
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["momentum_maps"]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.indexed.interface import Numbers
-from scvi_codegen.runtime.indexed.problem import IndexedProblem
-from scvi_codegen.runtime.indexed.run import IndexedRun
+from scvi_codegen.runtime.arrays.interface import Numbers
+from scvi_codegen.runtime.arrays.problem import IndexedProblem
+from scvi_codegen.runtime.arrays.run import IndexedRun
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.dense_output import whole_steps, within
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.indexed import IndexedTerm, term_of
-from scvi_codegen.formulas.indexed_forces import IndexedForce
+from scvi_codegen.formulas.array_forces import IndexedForce
+from scvi_codegen.formulas.arrays import IndexedTerm, term_of
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
-from scvi_codegen.mechanics.indexed.system import ArrayHamiltonian, ArrayLagrangian, ArraySystem
+from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangian, ArraySystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary

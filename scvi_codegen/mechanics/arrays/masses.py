@@ -9,8 +9,8 @@ import sympy
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access, Array, Loop
 
 __all__ = ["MassTerm", "check_form", "masses_of", "terms_at_rest", "velocity_symbols"]

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from numpy.typing import ArrayLike
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.mechanics.arrays.elements import unrolled_fields
+from scvi_codegen.mechanics.arrays.system import ARRAYS, ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.indexed.elements import unrolled_fields
-from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.lowering.arrays import SOLVERS, check_solver
-from scvi_codegen.mechanics.indexed.system import ARRAYS, ArraySystem
+from scvi_codegen.mechanics.arrays.system import ARRAYS, ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.time_span import TimeSpan
 from scvi_codegen.representation import LONGEST, clipped
@@ -16,9 +16,9 @@ from scvi_codegen.validation.argument_types import check_kind
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.indexed.run import IndexedRun
-    from scvi_codegen.runtime.indexed.stepper import IndexedStepper
-    from scvi_codegen.runtime.indexed.trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.arrays.run import IndexedRun
+    from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+    from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
     from scvi_codegen.runtime.run.global_error import GlobalError
 
 __all__ = ["IndexedModel"]

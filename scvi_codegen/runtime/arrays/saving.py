@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.rendering.source import Interface
-from scvi_codegen.runtime.indexed.interface import RunArrays, read_arrays
-from scvi_codegen.runtime.indexed.memory import RUN_FIELDS, STATE
+from scvi_codegen.runtime.arrays.interface import RunArrays, read_arrays
+from scvi_codegen.runtime.arrays.memory import RUN_FIELDS, STATE
 
 __all__ = ["damage_as_state_error", "read_saved", "restore_memory", "saved_arrays", "saved_bytes"]
 

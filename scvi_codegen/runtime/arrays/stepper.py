@@ -17,16 +17,16 @@ from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.thread_partition import MOST_THREADS
 from scvi_codegen.representation import LONGEST, clipped
+from scvi_codegen.runtime.arrays.constraints import consistent, project
+from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays, read_arrays
+from scvi_codegen.runtime.arrays.problem import IndexedProblem
+from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
+from scvi_codegen.runtime.arrays.trajectory import IndexedRecord, IndexedTrajectory
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import check_inputs_given, check_left_to_inputs, inputs_not_given
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.runtime.indexed.constraints import consistent, project
-from scvi_codegen.runtime.indexed.interface import Numbers, RunArrays, read_arrays
-from scvi_codegen.runtime.indexed.problem import IndexedProblem
-from scvi_codegen.runtime.indexed.run import IndexedRun
-from scvi_codegen.runtime.indexed.run_time_sizes import RunTimeSizes
-from scvi_codegen.runtime.indexed.trajectory import IndexedRecord, IndexedTrajectory
 from scvi_codegen.runtime.inputs.segments import (
     advance_to,
     checked_inputs,

@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
+from scvi_codegen.formulas.arrays import IndexedTerm
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
-from scvi_codegen.formulas.indexed import IndexedTerm
 from scvi_codegen.indices import Access, Array
 
 __all__ = [

@@ -14,8 +14,8 @@ from itertools import chain
 from sympy import Symbol
 
 from scvi_codegen.errors import ExpressionError
+from scvi_codegen.formulas.arrays import IndexedParser, IndexedTerm, term_of
 from scvi_codegen.formulas.grammar import parsed
-from scvi_codegen.formulas.indexed import IndexedParser, IndexedTerm, term_of
 from scvi_codegen.indices import Array, Loop
 
 __all__ = ["parse_constraint"]
@@ -30,12 +30,12 @@ def parse_constraint(
 
     Args:
         text: the constraint.
-        arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.indexed.parse_indexed`.
+        arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.arrays.parse_indexed`.
 
     Raises:
         ExpressionError: as there, and for a sum over a whole array, which would couple all of its entries.
 
-    >>> from scvi_codegen.formulas.indexed import parse_array
+    >>> from scvi_codegen.formulas.arrays import parse_array
     >>> term = parse_constraint("(q[i+1] - q[i])**2 = 1 for i in 0..N-2", [parse_array("q[N]")], {})
     >>> print(term.formula, "for", *term.loops)
     (q[i+1] - q[i])**2 - 1 for i in 0..N-2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
-from scvi_codegen.runtime.indexed.interface import Numbers
+from scvi_codegen.runtime.arrays.interface import Numbers
 
 __all__ = ["RUN_FIELDS", "STATE", "IndexedSnapshot", "aligned", "constraint_memory"]
 
