@@ -78,7 +78,6 @@ static double larger(double a, double b) {{ return a > b ? a : b; }}
 static double largest_number(const number *x) {{ return larger(x[0], larger(x[1], x[2])); }}
 static double number_of(double x) {{ return x; }}
 #include "{folder}/convergence.h"
-#include "{folder}/inverse_sizes.h"
 int verdict(double change, double last, double before, double tolerance, int absolute, int k)
 {{
   const solver_options options = {{tolerance, 40, absolute}};
@@ -113,20 +112,20 @@ ROUNDED = 2.0**-53
 TABLE = [
     # change, the one before, tolerance, absolute, iteration; verdict; perhaps the change before both
     ("shrinking", 1e-6, 1e-4, ROUNDED, 0, 3, ON),
-    ("shrinking, but slowly where sweeps are far from rest", 0.8e-6, 1e-6, ROUNDED, 0, 5, GIVEN_UP),
-    ("slowly in one sweep, but not in two", 0.8e-6, 1e-6, ROUNDED, 0, 5, ON, 2e-6),
+    ("shrinking, but slowly where iterations are far from convergence", 0.8e-6, 1e-6, ROUNDED, 0, 5, GIVEN_UP),
+    ("slowly in one iteration, but not in two", 0.8e-6, 1e-6, ROUNDED, 0, 5, ON, 2e-6),
     ("slowly in two", 0.8e-6, 1e-6, ROUNDED, 0, 5, GIVEN_UP, 1.5e-6),
-    ("as slowly, among the first sweeps", 0.8e-6, 1e-6, ROUNDED, 0, 4, ON),
+    ("as slowly, among the first iterations", 0.8e-6, 1e-6, ROUNDED, 0, 4, ON),
     ("fast enough, a little", 0.7e-6, 1e-6, ROUNDED, 0, 5, ON),
-    ("as slowly, near rest", 0.8e-10, 1e-10, ROUNDED, 0, 5, ON),
-    ("too many sweeps", 1e-6, 1e-4, ROUNDED, 0, 40, GIVEN_UP),
-    ("one sweep less", 1e-6, 1e-4, ROUNDED, 0, 39, ON),
+    ("as slowly, near convergence", 0.8e-10, 1e-10, ROUNDED, 0, 5, ON),
+    ("too many iterations", 1e-6, 1e-4, ROUNDED, 0, 40, GIVEN_UP),
+    ("one iteration less", 1e-6, 1e-4, ROUNDED, 0, 39, ON),
     ("growing at 1e-9 of the state: no rounding is that large", 1.1e-9, 1e-9, ROUNDED, 0, 3, ON),
     ("growing at 1e-12", 1.1e-12, 1e-12, ROUNDED, 0, 3, ON),
     ("growing at 4e-13", 4e-13, 3.9e-13, ROUNDED, 0, 3, ON),
     ("growing at the level of rounding", 2.5e-13, 2.4e-13, ROUNDED, 0, 3, DONE),
     ("the same by chance", 2.5e-13, 2.5e-13, ROUNDED, 0, 2, DONE),
-    ("growing after a sweep that contracted by chance", 2.7e-13, 2.0e-13, ROUNDED, 0, 3, ON, 1.7e-10),
+    ("growing after an iteration that contracted by chance", 2.7e-13, 2.0e-13, ROUNDED, 0, 3, ON, 1.7e-10),
     ("the same below 1e-14", 0.9e-14, 0.8e-14, ROUNDED, 0, 3, DONE, 1.7e-10),
     ("far below the last by chance", 2e-14, 2e-11, ROUNDED, 0, 3, DONE, 2e-8),
     ("as far, after slower ones", 2e-13, 2e-10, ROUNDED, 0, 3, ON, 4e-10),

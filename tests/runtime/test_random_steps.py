@@ -70,7 +70,7 @@ def test_step_errors_of_all_methods_are_bounded_by_their_estimates(method, solve
 def adaptive_ratio(name, method, solver, q, p, t, tolerance):
     """Error of the first adaptive step of an array over the estimate of its run; None if the run fails."""
     family, stepper = FAMILIES[name], compiled(name, method, solver)
-    shape = [axis.number or 1 for axis in stepper.interface.coordinates[0].axes]
+    shape = [axis.number or 1 for axis in stepper.interface.layout.coordinates[0].axes]
     at = [np.reshape(x, [-1, *shape[1:]]) for x in (q, p)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
