@@ -75,7 +75,7 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
-from scvi_codegen.models.array_model import IndexedModel as IndexedModel
+from scvi_codegen.models.array_model import ArrayModel as ArrayModel
 from scvi_codegen.models.fmu import generate_fmu as generate_fmu
 from scvi_codegen.models.model import Model as Model
 from scvi_codegen.models.model_file import load_model as load_model
@@ -98,9 +98,9 @@ from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run
 from scvi_codegen.results.recording import resume_run as resume_run
-from scvi_codegen.runtime.arrays.run import IndexedRun as IndexedRun
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper as IndexedStepper
-from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory as IndexedTrajectory
+from scvi_codegen.runtime.arrays.run import ArrayRun as ArrayRun
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper as ArrayStepper
+from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory as ArrayTrajectory
 from scvi_codegen.runtime.chaos.indicators import ChaosIndicators as ChaosIndicators
 from scvi_codegen.runtime.core.stepper import Stepper as Stepper
 from scvi_codegen.runtime.ensemble.result import EnsembleTrajectory as EnsembleTrajectory

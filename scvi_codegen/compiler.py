@@ -73,7 +73,7 @@ from scvi_codegen.rendering.program_source import (
 )
 from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
 from scvi_codegen.rendering.source_cache import cached_source
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
@@ -99,7 +99,7 @@ def compile_stepper(
     solver: str = "auto",
     flags: tuple[str, ...] = TUNED_FLAGS,
     prefix: str | None = None,
-) -> IndexedStepper: ...
+) -> ArrayStepper: ...
 @overload
 def compile_stepper(
     system: MechanicalSystem,
@@ -135,7 +135,7 @@ def compile_stepper(
     time_transformation: str | Expr | None = None,
     sizes: Mapping[str, int] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
-) -> Stepper | IndexedStepper:
+) -> Stepper | ArrayStepper:
     """Derive, generate, compile and load the integrator of ``system`` by ``method``.
 
     Args:
@@ -173,7 +173,7 @@ def compile_stepper(
         _check_sizes_not_needed(system, symmetries=symmetries, events=events, time_transformation=time_transformation)
         array_sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
         variants = Variants(make=lambda name: array_sources.controlled if name == "controlled" else None)
-        return IndexedStepper(array_sources.plain, array_sources.interface, variants=variants, flags=flags)
+        return ArrayStepper(array_sources.plain, array_sources.interface, variants=variants, flags=flags)
     sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, time_transformation)
     own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
     source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
@@ -319,7 +319,7 @@ class _ArraySources:
     @cached_property
     def plain(self) -> Source:
         """C source with fixed step size."""
-        return Source.from_json(self._remembered("indexed", lambda: render(self.program).to_json()))
+        return Source.from_json(self._remembered("arrays", lambda: render(self.program).to_json()))
 
     @cached_property
     def controlled(self) -> Source | None:
@@ -329,7 +329,7 @@ class _ArraySources:
             control = control_of(self.program)
             return render(self.program, control).to_json() if control else ""
 
-        document = self._remembered("indexed controlled", text)
+        document = self._remembered("arrays, adaptive", text)
         return Source.from_json(document) if document else None
 
     def _remembered(self, what: str, make: Callable[[], str]) -> str:

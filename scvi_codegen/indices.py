@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
-__all__ = ["SIZES_REQUIRED", "Access", "Array", "IndexedMap", "Loop", "Place", "Size"]
+__all__ = ["SIZES_REQUIRED", "Access", "Array", "ArrayMap", "Loop", "Place", "Size"]
 
 SIZES_REQUIRED = (
     "the sizes of its arrays are known at run time only. Give them when compiling, "
@@ -147,7 +147,7 @@ class Access:
 
 
 @dataclass(frozen=True, slots=True)
-class IndexedMap:
+class ArrayMap:
     """Momentum map of a translation of an array component (all components if ``None``) or of a rotation of two.
 
     Attributes:

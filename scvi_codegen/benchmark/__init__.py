@@ -20,8 +20,8 @@
     mechanisms          from SymPy's bodies and loads to a trajectory; lambdify and PyDy
     constrained_bodies  energies and lengths at equal time; MuJoCo
     control_loop        cost of a control step, and of the bare C function
-    lattices            indexed systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
-    large_cases         the indexed systems; threads: their steps with several threads
+    lattices            array systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
+    large_cases         the array systems; threads: their steps with several threads
     array_energies    their energies over a hundred thousand steps
     thousand_bodies     a thousand bodies; REBOUND
     compilers           the same source with several compilers, and for several processors

@@ -1,4 +1,4 @@
-"""Benchmark of the energy of indexed systems over a hundred thousand steps: growth by round-off."""
+"""Benchmark of the energy of array systems over a hundred thousand steps: growth by round-off."""
 
 from __future__ import annotations
 

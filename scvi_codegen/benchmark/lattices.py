@@ -1,4 +1,4 @@
-"""Benchmark of indexed systems: time at equal error (hand-written C, SciPy, REBOUND, OpenMM), and scaling with size."""
+"""Benchmark of array systems: time at equal error (hand-written C, SciPy, REBOUND, OpenMM), and scaling with size."""
 
 from __future__ import annotations
 

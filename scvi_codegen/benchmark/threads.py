@@ -1,4 +1,4 @@
-"""Benchmark of steps of indexed systems with several threads: wall time, in short turns, the minimum of each."""
+"""Benchmark of steps of array systems with several threads: wall time, in short turns, the minimum of each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, cloth, ri
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.benchmark.tables import ResultTable
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["run_threads"]
@@ -81,7 +81,7 @@ def _row(each: Lattice, method: str, h: float, numbers: list[int], plan: Plan) -
     return {"by": f"{OURS} {method}", "one_us": 1e6 * best[1]} | gained
 
 
-def _seconds(run: IndexedRun, steps: int) -> float:
+def _seconds(run: ArrayRun, steps: int) -> float:
     """Return the seconds per step of a call with ``steps`` steps."""
     report = run.problem.binding.new("report *")
     began = time.perf_counter()

@@ -29,7 +29,7 @@ Examples:
   scvi-codegen generate mine.toml -o mine_svi          C, a Makefile and a Python package in the folder mine_svi
   scvi-codegen reproduce all --html paper.html         every figure, table and claim of the paper, with a verdict
   scvi-codegen verify mine_svi                         measure its guaranteed properties
-  scvi-codegen run ring.toml --size N=10000            an indexed model (lattice), of any size
+  scvi-codegen run ring.toml --size N=10000            an array model (lattice), of any size
 
 With --json a command prints one JSON document, with --quiet only errors and warnings; files are written as usual.
 

@@ -16,7 +16,7 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.reparametrisation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import catalogue_model, read_model_file
 from scvi_codegen.models.problems import PROBLEMS, problem
@@ -216,7 +216,7 @@ STATE_OPTIONS = (
         multiple=True,
         metavar="NAME=N",
         callback=_sizes,
-        help="Array size of an indexed model, as N=1000; may be repeated.",
+        help="Array size of an array model, as N=1000; may be repeated.",
     ),
     _option("--q", metavar="Q1,Q2,..", callback=_numbers, help="Initial coordinates."),
     _option("--p", metavar="P1,P2,..", callback=_numbers, help="Initial momenta."),
@@ -245,7 +245,7 @@ SOLVER_OPTION = _option(
     default="auto",
     show_default=True,
     help="Solver of the stage equations; auto: explicit or fixed-point iteration if possible, Newton as fallback; "
-    "for indexed models that of the model.",
+    "for array models that of the model.",
 )
 
 
@@ -278,7 +278,7 @@ def _check_method(choices: ModelOptions) -> None:
             )
 
 
-def read_model(name: str, choices: ModelOptions) -> Model | IndexedModel:
+def read_model(name: str, choices: ModelOptions) -> Model | ArrayModel:
     """Return the model of a file or of the catalogue, overridden by the options of the command line.
 
     Raises:

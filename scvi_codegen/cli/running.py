@@ -18,7 +18,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.method import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
+from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
@@ -241,7 +241,7 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: 
     yield from momentum_report(trajectory)
 
 
-def worst_step(trajectory: Trajectory | DrivenTrajectory | IndexedTrajectory) -> Iterator[str]:
+def worst_step(trajectory: Trajectory | DrivenTrajectory | ArrayTrajectory) -> Iterator[str]:
     """Yield a line with the largest error estimate of a step; warn if that step is too large.
 
     The warning does not depend on options such as ``--quiet``.

@@ -13,7 +13,7 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.formatting import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run.global_error import GlobalError
@@ -21,7 +21,7 @@ from scvi_codegen.validation.counts import check_tolerance
 
 __all__ = ["model_with_adaptive_steps", "model_with_advised_step", "model_with_global_error"]
 
-AnyModel = TypeVar("AnyModel", Model, IndexedModel)
+AnyModel = TypeVar("AnyModel", Model, ArrayModel)
 ROUND_OFF = 2.0**-52
 """Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""
 MAX_STEPS = 10**9
@@ -55,7 +55,7 @@ def model_with_global_error(
     wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
-        if isinstance(wanted, IndexedModel):
+        if isinstance(wanted, ArrayModel):
             result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
         else:
             result = wanted.confirmed(wanted.stepper(solver=solver), options=options)

@@ -1,4 +1,4 @@
-"""Integration of indexed systems for ``scvi-codegen run``, in chunks, so that Ctrl-C and a failed step lose nothing."""
+"""Integration of array systems for ``scvi-codegen run``, in chunks, so that Ctrl-C and a failed step lose nothing."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from scvi_codegen.cli.memory import check_state_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.cli.running import worst_step
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.pictures.arrays import plot_arrays
 from scvi_codegen.runtime.arrays.interface import Numbers
-from scvi_codegen.runtime.arrays.run import IndexedRun
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
-from scvi_codegen.runtime.arrays.trajectory import IndexedRecord, IndexedTrajectory, check_npz
+from scvi_codegen.runtime.arrays.run import ArrayRun
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.runtime.arrays.trajectory import ArrayRecord, ArrayTrajectory, check_npz
 
-__all__ = ["reject_options", "run_indexed", "with_solver"]
+__all__ = ["reject_options", "run_arrays", "with_solver"]
 
 MAX_LISTED = 4
 """Largest number of entries of an array that the final state lists."""
 ALTERNATIVES = {"advise": "give --tolerance"}
-"""Alternatives to options that indexed systems do not have."""
+"""Alternatives to options that array systems do not have."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedOutcome:
+class ArrayOutcome:
     """Result of a run: saved states, state of the run, seconds of preparation and of steps, and why it ended."""
 
-    trajectory: IndexedTrajectory
-    run: IndexedRun
-    stepper: IndexedStepper
+    trajectory: ArrayTrajectory
+    run: ArrayRun
+    stepper: ArrayStepper
     preparation: float
     seconds: float
     failure: StepFailedError | None
@@ -47,7 +47,7 @@ class IndexedOutcome:
 
 
 def reject_options(what: dict[str, object]) -> None:
-    """Reject options, by name, that indexed systems do not have.
+    """Reject options, by name, that array systems do not have.
 
     Raises:
         click.UsageError: if one of them is set.
@@ -61,19 +61,19 @@ def reject_options(what: dict[str, object]) -> None:
             )
 
 
-def with_solver(solver: str, model: IndexedModel) -> IndexedModel:
+def with_solver(solver: str, model: ArrayModel) -> ArrayModel:
     """Return the model with the solver of the command line; with ``"auto"`` the model's own solver stays."""
     return model if solver == "auto" else replace(model, solver=solver)
 
 
-def run_indexed(
-    model: IndexedModel,
+def run_arrays(
+    model: ArrayModel,
     output: str | None,
     plot: str | None,
     options: SolverOptions | None,
     threads: int | None = None,
 ) -> None:
-    """Integrate an indexed system, print a summary and write the files asked for.
+    """Integrate an array system, print a summary and write the files asked for.
 
     Raises:
         CommandFailure: if a step failed or a signal ended the run; the states before are summarised and written.
@@ -96,7 +96,7 @@ def run_indexed(
         tell(f"wrote {path}")
 
 
-def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int | None) -> IndexedOutcome:
+def _integrate(model: ArrayModel, options: SolverOptions | None, threads: int | None) -> ArrayOutcome:
     began, controlled = time.perf_counter(), model.h is None
     steps = math.inf if controlled else model.step_count
     if not controlled:
@@ -104,7 +104,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
     stepper = model.stepper()
     run, failure = model.start(stepper, options=options, threads=threads), None
     preparation, began = time.perf_counter() - began, time.perf_counter()
-    record = IndexedRecord(run)
+    record = ArrayRecord(run)
     with interruptions() as caught, progress_bar(BAR_LENGTH if controlled else model.step_count) as show_progress:
 
         def report_progress(done: int) -> None:
@@ -119,7 +119,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
                 )
         except StepFailedError as error:
             failure = error
-    return IndexedOutcome(
+    return ArrayOutcome(
         trajectory=record.trajectory(),
         run=run,
         stepper=stepper,
@@ -130,7 +130,7 @@ def _integrate(model: IndexedModel, options: SolverOptions | None, threads: int 
     )
 
 
-def _summary(model: IndexedModel, outcome: IndexedOutcome) -> Iterator[str]:
+def _summary(model: ArrayModel, outcome: ArrayOutcome) -> Iterator[str]:
     run, trajectory, method = outcome.run, outcome.trajectory, model.method
     sizes = ", ".join(f"{name} = {size}" for name, size in run.sizes.items())
     count = sum(values.size for values in run.q.values())
@@ -157,7 +157,7 @@ def _summary(model: IndexedModel, outcome: IndexedOutcome) -> Iterator[str]:
         yield f"  {name} = {shown}{', ..' if values.size > MAX_LISTED else ''}"
 
 
-def _energy(model: IndexedModel, outcome: IndexedOutcome) -> str:
+def _energy(model: ArrayModel, outcome: ArrayOutcome) -> str:
     if why := model.system.changes_energy:
         energy = _energies(outcome)[:, 2]
         change = float(np.abs(energy - energy[0]).max())
@@ -165,23 +165,23 @@ def _energy(model: IndexedModel, outcome: IndexedOutcome) -> str:
     return f"relative energy error: {_energy_error(outcome):.2e} at most"
 
 
-def _energies(outcome: IndexedOutcome) -> Numbers:
+def _energies(outcome: ArrayOutcome) -> Numbers:
     """Return the energies of all saved states and of the final state, which may not be saved."""
     return np.vstack([outcome.trajectory.energies, outcome.run.energies])
 
 
-def _energy_error(outcome: IndexedOutcome) -> float:
+def _energy_error(outcome: ArrayOutcome) -> float:
     return replace(outcome.trajectory, energies=_energies(outcome)).energy_error()
 
 
-def _map_changes(outcome: IndexedOutcome) -> Iterator[tuple[str, float]]:
+def _map_changes(outcome: ArrayOutcome) -> Iterator[tuple[str, float]]:
     """Return the largest change of each momentum map."""
     maps = np.vstack([outcome.trajectory.momentum_maps(), outcome.run.momentum_maps])
     changes = np.abs(maps - maps[0]).max(axis=0)
     return zip(outcome.stepper.momentum_map_names, changes.tolist(), strict=True)
 
 
-def _numbers(model: IndexedModel, outcome: IndexedOutcome) -> dict[str, Any]:
+def _numbers(model: ArrayModel, outcome: ArrayOutcome) -> dict[str, Any]:
     """Return the document of ``--json``."""
     run, trajectory = outcome.run, outcome.trajectory
     failure = "interrupted" if outcome.interrupted else None

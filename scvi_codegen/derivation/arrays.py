@@ -1,4 +1,4 @@
-"""Derivation of indexed systems: L or H, the derivatives of every term with respect to its entries, and a step."""
+"""Derivation of array systems: L or H, the derivatives of every term with respect to its entries, and a step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parser for constraints of indexed systems: an equation, and loops over the elements for which it holds.
+"""Parser for constraints of array systems: an equation, and loops over the elements for which it holds.
 
 constraint = sum ["=" sum] ["for" loop ("," loop)*]      (r[b+1] - r[b])**2 = l[b]**2 for b in 0..N-2
 
@@ -14,7 +14,7 @@ from itertools import chain
 from sympy import Symbol
 
 from scvi_codegen.errors import ExpressionError
-from scvi_codegen.formulas.arrays import IndexedParser, IndexedTerm, term_of
+from scvi_codegen.formulas.arrays import ArrayParser, ArrayTerm, term_of
 from scvi_codegen.formulas.grammar import parsed
 from scvi_codegen.indices import Array, Loop
 
@@ -25,12 +25,12 @@ _FOR = re.compile(r"\bfor\b")
 
 def parse_constraint(
     text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
-) -> IndexedTerm:
+) -> ArrayTerm:
     """Parse a constraint g = 0 for all elements of loops; for ``left = right`` g is left - right.
 
     Args:
         text: the constraint.
-        arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.arrays.parse_indexed`.
+        arrays, symbols, tables: as of :func:`~scvi_codegen.formulas.arrays.parse_sums`.
 
     Raises:
         ExpressionError: as there, and for a sum over a whole array, which would couple all of its entries.
@@ -45,7 +45,7 @@ def parse_constraint(
     if len(sides) > 2 or len(behind) > 1:
         raise ExpressionError("a constraint may contain one '=' and one 'for'", text, 0)
     loops = tuple(chain(*(_Loops(each, symbols, arrays, tables).read() for each in behind)))
-    parsers = [IndexedParser(side, symbols, arrays, tables) for side in sides]
+    parsers = [ArrayParser(side, symbols, arrays, tables) for side in sides]
     for parser in parsers:
         parser.in_scope = {loop.index: loop for loop in loops}
     left, *right = map(parsed, parsers)
@@ -56,7 +56,7 @@ def parse_constraint(
     return term_of(loops, left - right[0] if right else left, accesses)
 
 
-class _Loops(IndexedParser):
+class _Loops(ArrayParser):
     """Parser for loops alone, ``b in B, k in 0..N-2``."""
 
     def read(self) -> list[Loop]:

@@ -1,4 +1,4 @@
-"""Parser for forces of indexed systems: on all entries along an axis, on a single one, or on those in a table.
+"""Parser for forces of array systems: on all entries along an axis, on a single one, or on those in a table.
 
 target   = array "[" (index | size | whole number | entry) ("," ..)* "]"        q[i], r[i, a], q[0], q[N-1]
 entry    = table "[" index ("," whole number)? "]"                            q[pins[p]], r[bonds[b, 1], a]
@@ -11,19 +11,19 @@ from dataclasses import dataclass
 
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.arrays import Bound, IndexedParser, term_of
+from scvi_codegen.formulas.arrays import ArrayParser, Bound, term_of
 from scvi_codegen.formulas.grammar import parsed
 from scvi_codegen.indices import Access, Array, Loop, Size
 
-__all__ = ["IndexedForce", "parse_force"]
+__all__ = ["ArrayForce", "parse_force"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedForce:
+class ArrayForce:
     """Forces over loops.
 
     Attributes:
-        loops, slots: as of :class:`IndexedTerm`, common to all formulas.
+        loops, slots: as of :class:`ArrayTerm`, common to all formulas.
         targets: coordinates on which forces act, each with its formula.
     """
 
@@ -43,17 +43,17 @@ def parse_force(
     arrays: Sequence[Array],
     symbols: Mapping[str, Symbol],
     tables: Sequence[Array] = (),
-) -> tuple[IndexedForce, ...]:
+) -> tuple[ArrayForce, ...]:
     """Parse the force on ``q[i]`` for all i along an axis, on a single entry, ``q[0]``, or on those of a table.
 
     Args:
         target: the coordinate that it acts on.
         text: its formula, in the indices of the target.
         coordinates: arrays of the target.
-        arrays, symbols, tables: as of :func:`parse_indexed`.
+        arrays, symbols, tables: as of :func:`parse_sums`.
 
     Raises:
-        ExpressionError: as :func:`parse_indexed`.
+        ExpressionError: as :func:`parse_sums`.
 
     >>> from scvi_codegen.formulas.arrays import parse_array
     >>> from scvi_codegen.formulas.symbols import symbol
@@ -69,16 +69,16 @@ def parse_force(
         rows = [{**row, name: value} for row in rows for value in values]
     forces = []
     for row in rows:
-        targets, formula = (IndexedParser(given, symbols, arrays, tables) for given in (target, text))
+        targets, formula = (ArrayParser(given, symbols, arrays, tables) for given in (target, text))
         targets.in_scope, formula.in_scope = dict(row), dict(row)
         slot, expression = parsed(targets), parsed(formula)
         loops = tuple(bound for bound in row.values() if isinstance(bound, Loop))
         term = term_of(loops, expression, formula.accesses)
-        forces.append(IndexedForce(loops=loops, slots=term.slots, targets=((targets.accesses[slot], expression),)))
+        forces.append(ArrayForce(loops=loops, slots=term.slots, targets=((targets.accesses[slot], expression),)))
     return tuple(forces)
 
 
-class _Target(IndexedParser):
+class _Target(ArrayParser):
     """Parser for the target of a force: an array entry whose indices run over whole axes."""
 
     def read(self) -> dict[str, Size]:

@@ -1,21 +1,21 @@
-"""LaTeX of indexed formulas."""
+"""LaTeX of array formulas."""
 
 from __future__ import annotations
 
 from sympy import latex
 
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop, Place
 
 __all__ = ["latex_entry", "latex_sum", "latex_sums"]
 
 
-def latex_sum(term: IndexedTerm) -> str:
+def latex_sum(term: ArrayTerm) -> str:
     r"""Return a term in LaTeX.
 
-    >>> from scvi_codegen.formulas.arrays import parse_array, parse_indexed
-    >>> (term,) = parse_indexed("sum(i in 0..N-2, (q[i+1] - q[i])**2/2)", [parse_array("q[N]")], {})
+    >>> from scvi_codegen.formulas.arrays import parse_array, parse_sums
+    >>> (term,) = parse_sums("sum(i in 0..N-2, (q[i+1] - q[i])**2/2)", [parse_array("q[N]")], {})
     >>> print(latex_sum(term))
     \sum_{i=0}^{N-2} \left(\frac{\left(q_{i+1} - q_{i}\right)^{2}}{2}\right)
     """
@@ -24,7 +24,7 @@ def latex_sum(term: IndexedTerm) -> str:
     return f"{sums} \\left({formula}\\right)" if sums else str(formula)
 
 
-def latex_sums(term: IndexedTerm) -> str:
+def latex_sums(term: ArrayTerm) -> str:
     """Return the summation signs of a term alone."""
     pairs = {loop.behind for loop in term.loops}
     return " ".join(_sum(loop) for loop in term.loops if loop.index not in pairs)

@@ -1,4 +1,4 @@
-"""Conversion of SymPy's ``Sum`` and ``Indexed`` to text of the grammar of indexed formulas.
+"""Conversion of SymPy's ``Sum`` and ``Indexed`` to text of the grammar of array formulas.
 
 SymPy's own derivatives of such sums are not used, as they are sometimes wrong (repeated bound symbols, functions of
 indices); a sum is read term by term.
@@ -17,10 +17,10 @@ from sympy.printing.str import StrPrinter
 
 from scvi_codegen.errors import SystemDefinitionError
 
-__all__ = ["indexed_text"]
+__all__ = ["array_text"]
 
 
-def indexed_text(expression: Expr) -> str:
+def array_text(expression: Expr) -> str:
     """Return the text of a sum of sums.
 
     Raises:
@@ -28,7 +28,7 @@ def indexed_text(expression: Expr) -> str:
 
     >>> from sympy import IndexedBase, symbols
     >>> q, (i, N) = IndexedBase("q"), symbols("i N", integer=True)
-    >>> indexed_text(-Sum((q[Mod(i + 1, N)] - q[i]) ** 2 / 2, (i, 0, N - 1)))
+    >>> array_text(-Sum((q[Mod(i + 1, N)] - q[i]) ** 2 / 2, (i, 0, N - 1)))
     '-sum(i in N periodic, (q[i + 1] - q[i])**2/2)'
     """
     return str(_Printer({"full_prec": False}).doprint(expression))

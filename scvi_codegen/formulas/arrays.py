@@ -1,4 +1,4 @@
-"""Parser for indexed formulas: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
+"""Parser for array formulas: the grammar of formulas with arrays, and with ``sum(loops, formula)``.
 
     L     = a sum of  [factor "*"] "sum" "(" loop ("," loop)* "," formula ")"  and of formulas without a sum
     atom  = .. | array "[" index ("," index)* "]"
@@ -21,7 +21,7 @@ from scvi_codegen.formulas.grammar import Parser, Token, parsed
 from scvi_codegen.formulas.symbols import check_name, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 
-__all__ = ["Bound", "IndexedParser", "IndexedTerm", "parse_array", "parse_coordinate", "parse_indexed", "term_of"]
+__all__ = ["ArrayParser", "ArrayTerm", "Bound", "parse_array", "parse_coordinate", "parse_sums", "term_of"]
 
 _TOKEN = re.compile(
     r"(?P<number>(?:\d+(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
@@ -35,7 +35,7 @@ Bound: TypeAlias = Loop | int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IndexedTerm:
+class ArrayTerm:
     """Formula summed over loops; every array access in it is a symbol named as it is written.
 
     Attributes:
@@ -76,9 +76,9 @@ def parse_coordinate(text: str) -> Array:
     return Array(text, ())
 
 
-def parse_indexed(
+def parse_sums(
     text: str, arrays: Sequence[Array], symbols: Mapping[str, Symbol], tables: Sequence[Array] = ()
-) -> tuple[IndexedTerm, ...]:
+) -> tuple[ArrayTerm, ...]:
     """Parse a sum of sums.
 
     Args:
@@ -94,10 +94,10 @@ def parse_indexed(
         ExpressionError: for anything outside the grammar, and for an index outside its array.
 
     >>> q = parse_array("q[N]")
-    >>> [str(term) for term in parse_indexed("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
+    >>> [str(term) for term in parse_sums("-k*sum(i in 0..N-2, (q[i+1] - q[i])**2)", [q], {"k": symbol("k")})]
     ['sum(i in 0..N-2, -k*(q[i+1] - q[i])**2)']
     """
-    parser = IndexedParser(text, symbols, arrays, tables)
+    parser = ArrayParser(text, symbols, arrays, tables)
     whole = parsed(parser)
     by_loops: dict[tuple[Loop, ...], list[Expr]] = {}
     for placeholder, (loops, formula, column) in parser.sums.items():
@@ -111,10 +111,10 @@ def parse_indexed(
     return tuple(term_of(loops, formula, parser.accesses) for loops, formula in terms if formula != 0)
 
 
-def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> IndexedTerm:
+def term_of(loops: tuple[Loop, ...], formula: Expr, accesses: Mapping[Symbol, Access]) -> ArrayTerm:
     """Return the term of a formula over loops, with the accesses that occur in it."""
     occurring = sorted(formula.free_symbols & set(accesses), key=lambda slot: slot.name)
-    return IndexedTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in occurring))
+    return ArrayTerm(loops=loops, formula=formula, slots=tuple((slot, accesses[slot]) for slot in occurring))
 
 
 class _Indices(Parser):
@@ -189,7 +189,7 @@ class _Declaration(_Indices):
         return size
 
 
-class IndexedParser(_Indices):
+class ArrayParser(_Indices):
     """Parser for formulas with array entries and sums."""
 
     def __init__(

@@ -27,13 +27,13 @@ from scvi_codegen.methods.method import Method
 __all__ = ["SOLVERS", "check_solver", "lower_arrays", "one_coordinate"]
 
 SOLVERS = ("fixed-point", "newton")
-"""Solvers of the equations of a step of an indexed system."""
+"""Solvers of the equations of a step of an array system."""
 
 
 def check_solver(solver: object, error: type[ScviCodegenError] = MethodError) -> None:
     """Raise an error unless the solver is one of :data:`SOLVERS`."""
     if solver not in SOLVERS:
-        raise error(f"unknown solver {solver!r} of an indexed system: use {' or '.join(map(repr, SOLVERS))}")
+        raise error(f"unknown solver {solver!r} of an array system: use {' or '.join(map(repr, SOLVERS))}")
 
 
 def one_coordinate(system: ArraySystem) -> MechanicalSystem:
@@ -55,13 +55,13 @@ def lower_arrays(system: ArraySystem, method: Method, prefix: str, *, newton: bo
     splitting = None if constrained else splitting_of(one, method)
     if splitting and system.velocities:
         raise MethodError(
-            f"{method.name} does not support velocity-dependent forces of indexed systems: use an SVI or a "
+            f"{method.name} does not support velocity-dependent forces of array systems: use an SVI or a "
             "Runge-Kutta method"
         )
     loops = looped_terms(system, constrained, newton=newton)
     if newton and (splitting or constrained or system.momenta or system.velocities or not loops.products):
         raise MethodError(
-            "Newton's method for indexed systems requires a Lagrangian with a potential that is not linear, forces of "
+            "Newton's method for array systems requires a Lagrangian with a potential that is not linear, forces of "
             "positions and time, no constraints, and an implicit method: leave out solver='newton'"
         )
     fixed_point = None if splitting or constrained else _fixed_point(one, method, velocities=bool(system.velocities))
@@ -101,6 +101,6 @@ def _fixed_point(
         return found
     explicit = "" if one.auxiliaries else ", Stoermer-Verlet or a composition"
     raise MethodError(
-        f"{method.name} is not supported for indexed systems: use an SVI, a Runge-Kutta method of at "
+        f"{method.name} is not supported for array systems: use an SVI, a Runge-Kutta method of at "
         f"most 32 points{explicit}"
     )

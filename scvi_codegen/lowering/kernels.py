@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from sympy import Expr, Symbol
 
-from scvi_codegen.formulas.array_forces import IndexedForce
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
@@ -68,7 +68,7 @@ def looped_kernel(
     system: ArraySystem,
     name: str,
     values: Iterable[Expr],
-    of: IndexedTerm | IndexedForce | MassTerm,
+    of: ArrayTerm | ArrayForce | MassTerm,
     u: Sequence[tuple[Symbol, Access]] = (),
     *,
     along: Sequence[Symbol] = (),

@@ -1,4 +1,4 @@
-"""Lattices: indexed systems whose forces couple places at constant distances."""
+"""Lattices: array systems whose forces couple places at constant distances."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ from functools import partial
 
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.formulas.array_forces import IndexedForce
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.constraints import ConstrainedSteps
@@ -69,7 +69,7 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
     )
 
 
-def _force(system: ArraySystem, term: IndexedTerm, number: int) -> LoopedKernel:
+def _force(system: ArraySystem, term: ArrayTerm, number: int) -> LoopedKernel:
     """Return the derivatives of a term with respect to its coordinates and momenta, and the term itself."""
     moving = [pair for pair in term.slots if pair[1].array in system.state]
     partials = gradient(term.formula, [slot for slot, _ in moving])
@@ -88,17 +88,17 @@ def _jacobian(system: ArraySystem) -> tuple[tuple[LoopedKernel, ...], tuple[Loop
     return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
 
 
-def _all_forces(system: ArraySystem) -> Iterator[IndexedForce]:
+def _all_forces(system: ArraySystem) -> Iterator[ArrayForce]:
     """Yield all forces, those of the potentials by their slots."""
     for term in system.potentials:
         moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
         partials = gradient(term.formula, [slot for slot, _ in moving])
         targets = tuple((access, partials[k]) for k, (_, access) in enumerate(moving) if k in partials)
-        yield IndexedForce(loops=term.loops, slots=term.slots, targets=targets)
+        yield ArrayForce(loops=term.loops, slots=term.slots, targets=targets)
     yield from system.forces
 
 
-def _derived(system: ArraySystem, force: IndexedForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
+def _derived(system: ArraySystem, force: ArrayForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
     """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on positions."""
     moving = [pair for pair in force.slots if pair[1].array in system.state]
     u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]

@@ -1,4 +1,4 @@
-"""Model files in generated folders of indexed systems, with tables of the arrays that it reads from files."""
+"""Model files in generated folders of array systems, with tables of the arrays that it reads from files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.model_document import method_section
 from scvi_codegen.models.sections import Section
 
@@ -18,7 +18,7 @@ STATES = {"q": "q", "p": "p", "q_dot": "velocity"}
 """Field of a model by key of the initial state."""
 
 
-def model_texts(model: IndexedModel) -> dict[str, str]:
+def model_texts(model: ArrayModel) -> dict[str, str]:
     """Return the model file and the tables that it refers to, by file name; empty for models not read from a file."""
     if model.document is None:
         return {}

@@ -1,4 +1,4 @@
-"""Model files of indexed systems: those of :mod:`scvi_codegen.models.model_file` with arrays.
+"""Model files of array systems: those of :mod:`scvi_codegen.models.model_file` with arrays.
 
     [system]
     name = "ring"
@@ -53,7 +53,7 @@ from scvi_codegen.indices import Array
 from scvi_codegen.lowering.arrays import SOLVERS, one_coordinate
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods import fitted
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.array_values import is_filled, read_array
 from scvi_codegen.models.sections import (
     Document,
@@ -72,7 +72,7 @@ from scvi_codegen.models.sections import (
 from scvi_codegen.models.time_span import real
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["read_indexed"]
+__all__ = ["read_array_model"]
 
 KEYS = {
     "system": ("name", "coordinates", "momenta", "lagrangian", "hamiltonian", "dissipation", "constraints"),
@@ -85,7 +85,7 @@ OTHERS = {
     "system": ("inputs", "catalogue", "time_transformation"),
     "run": ("controller",),
 }
-"""Keys of models without arrays, which indexed systems do not support."""
+"""Keys of models without arrays, which array systems do not support."""
 GROUPS = ("q", "p", "q_dot", "parameters", "tables")
 """Sections and keys whose values are arrays."""
 
@@ -99,7 +99,7 @@ class Entry:
     where: str
 
 
-def read_indexed(document: Document, changes: Document, folder: str | os.PathLike[str]) -> IndexedModel:
+def read_array_model(document: Document, changes: Document, folder: str | os.PathLike[str]) -> ArrayModel:
     """Return the model of a file, with the sections ``changes`` merged over it.
 
     Raises:
@@ -129,7 +129,7 @@ def read_indexed(document: Document, changes: Document, folder: str | os.PathLik
     numbers = {parameter.name: value for parameter, value in zip(system.parameters, system.defaults, strict=True)}
     arrays = _read_arrays(entries, _read_sizes(document.get("sizes", {}), system), folder, numbers)
     groups = {key: {name: values for (group, name), values in arrays.items() if group == key} for key in GROUPS}
-    return IndexedModel(
+    return ArrayModel(
         system=system,
         method=method,
         solver=solver,
@@ -145,13 +145,13 @@ def read_indexed(document: Document, changes: Document, folder: str | os.PathLik
 
 
 def _check_known(document: Document) -> None:
-    """Raise an error for unknown keys, and a specific one for keys that indexed systems do not support."""
+    """Raise an error for unknown keys, and a specific one for keys that array systems do not support."""
     for name, section in (("", document), *document.items()):
         for key in section if name in OTHERS else ():
             if key in OTHERS[name]:
                 where = f"[{name}] {key}" if name else f"[{key}]"
                 raise ModelFileError(
-                    f"{where} is not supported for indexed systems: leave it out, or unroll the system (unroll_sums)"
+                    f"{where} is not supported for array systems: leave it out, or unroll the system (unroll_sums)"
                 )
     check_keys(document, SECTIONS, "section")
     for name, known in KEYS.items():

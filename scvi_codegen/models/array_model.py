@@ -1,4 +1,4 @@
-"""Validated model of an indexed system: method, sizes, initial state and time span."""
+"""Validated model of an array system: method, sizes, initial state and time span."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from scvi_codegen.validation.argument_types import check_kind
 
 if TYPE_CHECKING:
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.arrays.run import IndexedRun
-    from scvi_codegen.runtime.arrays.stepper import IndexedStepper
-    from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.arrays.run import ArrayRun
+    from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+    from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory
     from scvi_codegen.runtime.run.global_error import GlobalError
 
-__all__ = ["IndexedModel"]
+__all__ = ["ArrayModel"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedModel(TimeSpan):
-    """Indexed system with a method, an initial state and a time span.
+class ArrayModel(TimeSpan):
+    """Array system with a method, an initial state and a time span.
 
     Attributes:
-        system: the indexed system.
+        system: the array system.
         method: its discretisation.
         solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
         q: initial positions by the name of their array; their shapes determine the sizes.
@@ -66,9 +66,9 @@ class IndexedModel(TimeSpan):
 
     def __repr__(self) -> str:
         steps = f"span {self.span:g}" if self.h is None else f"{self.step_count} steps of {self.h:g}"
-        return clipped(f"<IndexedModel of {self.system.name}: {self.method.name}, {steps}>", LONGEST)
+        return clipped(f"<ArrayModel of {self.system.name}: {self.method.name}, {steps}>", LONGEST)
 
-    def segments(self, run: IndexedRun) -> Iterator[int | None]:
+    def segments(self, run: ArrayRun) -> Iterator[int | None]:
         """Prepare a run of this model for each segment of equal steps, and yield its number of steps.
 
         ``None`` stands for steps up to the target time of the run.
@@ -82,7 +82,7 @@ class IndexedModel(TimeSpan):
             run.update(h=segment.h)
             yield segment.steps
 
-    def stepper(self) -> IndexedStepper:
+    def stepper(self) -> ArrayStepper:
         """Compile a stepper for runs of any size; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
@@ -90,12 +90,12 @@ class IndexedModel(TimeSpan):
 
     def start(
         self,
-        stepper: IndexedStepper | None = None,
+        stepper: ArrayStepper | None = None,
         *,
         options: SolverOptions | None = None,
         threads: int | None = None,
-    ) -> IndexedRun:
-        """Start the run of this model at its initial state; raises as :meth:`IndexedStepper.start`."""
+    ) -> ArrayRun:
+        """Start the run of this model at its initial state; raises as :meth:`ArrayStepper.start`."""
         run_options: dict[str, Any] = {"options": options, "threads": threads}
         stepper, lengths = stepper or self.stepper(), self._step_arguments
         if self.error is not None:
@@ -103,14 +103,14 @@ class IndexedModel(TimeSpan):
             lengths = {"t_end": lengths["t_end"], "tolerance": confirmation.local_tolerance}
         return stepper.start(**self._initial_arguments, **lengths, **run_options)
 
-    def confirmed(self, stepper: IndexedStepper, **run_options: Any) -> GlobalError:
+    def confirmed(self, stepper: ArrayStepper, **run_options: Any) -> GlobalError:
         """Return the local tolerance for :attr:`error`, confirmed by further runs, as in :class:`Model`."""
         confirmation = stepper.integrate(**self._initial_arguments, **self._step_arguments, **run_options).confirmation
         assert confirmation is not None  # by construction
         return confirmation
 
-    def integrate(self, *, progress: Callable[[int], None] | None = None) -> IndexedTrajectory:
-        """Integrate over the whole span; raises as :meth:`IndexedStepper.integrate`."""
+    def integrate(self, *, progress: Callable[[int], None] | None = None) -> ArrayTrajectory:
+        """Integrate over the whole span; raises as :meth:`ArrayStepper.integrate`."""
         lengths = self._step_arguments
         if self.has_shorter_last_step:
             lengths["t_end"] = self.t + self.covered

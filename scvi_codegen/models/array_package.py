@@ -1,4 +1,4 @@
-"""Generated folders of indexed systems: C code, and a program that runs it from the initial state in files.
+"""Generated folders of array systems: C code, and a program that runs it from the initial state in files.
 
 ring_svi/  ring_svi.h  ring_svi.c  support/         the integrator, for any number of coordinates
            main.c  Makefile                         ``make run`` runs it with a C compiler and libm
@@ -18,20 +18,20 @@ import numpy as np
 
 from scvi_codegen.compiler import generate_array_source
 from scvi_codegen.models.array_document import model_texts
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.generated_folders import prefix_of, source_in
 from scvi_codegen.rendering.program_source import render_array_example
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.validation.argument_types import PATH, SWITCH, checks_arguments, of
 
 __all__ = ["generate_sums", "load_sums"]
 
 
-@checks_arguments(model=of("an IndexedModel", IndexedModel), folder=PATH, force=SWITCH)
-def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the integrator of a model of an indexed system into a folder, as :func:`generate_package` does.
+@checks_arguments(model=of("an ArrayModel", ArrayModel), folder=PATH, force=SWITCH)
+def generate_sums(model: ArrayModel, folder: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """Write the integrator of a model of an array system into a folder, as :func:`generate_package` does.
 
     Raises:
         PackageError: if the folder's name is invalid, it cannot be written, or a file in it would be lost.
@@ -69,7 +69,7 @@ def generate_sums(model: IndexedModel, folder: str | os.PathLike[str], *, force:
     return target
 
 
-def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedStepper:
+def load_sums(folder: str | os.PathLike[str], model: ArrayModel) -> ArrayStepper:
     """Return the stepper of a generated folder of a model, compiled from the C code in it.
 
     Raises:
@@ -78,7 +78,7 @@ def load_sums(folder: str | os.PathLike[str], model: IndexedModel) -> IndexedSte
     target = Path(folder)
     prefix = prefix_of(target)
     _, interface = generate_array_source(model.system, model.method, solver=model.solver, prefix=prefix)
-    return IndexedStepper(source_in(target, prefix), interface)
+    return ArrayStepper(source_in(target, prefix), interface)
 
 
 def _flat(state: Mapping[str, Any]) -> Any:

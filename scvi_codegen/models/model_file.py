@@ -100,7 +100,7 @@ from scvi_codegen.models.time_span import check_length, real
 from scvi_codegen.validation.argument_types import PATH, checks_arguments, of
 
 if TYPE_CHECKING:
-    from scvi_codegen.models.array_model import IndexedModel
+    from scvi_codegen.models.array_model import ArrayModel
     from scvi_codegen.models.input_tables import InputTable
 
 __all__ = [
@@ -118,7 +118,7 @@ RUN_KEYS = ("step", "tolerance", "error", "controller", "span", "steps", "save_e
 KEYS = {"system": SYSTEM_KEYS, "initial": ("q", "p", "q_dot", "t"), "run": RUN_KEYS}
 SECTIONS = ("system", "forces", "inputs", "parameters", "initial", "method", "run")
 ARRAY_SECTIONS = ("sizes", "tables")
-"""Additional sections of indexed systems."""
+"""Additional sections of array systems."""
 NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_dot"), "run": ("span",)}
 """Required keys, or their alternatives."""
 
@@ -127,7 +127,7 @@ NEEDED = {"system": ("name", "coordinates", "lagrangian"), "initial": ("q", "q_d
 def load_model(path: str | os.PathLike[str], given: Document | None = None) -> Model:
     """Read a model file, with the sections ``given`` merged over its own.
 
-    A system with arrays whose sizes are names, ``coordinates = ["q[N]"]``, makes it an :class:`IndexedModel`.
+    A system with arrays whose sizes are names, ``coordinates = ["q[N]"]``, makes it an :class:`ArrayModel`.
 
     Raises:
         ModelFileError: beginning with the path and naming the key at fault.
@@ -135,7 +135,7 @@ def load_model(path: str | os.PathLike[str], given: Document | None = None) -> M
     return cast(Model, read_model_file(path, given))
 
 
-def read_model_file(path: str | os.PathLike[str], changes: Document | None = None) -> Model | IndexedModel:
+def read_model_file(path: str | os.PathLike[str], changes: Document | None = None) -> Model | ArrayModel:
     """Read a model of either kind. Raises as :func:`load_model`."""
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -176,16 +176,18 @@ def parse_model(text: str, changes: Document | None = None, *, folder: str | os.
     return cast(Model, _parsed(text, changes, folder))
 
 
-def _parsed(text: str, changes: Document | None, folder: str | os.PathLike[str]) -> Model | IndexedModel:
+def _parsed(text: str, changes: Document | None, folder: str | os.PathLike[str]) -> Model | ArrayModel:
     document = read_toml(text)
     check_keys(document, (*SECTIONS, *ARRAY_SECTIONS), "section")
     for name, content in document.items():
         if not isinstance(content, dict):
             raise ModelFileError(f"'{name}' must be a section, [{name}], not {content!r}")
     if _has_arrays(document):
-        from scvi_codegen.models.array_file import read_indexed  # imported here: other models are read without NumPy
+        from scvi_codegen.models.array_file import (
+            read_array_model,  # imported here: other models are read without NumPy
+        )
 
-        return read_indexed(document, changes or {}, folder)
+        return read_array_model(document, changes or {}, folder)
     for name in ARRAY_SECTIONS:
         if name in document:
             raise ModelFileError(f'[{name}] belongs to arrays whose sizes are names, coordinates = ["q[N]"]')

@@ -31,7 +31,7 @@ from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, ArgumentT
 
 if TYPE_CHECKING:
     from scvi_codegen.mechanics.system import MechanicalSystem
-    from scvi_codegen.models.array_model import IndexedModel
+    from scvi_codegen.models.array_model import ArrayModel
     from scvi_codegen.models.model import Model
     from scvi_codegen.rendering.program_source import Embedded, ExampleRun
 
@@ -50,7 +50,7 @@ MODEL = ArgumentType("a Model", lambda value: EITHER_MODEL.accepts(value) and no
 
 @checks_arguments(model=EITHER_MODEL, folder=PATH, solver=TEXT, force=SWITCH)
 def generate_package(
-    model: Model | IndexedModel,
+    model: Model | ArrayModel,
     folder: str | os.PathLike[str],
     *,
     solver: str = "auto",
@@ -80,9 +80,9 @@ def generate_package(
         StateError: if the initial velocities have no momenta.
     """
     target = Path(folder)
-    from scvi_codegen.models.array_model import IndexedModel  # imported here: folders are loaded without SymPy
+    from scvi_codegen.models.array_model import ArrayModel  # imported here: folders are loaded without SymPy
 
-    if isinstance(model, IndexedModel):
+    if isinstance(model, ArrayModel):
         from scvi_codegen.models.array_package import generate_sums
 
         if embedded or single_file:

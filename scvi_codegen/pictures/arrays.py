@@ -1,4 +1,4 @@
-"""Plots of arrays of indexed systems: an image over index and time, a final image, or bodies in space."""
+"""Plots of arrays of array systems: an image over index and time, a final image, or bodies in space."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def plot_arrays(
     array: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an array of a trajectory of an indexed system.
+    """Draw an array of a trajectory of an array system.
 
     An array with one index, ``q[N]``, is an image over index and time; ``r[N, 2]`` or ``r[N, 3]`` are the first and
     last positions in space, in their first two components; any other array with two indices, ``u[NX, NY]``, is an image
     of the final state.
 
     Args:
-        trajectory: result of :meth:`IndexedStepper.integrate`.
+        trajectory: result of :meth:`ArrayStepper.integrate`.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
         array: name of the array; by default the first.
 

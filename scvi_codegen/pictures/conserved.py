@@ -31,7 +31,7 @@ def plot_energy(
     """Draw the energy error ``|H - H_0| / |H_0|`` over time (absolute if H_0 = 0), a colour a trajectory.
 
     Args:
-        trajectories: one or several trajectories, also of indexed systems.
+        trajectories: one or several trajectories, also of array systems.
         path, ax: as of :func:`~scvi_codegen.pictures.paths.plot_motion`.
 
     Raises:

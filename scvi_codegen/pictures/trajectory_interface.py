@@ -33,7 +33,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 class EnergyHistory(Protocol):
-    """Times and energies: of a :class:`DrawnMotion` or an indexed system."""
+    """Times and energies: of a :class:`DrawnMotion` or an array system."""
 
     @property
     def t(self) -> Array: ...  # noqa: D102

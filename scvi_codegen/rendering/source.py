@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from scvi_codegen.indices import Access, Array, IndexedMap, Loop
+from scvi_codegen.indices import Access, Array, ArrayMap, Loop
 from scvi_codegen.version import __version__
 
 __all__ = ["ArrayLayout", "Interface", "Source", "check_interface", "included"]
@@ -185,7 +185,7 @@ class ArrayLayout:
     fields: tuple[Array, ...] = ()
     tables: tuple[Array, ...] = ()
     field_defaults: tuple[float, ...] = ()
-    maps: tuple[IndexedMap, ...] = ()
+    maps: tuple[ArrayMap, ...] = ()
     accesses: tuple[tuple[Access, tuple[Loop, ...]], ...] = ()
     depends_on_time: bool = False
     constraints: tuple[tuple[Loop, ...], ...] = ()

@@ -26,7 +26,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import checked_vector
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
@@ -55,7 +55,7 @@ LONGEST, HALVINGS, PART = 1.0, 40, 0.1
 
 @checks_arguments(
     system=SYSTEM_OR_ARRAYS,
-    stepper=of("a stepper", Stepper, IndexedStepper),
+    stepper=of("a stepper", Stepper, ArrayStepper),
     solver=TEXT,
     flags=TEXTS,
     parameters=MAPPING,
@@ -70,7 +70,7 @@ def verify(
     *,
     h: float | None = None,
     t: float = 0.0,
-    stepper: Stepper | IndexedStepper | None = None,
+    stepper: Stepper | ArrayStepper | None = None,
     tolerance: float | None = None,
     solver: str = "auto",
     flags: Sequence[str] = TUNED_FLAGS,
@@ -93,7 +93,7 @@ def verify(
         tolerance: also measure runs with adaptive step size and this relative local error; 0: round-off.
         solver, flags: as for ``compile_stepper``.
         velocity, parameters, tables: only for arrays of run-time sizes, which also need q and h, as of
-            :meth:`IndexedStepper.integrate`: properties are measured on a few indices of the arrays first, then at full
+            :meth:`ArrayStepper.integrate`: properties are measured on a few indices of the arrays first, then at full
             size; the state of the certificate is that of the few indices.
 
     Returns:
@@ -113,7 +113,7 @@ def verify(
             raise StateError(
                 f"{name} is for arrays of run-time sizes: give p, and parameters as defaults of the system"
             )
-    assert not isinstance(stepper, IndexedStepper)
+    assert not isinstance(stepper, ArrayStepper)
     began = time.perf_counter()
     method = as_method(method, system)
     t, h = checked_number(t, "the time t"), None if h is None else checked_step(h)

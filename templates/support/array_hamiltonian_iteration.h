@@ -1,4 +1,4 @@
-/* Fixed-point iteration of a step of an indexed Hamiltonian system: positions and momenta y at the points are updated
+/* Fixed-point iteration of a step of an array Hamiltonian system: positions and momenta y at the points are updated
  * from their rates until they converge. Requires: points.h, convergence.h, the tables, curve_error.h, forces, which
  * computes the rates G at X: -H_q of the momenta, then H_p of the positions. Momenta follow positions in memory. */
 

@@ -1,4 +1,4 @@
-/* Linear systems of Newton's method for the points of a step of an indexed system: (1 - h^2 A F' / m) dX = the change
+/* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
  * multiplied by vectors, term group by term group. Requires: array_points.h; products and diagonals of F'. */
 

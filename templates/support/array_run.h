@@ -65,7 +65,7 @@ static int run_workers(run_memory *run, const job *way, solver_report *report)
 }
 #endif
 
-/* Runs of indexed systems in arrays of the caller. Requires: take_step of a solver, ERROR_POWER. */
+/* Runs of array systems in arrays of the caller. Requires: take_step of a solver, ERROR_POWER. */
 
 solver_options NAME(default_options)(void)
 {

@@ -1,4 +1,4 @@
-/* Splitting step of an indexed system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
+/* Splitting step of an array system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
  * arrays.h, add_forces, LEAPS, CHUNK, the tables. */
 
 /* Parts of work: positions of the next kick, forces at the end of a step, increments of positions and momenta. */

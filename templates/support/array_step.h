@@ -154,7 +154,7 @@ static SELDOM int compare_with_halves(run_memory *run, const problem *given, lon
   return status;
 }
 
-/* Step of an indexed system with a solver: error estimate, comparison with half steps, update of the state. Requires:
+/* Step of an array system with a solver: error estimate, comparison with half steps, update of the state. Requires:
  * solve, continue_steps; tables LAST_ALONE, LAST, BEFORE; curve_error.h, sizes.h. */
 
 /* Largest coordinate and largest momentum. */

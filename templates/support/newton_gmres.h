@@ -102,7 +102,7 @@ static double find_correction(linear_system *of, solver_report *report)
   return last;
 }
 
-/* Newton's method for the points of a step of an indexed system. Requires: array_newton.h. */
+/* Newton's method for the points of a step of an array system. Requires: array_newton.h. */
 
 #define REFRESHED 1e-6 /* squared: the preconditioner is recomputed while points change by more than 1e-3 of the
                         * state */

@@ -1,7 +1,7 @@
 /* Trial of an adaptive step of arrays (ARRAYS) or of named coordinates, by fixed-point iteration or by Newton's
  * method (NEWTON_ALONE). */
 #ifdef ARRAYS
-/* Trial of an adaptive step of an indexed system. Requires: step_size_levels.h, predictor_tables.h, array_step.h;
+/* Trial of an adaptive step of an array system. Requires: step_size_levels.h, predictor_tables.h, array_step.h;
  * DOUBTS. */
 #define HOT static
 #define SHORT_STEPS_FAIL 1 /* their changes are relative to velocities that may be little more than rounding */

@@ -1,4 +1,4 @@
-"""The benchmark of indexed systems: all contenders compute the same motion, and measurements are reported."""
+"""The benchmark of array systems: all contenders compute the same motion, and measurements are reported."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The commands with a model of an indexed system."""
+"""The commands with a model of an array system."""
 
 from __future__ import annotations
 
@@ -109,12 +109,12 @@ def test_options_of_array_systems(ring: str) -> None:
     ("words", "message"),
     [
         (("run", "--advise", "1e-9"), "--advise is not available for arrays whose sizes are known"),
-        (("run", "--time-transformation", "frequency"), "time_transformation is not supported for indexed systems"),
+        (("run", "--time-transformation", "frequency"), "time_transformation is not supported for array systems"),
         (("run", "-o", "ring.csv"), "use .npz"),
         (("run", "--size", "N=1.5"), "must be an integer, not 1.5"),
         (("run", "--parameter", "x=1"), "has no parameter 'x'"),
-        (("run", "--method", "scvi:4"), "not supported for indexed systems"),
-        (("run", "--solver", "explicit"), "unknown solver 'explicit' of an indexed system"),
+        (("run", "--method", "scvi:4"), "not supported for array systems"),
+        (("run", "--solver", "explicit"), "unknown solver 'explicit' of an array system"),
         (("generate", "-o", "folder", "--method", "stoermer-verlet", *NEWTON), "leave out solver='newton'"),
         (("generate", "-o", "folder", "--embedded", "double"), "--embedded is not available for arrays whose sizes"),
         (("derive", "--html", "page.html"), "--html is not available for arrays whose sizes are known"),
@@ -229,12 +229,12 @@ def test_pictures_of_an_array_system(axes: str, tmp_path: Path) -> None:
     """Line in time, bodies in space, and a plane."""
     pytest.importorskip("matplotlib")
     from scvi_codegen.pictures.arrays import plot_arrays
-    from scvi_codegen.runtime.arrays.trajectory import IndexedTrajectory
+    from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory
 
     shape = {"q[N]": (3, 4), "q[N, 2]": (3, 4, 2), "q[N, M]": (3, 4, 5)}[axes]
     values = np.arange(np.prod(shape), dtype=float).reshape(shape)
     nothing = {"observed": None, "energies": values, "maps": values, "inverse_masses": {}, "h": 1.0, "steps": 2}
-    run = IndexedTrajectory(
+    run = ArrayTrajectory(
         t=np.arange(3.0), q={"q": values}, p={"q": values}, **nothing, iterations=0, step_error=0.0, worst_step_time=0.0
     )
     ax = plot_arrays(run, tmp_path / "picture.png")

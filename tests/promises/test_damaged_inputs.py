@@ -83,7 +83,7 @@ def stepper() -> sc.Stepper:
 
 
 @cache
-def arrays() -> sc.IndexedStepper:
+def arrays() -> sc.ArrayStepper:
     found = sc.LagrangianSystem.from_text(
         name="net",
         coordinates=["q[N]"],

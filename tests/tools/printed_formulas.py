@@ -74,7 +74,7 @@ def _tokens(element: ElementTree.Element) -> Iterator[Any]:  # noqa: C901
         case "mover":
             yield _name(children[0].text or "", ACCENTS[children[1].text or ""])
         case "msub":
-            yield _indexed(children[0], _index(children[1]))
+            yield _arrays(children[0], _index(children[1]))
         case "msup" if children[0].tag == "mo":
             yield ")"
             yield ("power", _tree(children[1]))
@@ -85,7 +85,7 @@ def _tokens(element: ElementTree.Element) -> Iterator[Any]:  # noqa: C901
         case "msup":
             yield ("^", _tree(children[0]), _tree(children[1]))
         case "msubsup":
-            base = _indexed(children[0], _index(children[1]))
+            base = _arrays(children[0], _index(children[1]))
             raised = base[0] == "name" and base[1].rstrip("'") in RAISED
             yield (*base[:3], _index(children[2])) if raised else ("^", base, _tree(children[2]))
         case _:
@@ -100,7 +100,7 @@ def _index(element: ElementTree.Element) -> str:
     return "".join(element.itertext())
 
 
-def _indexed(base: ElementTree.Element, index: str) -> Tree:
+def _arrays(base: ElementTree.Element, index: str) -> Tree:
     """A letter with a lower index; a product of matrices in brackets is one name."""
     if base.tag == "mover":
         return _name(base[0].text or "", ACCENTS[base[1].text or ""], index)

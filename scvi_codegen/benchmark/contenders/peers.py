@@ -253,4 +253,4 @@ PEERS = {
     "scipy": Peer(modules=("scipy",), contenders=_scipy),
     "openmm": Peer(modules=("openmm",), contenders=lambda case, quick: iter(()), suits=lambda case: False),
 }
-"""Peers by the name on the command line, the fastest first; the last is for indexed systems only."""
+"""Peers by the name on the command line, the fastest first; the last is for array systems only."""

@@ -49,9 +49,9 @@ def bench(
       mechanisms                SymPy mechanisms; lambdify and PyDy
       constrained-bodies        constrained bodies; MuJoCo
       control-loop              cost of a control step
-      lattices, growth          indexed systems (lattices, fields, bodies); scaling with size
+      lattices, growth          array systems (lattices, fields, bodies); scaling with size
       threads                   steps with several threads
-      energies                  energy of indexed systems over 100,000 steps
+      energies                  energy of array systems over 100,000 steps
       thousand-bodies           a thousand bodies; REBOUND
       c-compilers               compilers and processors
 

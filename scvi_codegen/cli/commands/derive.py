@@ -14,7 +14,7 @@ from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 
 __all__ = ["derive"]
 
@@ -34,7 +34,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
     with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
 
-    For an indexed model: each term group with its derivatives with respect to its entries, masses, and the step.
+    For an array model: each term group with its derivatives with respect to its entries, masses, and the step.
 
     \b
     Examples:
@@ -47,7 +47,7 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, ModelOptions(**choices))
     about = {"system": model.system.name, "method": model.method.name}
-    if isinstance(model, IndexedModel):
+    if isinstance(model, ArrayModel):
         reject_options({"html": html, "radicals": radicals})
         text = derive_sums(model.system, model.method, as_latex=latex)
         emit(text, output, **about, text=text)

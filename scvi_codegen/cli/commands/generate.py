@@ -9,7 +9,7 @@ import click
 from scvi_codegen.cli.command_group import reporting, tell
 from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import reject_options
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.cross import TARGETS
@@ -60,7 +60,7 @@ def generate(
 
     With --embedded the C code is small: Newton's method alone, or an explicit method; a macro bounds the iterations.
 
-    For an indexed model the folder has C code for any array sizes and the initial state as a text file, but no Python
+    For an array model the folder has C code for any array sizes and the initial state as a text file, but no Python
     package.
 
     With --fmu the output is one file for Modelica tools, Simulink and FMPy: the compiled library, the C code, and the
@@ -77,7 +77,7 @@ def generate(
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
-    if isinstance(model, IndexedModel):
+    if isinstance(model, ArrayModel):
         reject_options({"embedded": embedded, "single_file": single_file, "fmu": fmu})
         folder, python = generate_package(model, output, solver=solver, force=force), ""
     elif fmu:

@@ -17,8 +17,8 @@ from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_ar
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
-from scvi_codegen.cli.sums import reject_options, run_indexed, with_solver
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.cli.sums import reject_options, run_arrays, with_solver
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
@@ -45,7 +45,7 @@ fast); the map remains symplectic. --step is then the step of tau; without it on
 round-off. --span and all times are of t. For systems with explicit time or forces use --controller reversible, a
 time-reversible step-size controller.
 
-An indexed model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its trajectory is an .npz
+An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its trajectory is an .npz
 file, its plot an image over index and time.
 
 A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
@@ -130,7 +130,7 @@ Examples:
     help="Convergence criterion: relative update of the stages [round-off].",
 )
 @click.option("--max-iterations", type=int, metavar="N", help="Iterations after which a step fails [50].")
-@click.option("--threads", type=int, metavar="N", help="Worker threads per step of an indexed model [1].")
+@click.option("--threads", type=int, metavar="N", help="Worker threads per step of an array model [1].")
 @reporting
 def run(
     model_name: str | None,
@@ -167,14 +167,14 @@ def run(
     arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in arguments.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
-    if isinstance(model, IndexedModel):
+    if isinstance(model, ArrayModel):
         reject_options({"ensemble": ensemble, "advise": advise})
-        arrays, confirmed = _indexed_with_steps(with_solver(solver, model), wanted, options, threads)
-        run_indexed(arrays, output, plot, options, threads)
+        arrays, confirmed = _arrays_with_steps(with_solver(solver, model), wanted, options, threads)
+        run_arrays(arrays, output, plot, options, threads)
         _check_confirmed(confirmed)
         return
     if threads is not None:
-        raise click.UsageError("--threads requires an indexed model (array coordinates)")
+        raise click.UsageError("--threads requires an array model (array coordinates)")
     if model.system.inputs:
         _check_driven(advise, recorded=recorded)
     if ensemble is not None:
@@ -211,10 +211,10 @@ def _with_steps(
     return model, None
 
 
-def _indexed_with_steps(
-    model: IndexedModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
-) -> tuple[IndexedModel, GlobalError | None]:
-    """Return the same as :func:`_with_steps` for indexed systems."""
+def _arrays_with_steps(
+    model: ArrayModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
+) -> tuple[ArrayModel, GlobalError | None]:
+    """Return the same as :func:`_with_steps` for array systems."""
     if wanted["tolerance"] is not None:
         return model_with_adaptive_steps(model, wanted["tolerance"]), None
     wanted_error = model.error if wanted["error"] is None else wanted["error"]

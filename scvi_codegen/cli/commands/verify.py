@@ -13,12 +13,12 @@ from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writab
 from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
 from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.array_model import IndexedModel
+from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.array_package import load_sums
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import read_model_file
 from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification import Certificate
 
@@ -38,7 +38,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     MODEL may also be a folder written by 'generate': then its C code is measured. A step is compared with the paper's
     equations solved in 60 digits, and these with the exact motion. Order, symplecticity, reversibility, momentum maps,
     Newton's matrix and identities between methods are measured; if the model has a tolerance or a time transformation,
-    also runs with these steps. Indexed models are measured on a few indices, compared with the unrolled system, and at
+    also runs with these steps. Array models are measured on a few indices, compared with the unrolled system, and at
     full size. The JSON is written into the folder or next to the model file.
 
     \b
@@ -71,9 +71,9 @@ def _verified(name: str, choices: ModelOptions, *, solver: str) -> Certificate:
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
-        if isinstance(model, IndexedModel):
+        if isinstance(model, ArrayModel):
             model = with_solver(solver, model)
-            return _indexed_certificate(model, model.stepper())
+            return _array_certificate(model, model.stepper())
         return _certificate(model, model.stepper(solver=solver), solver)
     if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
@@ -82,8 +82,8 @@ def _verified(name: str, choices: ModelOptions, *, solver: str) -> Certificate:
             f"{folder} has no {MODEL_FILE}, which defines its guaranteed properties: generate it from a model"
         )
     model = read_model_file(folder / MODEL_FILE, choices.sections())
-    if isinstance(model, IndexedModel):
-        return _indexed_certificate(model, load_sums(folder, model))
+    if isinstance(model, ArrayModel):
+        return _array_certificate(model, load_sums(folder, model))
     return _certificate(model, load_package(folder), "auto")
 
 
@@ -102,7 +102,7 @@ def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
     )
 
 
-def _indexed_certificate(model: IndexedModel, stepper: IndexedStepper) -> Certificate:
+def _array_certificate(model: ArrayModel, stepper: ArrayStepper) -> Certificate:
     return verification.verify(
         model.system,
         model.method,

@@ -90,7 +90,7 @@ def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) 
     """
     if system.velocities:
         raise MethodError(
-            "velocity-dependent forces are not supported for indexed systems with constraints: remove "
+            "velocity-dependent forces are not supported for array systems with constraints: remove "
             "the forces or the constraints"
         )
     pairs = list(_kernels(system))
@@ -106,7 +106,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
     if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
         return (mp.one,)
     raise MethodError(
-        f"{method.name} does not support constraints of indexed systems: use 'stoermer-verlet', which is "
+        f"{method.name} does not support constraints of array systems: use 'stoermer-verlet', which is "
         "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
     )
 

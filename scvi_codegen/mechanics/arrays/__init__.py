@@ -1,1 +1,1 @@
-"""Indexed systems: Lagrangians and Hamiltonians of arrays in index notation, of any size."""
+"""Array systems: Lagrangians and Hamiltonians of arrays in index notation, of any size."""

@@ -1,4 +1,4 @@
-"""Constraints of indexed systems: g(array entries at e, parameters, t) = 0 for every element e of loops.
+"""Constraints of array systems: g(array entries at e, parameters, t) = 0 for every element e of loops.
 
     m q'' = F + G^T lambda,        g(q, t) = 0,        G = g_q,        hidden constraint G v + g_t = 0
 
@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from sympy import Add, Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.indices import Access, Array
@@ -30,17 +30,17 @@ __all__ = [
 ]
 
 
-def constraint_text(term: IndexedTerm) -> str:
+def constraint_text(term: ArrayTerm) -> str:
     """Return the constraint as text."""
     return f"{term.formula} = 0" + (f" for {', '.join(map(str, _named(term)))}" if term.loops else "")
 
 
-def _named(term: IndexedTerm) -> Iterator[object]:
+def _named(term: ArrayTerm) -> Iterator[object]:
     behind = {loop.behind for loop in term.loops}
     return (loop for loop in term.loops if loop.index not in behind)
 
 
-def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
+def check_constraint(term: ArrayTerm, coordinates: Sequence[Array], fields: Sequence[Array], inputs: str) -> None:
     """Raise :class:`SystemDefinitionError` unless a constraint contains coordinates, and neither velocities nor inputs.
 
     Args:
@@ -54,7 +54,7 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
     if moving := {access.array for _, access in term.slots} - {*coordinates, *fields}:
         name = min(array.name for array in moving)
         raise SystemDefinitionError(
-            f"the constraint '{shown}' contains the velocity {name}: constraints of indexed systems "
+            f"the constraint '{shown}' contains the velocity {name}: constraints of array systems "
             "must be holonomic (coordinates and time only)"
         )
     if not coordinate_accesses(term, coordinates):
@@ -69,12 +69,12 @@ def check_constraint(term: IndexedTerm, coordinates: Sequence[Array], fields: Se
         )
 
 
-def coordinate_accesses(term: IndexedTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
+def coordinate_accesses(term: ArrayTerm, coordinates: Sequence[Array]) -> tuple[tuple[Symbol, Access], ...]:
     """Return the coordinate accesses of a constraint, with their symbols."""
     return tuple(pair for pair in term.slots if pair[1].array in coordinates)
 
 
-def constraint_gradient(term: IndexedTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
+def constraint_gradient(term: ArrayTerm, coordinates: Sequence[Array], time: Symbol) -> tuple[Expr, ...]:
     """Return the row of G of one element, by its coordinates, followed by g_t."""
     variables = [*(slot for slot, _ in coordinate_accesses(term, coordinates)), time]
     derivatives = gradient(term.formula, variables)
@@ -82,7 +82,7 @@ def constraint_gradient(term: IndexedTerm, coordinates: Sequence[Array], time: S
 
 
 def constraint_force_terms(
-    term: IndexedTerm, coordinates: Sequence[Array], time: Symbol
+    term: ArrayTerm, coordinates: Sequence[Array], time: Symbol
 ) -> tuple[tuple[Access, Expr], ...]:
     """Return G^T of one element: each coordinate access with its factor of the multiplier."""
     derivatives = constraint_gradient(term, coordinates, time)
@@ -90,7 +90,7 @@ def constraint_force_terms(
 
 
 def constraint_second_rate(
-    term: IndexedTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]
+    term: ArrayTerm, coordinates: Sequence[Array], time: Symbol, velocities: Sequence[Symbol]
 ) -> Expr:
     """Return d^2 g / dt^2 at zero acceleration: v^T g_qq v + 2 g_qt v + g_tt."""
     variables = [*(slot for slot, _ in coordinate_accesses(term, coordinates)), time]

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.array_forces import IndexedForce
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
 from scvi_codegen.mechanics.arrays.system import ArraySystem
@@ -126,12 +126,12 @@ class _Elements:
     tables: Tables
     names: Mapping[str, NDArray[np.str_]]
 
-    def rules(self, of: IndexedTerm | IndexedForce) -> Iterator[tuple[Elements, dict[Symbol, Symbol]]]:
+    def rules(self, of: ArrayTerm | ArrayForce) -> Iterator[tuple[Elements, dict[Symbol, Symbol]]]:
         """Yield the values of the indices with the symbol that replaces each access."""
         for at in _elements(of.loops, self.sizes):
             yield at, {slot: self.entry(access, at, of.loops) for slot, access in of.slots}
 
-    def forces(self, forces: Sequence[IndexedForce]) -> dict[Symbol, list[Expr]]:
+    def forces(self, forces: Sequence[ArrayForce]) -> dict[Symbol, list[Expr]]:
         """Return the contributions to the force on each coordinate."""
         by_coordinate: dict[Symbol, list[Expr]] = {}
         for force in forces:

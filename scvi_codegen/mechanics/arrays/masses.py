@@ -1,4 +1,4 @@
-"""Masses of indexed systems: velocities occur as m v**2/2 with a constant m that may differ between elements."""
+"""Masses of array systems: velocities occur as m v**2/2 with a constant m that may differ between elements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sympy
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.arrays import IndexedTerm
+from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.indices import Access, Array, Loop
 
@@ -26,7 +26,7 @@ class MassTerm:
     slots: tuple[tuple[Symbol, Access], ...]
 
 
-def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
+def masses_of(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[MassTerm, ...]:
     """Return the mass contributions of a term, one per velocity."""
     known, masses = dict(term.slots), []
     for v in velocity_symbols(term, velocities):
@@ -37,12 +37,12 @@ def masses_of(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[MassT
     return tuple(masses)
 
 
-def velocity_symbols(term: IndexedTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
+def velocity_symbols(term: ArrayTerm, velocities: Mapping[str, Array]) -> tuple[Symbol, ...]:
     """Return the symbols of a term that denote velocities."""
     return tuple(slot for slot, access in term.slots if access.array.name in velocities)
 
 
-def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
+def check_form(term: ArrayTerm, velocities: Mapping[str, Array], time: Symbol) -> None:
     """Raise :class:`SystemDefinitionError` unless velocities occur as m v**2/2 with a constant m."""
     coordinates = set(velocities.values())
     varies = {slot for slot, access in term.slots if access.array.name in velocities or access.array in coordinates}
@@ -54,18 +54,18 @@ def check_form(term: IndexedTerm, velocities: Mapping[str, Array], time: Symbol)
         if mass.free_symbols & (varies | {time}) or sympy.expand(derivative - mass * v) != 0:
             raise SystemDefinitionError(
                 f"in '{term}' the derivative with respect to {v} is {derivative}: the Lagrangian of an "
-                "indexed system may contain velocities as m*v**2/2 only, with a constant mass m"
+                "array system may contain velocities as m*v**2/2 only, with a constant mass m"
             )
 
 
 def terms_at_rest(
-    terms: Sequence[IndexedTerm],
+    terms: Sequence[ArrayTerm],
     velocities: Mapping[str, Array],
     state: Sequence[Array],
     *,
     negative: bool,
     moving: bool,
-) -> tuple[IndexedTerm, ...]:
+) -> tuple[ArrayTerm, ...]:
     """Return the non-zero terms at zero velocity that depend on the state, or those that do not.
 
     Args:

@@ -1,4 +1,4 @@
-"""Rolling of repeated terms into loops: a system of many similar terms becomes an indexed system, compiled once.
+"""Rolling of repeated terms into loops: a system of many similar terms becomes an array system, compiled once.
 
 Terms that differ only in their coordinates, parameters and numbers form one group, sum(b in B, f(q[at[b, 0]],
 q[at[b, 1]], c[b])), with an index table and arrays of numbers.
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.array_forces import IndexedForce
-from scvi_codegen.formulas.arrays import IndexedTerm, term_of
+from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.arrays import ArrayTerm, term_of
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
@@ -31,7 +31,7 @@ __all__ = ["RolledSums", "roll_sums"]
 
 @dataclass(frozen=True, slots=True)
 class RolledSums:
-    """Indexed system with the data that make it equal to the original system.
+    """Array system with the data that make it equal to the original system.
 
     Attributes:
         system: with one array q[N], the coordinates in their order; named qg[Ng] or the like, as are other names, if
@@ -49,7 +49,7 @@ class RolledSums:
 
 @checks_arguments(SystemDefinitionError, system=SYSTEM)
 def roll_sums(system: MechanicalSystem) -> RolledSums:
-    """Return the indexed system of a Lagrangian or Hamiltonian with many similar terms, and of its forces.
+    """Return the array system of a Lagrangian or Hamiltonian with many similar terms, and of its forces.
 
     Parameters that differ from term to term become arrays of their default values; the others remain parameters.
 
@@ -99,7 +99,7 @@ def roll_sums(system: MechanicalSystem) -> RolledSums:
         tables=tuple(each.table for each in parts),
         terms=tuple(terms[: len(kinds)]),
         forces=tuple(
-            IndexedForce(
+            ArrayForce(
                 loops=term.loops, slots=term.slots, targets=((each.accesses[each.group.slots[0]], term.formula),)
             )
             for each, term in zip(parts[len(kinds) :], terms[len(kinds) :], strict=True)
@@ -166,7 +166,7 @@ class _Rolled:
         loop = Loop(index=index, first=Size(""), end=rows)
         return cls(group, loop, Array(f"at{name}", (rows, Size("", columns))), accesses)
 
-    def term(self, inputs: Mapping[Symbol, Expr]) -> IndexedTerm:
+    def term(self, inputs: Mapping[Symbol, Expr]) -> ArrayTerm:
         """Return the sum over the rows, with the formulas of inputs."""
         return term_of((self.loop,), self.group.formula.xreplace(inputs), self.accesses)
 

@@ -1,4 +1,4 @@
-"""Momentum maps of indexed systems: translations and rotations of whole arrays, proved by one identity per kernel.
+"""Momentum maps of array systems: translations and rotations of whole arrays, proved by one identity per kernel.
 
 sum_e l(q at e) is invariant under a translation of all entries of ``q`` if the derivatives of l with respect to its
 entries of ``q`` add up to 0 identically (Noether); so the cost of the proof does not depend on the number of
@@ -17,7 +17,7 @@ from sympy import Add, Expr, S, Symbol
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
-from scvi_codegen.indices import Access, Array, IndexedMap, Place, Size
+from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
 from scvi_codegen.mechanics.arrays.constraints import constraint_force_terms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.tables.precision import mp
@@ -32,7 +32,7 @@ MAX_ROTATED_COMPONENTS = 3
 """Largest number of components for which rotations are tested (points in space)."""
 
 
-def momentum_maps(system: ArraySystem) -> tuple[IndexedMap, ...]:
+def momentum_maps(system: ArraySystem) -> tuple[ArrayMap, ...]:
     """Return all momentum maps of these kinds that a system has."""
     return tuple(each for array in system.coordinates for each in _maps(system, array))
 
@@ -58,20 +58,20 @@ def _force_terms(system: ArraySystem) -> Iterator[_ForceTerms]:
         yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
 
 
-def _maps(system: ArraySystem, array: Array) -> Iterator[IndexedMap]:
+def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
     last, force_terms = array.axes[-1] if array.axes else Size("", 0), list(_force_terms(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
         if all(_is_zero(*_shift(system, each, array, component)) for each in force_terms):
-            yield IndexedMap(array.name, component)
+            yield ArrayMap(array.name, component)
     if system.momenta and all(_is_zero(*_phase(system, each, array)) for each in force_terms):
-        yield IndexedMap(array.name, None, phase=True)
+        yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
         for a in range(last.number):
             for b in range(a + 1, last.number):
                 turned = all(_is_zero(*_turn(system, each, array, (a, b))) for each in force_terms)
                 if turned and _same_masses(system, array, a, b):
-                    yield IndexedMap(array.name, a, b)
+                    yield ArrayMap(array.name, a, b)
 
 
 def _component(access: Access, array: Array, component: int | None) -> bool:

@@ -19,10 +19,10 @@ from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.array_constraints import parse_constraint
-from scvi_codegen.formulas.array_forces import IndexedForce, parse_force
+from scvi_codegen.formulas.array_forces import ArrayForce, parse_force
 from scvi_codegen.formulas.array_latex import latex_sum
-from scvi_codegen.formulas.array_sympy import indexed_text
-from scvi_codegen.formulas.arrays import IndexedTerm, parse_array, parse_coordinate, parse_indexed
+from scvi_codegen.formulas.array_sympy import array_text
+from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
@@ -71,10 +71,10 @@ class ArraySystem:
     fields: tuple[Array, ...]
     field_defaults: tuple[float, ...]
     tables: tuple[Array, ...]
-    terms: tuple[IndexedTerm, ...]
-    forces: tuple[IndexedForce, ...] = ()
+    terms: tuple[ArrayTerm, ...]
+    forces: tuple[ArrayForce, ...] = ()
     inputs: tuple[str, ...] = ()
-    constraints: tuple[IndexedTerm, ...] = ()
+    constraints: tuple[ArrayTerm, ...] = ()
     damping: Expr = S.Zero
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
@@ -197,7 +197,7 @@ class ArraySystem:
         everything = (*arrays, *conjugate, *velocities, *fields.values())
         applied = [parse_force(*pair, arrays, everything, known, index_tables) for pair in (forces or {}).items()]
         if dissipation is not None:
-            applied.append(_friction(parse_indexed(dissipation, everything, known, index_tables), velocities, arrays))
+            applied.append(_friction(parse_sums(dissipation, everything, known, index_tables), velocities, arrays))
         kind = ArrayHamiltonian if conjugate else ArrayLagrangian
         system = kind(
             name=name,
@@ -209,7 +209,7 @@ class ArraySystem:
             fields=tuple(fields.values()),
             field_defaults=tuple(values[key] for key in fields),
             tables=index_tables,
-            terms=tuple(_with_formulas(term, driven) for term in parse_indexed(text, everything, known, index_tables)),
+            terms=tuple(_with_formulas(term, driven) for term in parse_sums(text, everything, known, index_tables)),
             forces=tuple(_with_forces(force, driven) for force in chain(*applied)),
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
@@ -245,7 +245,7 @@ class ArraySystem:
         if not isinstance(lagrangian, Expr):
             what = type(lagrangian).__name__
             raise SystemDefinitionError(f"the Lagrangian is a {what}, not a SymPy expression (text goes to from_text)")
-        text = indexed_text(lagrangian)
+        text = array_text(lagrangian)
         return cls.from_text(name=name, coordinates=coordinates, lagrangian=text, parameters=parameters, tables=tables)
 
     @property
@@ -295,17 +295,17 @@ class ArraySystem:
         return tuple(chain(*(masses_of(term, self._velocities) for term in self.terms)))
 
     @property
-    def potentials(self) -> tuple[IndexedTerm, ...]:
+    def potentials(self) -> tuple[ArrayTerm, ...]:
         """Terms of -V or -H that depend on coordinates or momenta, at zero velocity."""
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=True)
 
     @property
-    def energy_offsets(self) -> tuple[IndexedTerm, ...]:
+    def energy_offsets(self) -> tuple[ArrayTerm, ...]:
         """Terms of -V or -H without coordinates and momenta, which change the energy but not the trajectory."""
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
-    def kernels(self) -> tuple[tuple[IndexedTerm, dict[str, Expr]], ...]:
+    def kernels(self) -> tuple[tuple[ArrayTerm, dict[str, Expr]], ...]:
         """Terms of -V or -H, each with its derivatives by the symbols of its accesses of the state."""
         results = []
         for term in self.potentials:
@@ -405,12 +405,12 @@ def are_arrays(*declarations: Iterable[str]) -> bool:
     return any("[" in str(each) for group in declarations for each in group)
 
 
-def _with_formulas(term: IndexedTerm, rule: Mapping[Any, Expr]) -> IndexedTerm:
+def _with_formulas(term: ArrayTerm, rule: Mapping[Any, Expr]) -> ArrayTerm:
     """Return the term with expressions substituted by ``rule``."""
     return replace(term, formula=term.formula.xreplace(rule)) if rule else term
 
 
-def _with_forces(force: IndexedForce, rule: Mapping[Any, Expr]) -> IndexedForce:
+def _with_forces(force: ArrayForce, rule: Mapping[Any, Expr]) -> ArrayForce:
     targets = tuple((access, formula.xreplace(rule)) for access, formula in force.targets)
     return replace(force, targets=targets) if rule else force
 
@@ -446,8 +446,8 @@ def _momenta(
 
 
 def _friction(
-    terms: Sequence[IndexedTerm], velocities: Sequence[Array], coordinates: Sequence[Array]
-) -> tuple[IndexedForce, ...]:
+    terms: Sequence[ArrayTerm], velocities: Sequence[Array], coordinates: Sequence[Array]
+) -> tuple[ArrayForce, ...]:
     """Return the forces -dD/dv of Rayleigh's dissipation function."""
     arrays = dict(zip(velocities, coordinates, strict=False))
     forces = []
@@ -464,7 +464,7 @@ def _friction(
                 f"the dissipation {term} contains no velocity: Rayleigh's function defines the forces "
                 "-dD/dq_dot. Add velocities, or remove it"
             )
-        forces.append(IndexedForce(loops=term.loops, slots=term.slots, targets=targets))
+        forces.append(ArrayForce(loops=term.loops, slots=term.slots, targets=targets))
     return tuple(forces)
 
 

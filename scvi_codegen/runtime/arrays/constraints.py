@@ -12,7 +12,7 @@ from scvi_codegen.indices import Loop
 from scvi_codegen.native.options import REASONS, STATUS, SolverOptions
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, ROUNDING_UNITS
 from scvi_codegen.runtime.arrays.interface import Numbers
-from scvi_codegen.runtime.arrays.problem import IndexedProblem
+from scvi_codegen.runtime.arrays.problem import ArrayProblem
 from scvi_codegen.runtime.constraints.rank import rank_deficiency
 
 __all__ = ["check_reachable", "consistent", "constraint_values", "multipliers", "project"]
@@ -31,7 +31,7 @@ class ConstrainedRun(Protocol):
         state: positions and momenta in one vector.
     """
 
-    problem: IndexedProblem
+    problem: ArrayProblem
     options: SolverOptions | None
     state: Numbers
 

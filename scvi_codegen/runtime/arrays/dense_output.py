@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.arrays.interface import Numbers
-from scvi_codegen.runtime.arrays.problem import IndexedProblem
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.problem import ArrayProblem
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.runtime.trajectory.dense_output import whole_steps, within
 
@@ -32,27 +32,27 @@ class Continuation:
         options: solver options.
     """
 
-    problem: IndexedProblem
+    problem: ArrayProblem
     h: float
     plan: StepPlan | None
     options: SolverOptions | None
 
     @classmethod
-    def of(cls, run: IndexedRun) -> Continuation:
+    def of(cls, run: ArrayRun) -> Continuation:
         """Construct from the current state of a run."""
         return cls(run.problem, run.h, run.plan, run.options)
 
-    def begin(self, t: float, q: State, p: State, *, h: float | None = None, t_end: float | None = None) -> IndexedRun:
+    def begin(self, t: float, q: State, p: State, *, h: float | None = None, t_end: float | None = None) -> ArrayRun:
         """Return a run from a state, with fixed steps h or with adaptive steps to t_end."""
         plan = replace(self.plan, t_end=t_end) if self.plan and t_end is not None else None
         length = 0.0 if plan else self.h if h is None else h
-        return IndexedRun(self.problem, q, (p, "momenta"), h=length, t=t, plan=plan, options=self.options)
+        return ArrayRun(self.problem, q, (p, "momenta"), h=length, t=t, plan=plan, options=self.options)
 
 
 def states_between(
     continuations: tuple[Continuation, ...], t: Numbers, q: State, p: State, times: Numbers
 ) -> tuple[dict[str, Numbers], dict[str, Numbers]]:
-    """Return positions and momenta by name at (n,) times; raises as :meth:`IndexedTrajectory.at`."""
+    """Return positions and momenta by name at (n,) times; raises as :meth:`ArrayTrajectory.at`."""
     flat = within(times.ravel(), t[0], t[-1])
     forward = math.copysign(1.0, t[-1] - t[0])
     left = np.searchsorted(forward * t, forward * flat, side="right") - 1

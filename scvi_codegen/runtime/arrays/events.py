@@ -20,14 +20,14 @@ from scvi_codegen.errors import EventError, ScviCodegenError
 from scvi_codegen.indices import Array
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import Numbers, check_accesses
-from scvi_codegen.runtime.arrays.memory import IndexedSnapshot
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.memory import ArraySnapshot
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.events.event import ACCUMULATED, Event
 
 if TYPE_CHECKING:
-    from scvi_codegen.formulas.arrays import IndexedTerm
+    from scvi_codegen.formulas.arrays import ArrayTerm
 
-__all__ = ["IndexedCrossings", "IndexedSearch"]
+__all__ = ["ArrayCrossings", "ArraySearch"]
 
 Sample: TypeAlias = tuple[float, float]
 """Fraction of a step, and the function value there."""
@@ -46,7 +46,7 @@ LEAST_DIFFERENCE, RELATIVE_DIFFERENCE = 2.0**-10, 2.0**-17
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedCrossings:
+class ArrayCrossings:
     """Crossings of one event, in the order of the run.
 
     Attributes:
@@ -63,20 +63,20 @@ class IndexedCrossings:
     def __len__(self) -> int:
         return len(self.t)
 
-    def chosen(self, which: NDArray[np.bool_]) -> IndexedCrossings:
+    def chosen(self, which: NDArray[np.bool_]) -> ArrayCrossings:
         """Return the crossings selected by a (k,) boolean mask."""
         q, p = ({name: each[which] for name, each in part.items()} for part in (self.q, self.p))
         return replace(self, t=self.t[which], q=q, p=p)
 
 
-class IndexedSearch:
+class ArraySearch:
     """Search for zeros of event functions along a run, step by step.
 
     Raises:
         EventError: if a formula is invalid, an index leaves its array, or a function is not finite.
     """
 
-    def __init__(self, run: IndexedRun, events: Sequence[Event]) -> None:
+    def __init__(self, run: ArrayRun, events: Sequence[Event]) -> None:
         self.run, self.events = run, tuple(events)
         self.functions = [_Function(run, event) for event in events]
         self.remaining = [int(event.terminal) for event in events]
@@ -109,13 +109,13 @@ class IndexedSearch:
                 self._end(before, there)
                 return
 
-    def _take(self, k: int, there: IndexedRun) -> bool:
+    def _take(self, k: int, there: ArrayRun) -> bool:
         """Record a crossing; return whether it ends the run."""
         self.recorded[k].append((there.t, there.q, there.p))
         self.remaining[k] -= 1
         return self.remaining[k] == 0
 
-    def _leaves_zero(self, before: IndexedSnapshot, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
+    def _leaves_zero(self, before: ArraySnapshot, k: int, h: float, ends: Sequence[Sample]) -> list[Sample]:
         """Return samples within a first step that begins at a zero, as if the run had come from the other side.
 
         Raises:
@@ -143,7 +143,7 @@ class IndexedSearch:
                 return []
         return samples
 
-    def _rounding(self, start: IndexedRun, k: int, old: float) -> float:
+    def _rounding(self, start: ArrayRun, k: int, old: float) -> float:
         """Return the change of a function when coordinates change by one ulp up or down."""
         rng, largest = np.random.default_rng(0), 0.0
         for _ in range(4):
@@ -152,7 +152,7 @@ class IndexedSearch:
         return largest
 
     def _first_change(
-        self, before: IndexedSnapshot, start: IndexedRun, k: int, h: float, noise: float
+        self, before: ArraySnapshot, start: ArrayRun, k: int, h: float, noise: float
     ) -> tuple[float, float]:
         """Return h dg/dt at the start of a step and its uncertainty; zeros if g is undefined nearby."""
         n, part, next_ = start.problem.count, RATE_PART, self._part(before, RATE_PART * h)
@@ -169,12 +169,12 @@ class IndexedSearch:
             return 0.0, 0.0
         return by_q + by_rest, noise / size + (noise / LEAST_DIFFERENCE if by_rest else 0.0)
 
-    def _difference(self, start: IndexedRun, k: int, dt: float, along: Numbers, size: float) -> float:
+    def _difference(self, start: ArrayRun, k: int, dt: float, along: Numbers, size: float) -> float:
         """Return the central difference of a function along a direction."""
         above, below = (self._moved(start, k, start.t + part * dt, part * along) for part in (size, -size))
         return (above - below) / (2.0 * size)
 
-    def _moved(self, start: IndexedRun, k: int, t: float, change: Numbers) -> float:
+    def _moved(self, start: ArrayRun, k: int, t: float, change: Numbers) -> float:
         """Return a function at a perturbed state."""
         state, when = start.state.copy(), start.t
         start.state += change
@@ -185,11 +185,11 @@ class IndexedSearch:
             start.state[:] = state
             start._run.t = when
 
-    def crossings(self) -> tuple[IndexedCrossings, ...]:
+    def crossings(self) -> tuple[ArrayCrossings, ...]:
         """Return the crossings by event."""
         names = list(self.run.interface.coordinates)
         return tuple(
-            IndexedCrossings(
+            ArrayCrossings(
                 event=event,
                 t=np.array([t for t, _, _ in points]),
                 q={name: np.array([q[name] for _, q, _ in points]) for name in names},
@@ -198,13 +198,13 @@ class IndexedSearch:
             for event, points in zip(self.events, self.recorded, strict=True)
         )
 
-    def _end(self, before: IndexedSnapshot, there: IndexedRun) -> None:
+    def _end(self, before: ArraySnapshot, there: ArrayRun) -> None:
         """Leave the run at the state of a terminal event."""
         self.run.rollback(before)
         self.run.move_to(there)
         self.ended = True
 
-    def _zero(self, before: IndexedSnapshot, k: int, h: float, left: Sample, right: Sample) -> float:
+    def _zero(self, before: ArraySnapshot, k: int, h: float, left: Sample, right: Sample) -> float:
         """Return the fraction of a step, between two samples, at which a function is 0 or first has its new sign."""
         from scipy.optimize import brentq  # here: slow to import
 
@@ -218,7 +218,7 @@ class IndexedSearch:
             part, width = min(right[0], part + width * right[0]), 2.0 * width
         return part
 
-    def _part(self, before: IndexedSnapshot, h: float) -> IndexedRun:
+    def _part(self, before: ArraySnapshot, h: float) -> ArrayRun:
         """Return the state after a partial step."""
         run = self.run.copy_with_step(h)
         run.rollback(replace(before, run_fields={**before.run_fields, "h": h}))
@@ -226,10 +226,10 @@ class IndexedSearch:
         run.advance(1)
         return run
 
-    def _values(self, run: IndexedRun) -> list[float]:
+    def _values(self, run: ArrayRun) -> list[float]:
         return [self._value(run, k) for k in range(len(self.events))]
 
-    def _value(self, run: IndexedRun, k: int) -> float:
+    def _value(self, run: ArrayRun, k: int) -> float:
         value = self.functions[k].value(run)
         if not np.isfinite(value):
             raise EventError(f"the event function '{self.events[k].function}' is not finite at t = {run.t:.17g}")
@@ -244,7 +244,7 @@ def _crosses(event: Event, old: float, new: float) -> bool:
 class _Function:
     """Event function of the state."""
 
-    def __init__(self, run: IndexedRun, event: Event) -> None:
+    def __init__(self, run: ArrayRun, event: Event) -> None:
         interface, arrays = run.interface, run.problem.arrays
         self.terms = _terms(interface, event)
         accesses = tuple((access, term.loops) for term in self.terms for _, access in term.slots)
@@ -254,7 +254,7 @@ class _Function:
             raise EventError(f"the event function '{event.function}': {error}") from error
         self.needs = {access.array.name for access, _ in accesses}
 
-    def value(self, run: IndexedRun) -> float:
+    def value(self, run: ArrayRun) -> float:
         from scvi_codegen.formulas.array_symbols import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
@@ -280,8 +280,8 @@ def _momenta(interface: Interface) -> dict[str, str]:
     return dict(zip(interface.coordinates, names, strict=True))
 
 
-def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
-    from scvi_codegen.formulas.arrays import parse_indexed  # here, because it imports SymPy
+def _terms(interface: Interface, event: Event) -> tuple[ArrayTerm, ...]:
+    from scvi_codegen.formulas.arrays import parse_sums  # here, because it imports SymPy
     from scvi_codegen.formulas.symbols import TIME, symbol
 
     axes = {array.name: array.axes for array in interface.layout.coordinates}
@@ -290,12 +290,12 @@ def _terms(interface: Interface, event: Event) -> tuple[IndexedTerm, ...]:
         known += [Array(other, axes[name]) for name, other in others.items()]
     symbols = {name: symbol(name) for name in (*interface.parameters, TIME)}
     try:
-        return parse_indexed(str(event.function), known, symbols, interface.layout.tables)
+        return parse_sums(str(event.function), known, symbols, interface.layout.tables)
     except ScviCodegenError as error:
         raise EventError(f"the event function '{event.function}': {error}") from error
 
 
-def _arrays_of(run: IndexedRun, names: set[str]) -> dict[str, NDArray[np.float64]]:
+def _arrays_of(run: ArrayRun, names: set[str]) -> dict[str, NDArray[np.float64]]:
     """Return the arrays of a state that occur in ``names``."""
     arrays = {**run.q, **run.problem.arrays.fields}
     for others, state in ((_velocities(run.interface), "velocity"), (_momenta(run.interface), "p")):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from scvi_codegen.indices import IndexedMap
+from scvi_codegen.indices import ArrayMap
 from scvi_codegen.runtime.arrays.interface import Numbers
 
 __all__ = ["momentum_of"]
 
 
-def momentum_of(q: Numbers, p: Numbers, of: IndexedMap) -> float:
+def momentum_of(q: Numbers, p: Numbers, of: ArrayMap) -> float:
     """Return the value of a momentum map from the positions and momenta of its array."""
     if of.phase:
         return float(np.sum(q**2 + p**2) / 2)

@@ -13,7 +13,7 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.native.binding import Binding
 from scvi_codegen.runtime.arrays.interface import Numbers
 
-__all__ = ["RUN_FIELDS", "STATE", "IndexedSnapshot", "aligned", "constraint_memory"]
+__all__ = ["RUN_FIELDS", "STATE", "ArraySnapshot", "aligned", "constraint_memory"]
 
 STEP_CONTROL_FIELDS = (
     "grid_level",
@@ -39,7 +39,7 @@ ALIGNMENT = 64
 
 
 @dataclass(frozen=True, slots=True)
-class IndexedSnapshot:
+class ArraySnapshot:
     """Snapshot of a run: arrays, scalar fields and total solver iterations."""
 
     arrays: Mapping[str, Numbers]

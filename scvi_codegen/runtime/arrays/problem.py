@@ -14,10 +14,10 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays, field_values, number_values
 from scvi_codegen.runtime.core.validation import inputs_not_given, no_input
 
-__all__ = ["IndexedProblem"]
+__all__ = ["ArrayProblem"]
 
 
-class IndexedProblem:
+class ArrayProblem:
     """C struct of a problem and the arrays to which it points.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Run of an indexed system: its memory, steps and energy."""
+"""Run of an array system: its memory, steps and energy."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.constraints import check_reachable, constraint_values, multipliers
 from scvi_codegen.runtime.arrays.interface import Numbers, read_state
 from scvi_codegen.runtime.arrays.maps import momentum_of
-from scvi_codegen.runtime.arrays.memory import RUN_FIELDS, STATE, IndexedSnapshot, aligned, constraint_memory
-from scvi_codegen.runtime.arrays.problem import IndexedProblem
+from scvi_codegen.runtime.arrays.memory import RUN_FIELDS, STATE, ArraySnapshot, aligned, constraint_memory
+from scvi_codegen.runtime.arrays.problem import ArrayProblem
 from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.arrays.saving import (
     damage_as_state_error,
@@ -34,7 +34,7 @@ from scvi_codegen.runtime.run.run_loop import drive
 from scvi_codegen.runtime.run.step_plan import StepPlan
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["IndexedRun"]
+__all__ = ["ArrayRun"]
 
 FAILURES_BY_SOLVER = {
     "fixed-point": FAILURES
@@ -57,8 +57,8 @@ FAILURES_BY_SOLVER = {
 }
 
 
-class IndexedRun(OneThread, RunTimeSizes):
-    """Run of an indexed system; made by :meth:`IndexedStepper.start`.
+class ArrayRun(OneThread, RunTimeSizes):
+    """Run of an array system; made by :meth:`ArrayStepper.start`.
 
     Args:
         problem: problem data.
@@ -80,7 +80,7 @@ class IndexedRun(OneThread, RunTimeSizes):
 
     def __init__(
         self,
-        problem: IndexedProblem,
+        problem: ArrayProblem,
         q: Mapping[str, Numbers],
         moving: tuple[Any, str],
         *,
@@ -165,7 +165,7 @@ class IndexedRun(OneThread, RunTimeSizes):
             self._run.h, self._run.guess = h, 0
         self.plan = plan or self.plan
 
-    def _take(self, problem: IndexedProblem) -> None:
+    def _take(self, problem: ArrayProblem) -> None:
         """Set another problem of equal sizes; reused forces are discarded, an extrapolated predictor is kept."""
         former, self.problem = self.problem, problem
         self._run.guess *= self.interface.layout.continued
@@ -183,31 +183,31 @@ class IndexedRun(OneThread, RunTimeSizes):
         self._take(self.problem.with_constant_inputs(inputs))
 
     @alone
-    def copy_with_step(self, h: float, plan: StepPlan | None = None) -> IndexedRun:
+    def copy_with_step(self, h: float, plan: StepPlan | None = None) -> ArrayRun:
         """Return an independent run from the present state, bitwise equal, with another step size or step plan."""
         shared_arguments: dict[str, Any] = {"plan": plan, "options": self.options, "threads": self.threads}
-        other = IndexedRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **shared_arguments)
+        other = ArrayRun(self.problem, self.q, (self.p, "momenta"), h=h, t=self.t, **shared_arguments)
         for name in ("carry_q", "carry_p"):
             other._numbers[name][:] = self._numbers[name]
         other._run.t_low = self._run.t_low
         return other
 
     @property
-    def snapshot(self) -> IndexedSnapshot:
+    def snapshot(self) -> ArraySnapshot:
         """Snapshot of the present state for :meth:`rollback`."""
         arrays = {name: self._numbers[name].copy() for name in STATE}
         run_fields = {name: getattr(self._run, name) for name in RUN_FIELDS}
-        return IndexedSnapshot(arrays, run_fields, self.iterations)
+        return ArraySnapshot(arrays, run_fields, self.iterations)
 
     @alone
-    def move_to(self, other: IndexedRun) -> None:
+    def move_to(self, other: ArrayRun) -> None:
         """Copy state and time of another run of the same problem; keep the step count, reset the predictor."""
         for name in STATE:
             self._numbers[name][:] = other._numbers[name]
         self._run.t, self._run.t_low, self._run.guess = other._run.t, other._run.t_low, 0
 
     @alone
-    def rollback(self, snapshot: IndexedSnapshot) -> None:
+    def rollback(self, snapshot: ArraySnapshot) -> None:
         """Restore a snapshot; the predictor of the next step is reset."""
         for name, values in snapshot.arrays.items():
             self._numbers[name][:] = values
@@ -333,7 +333,7 @@ class IndexedRun(OneThread, RunTimeSizes):
 
     @alone
     def checkpoint(self) -> bytes:
-        """Return the whole run as bytes in NumPy's format (.npz), for :meth:`IndexedStepper.from_checkpoint`."""
+        """Return the whole run as bytes in NumPy's format (.npz), for :meth:`ArrayStepper.from_checkpoint`."""
         saved: dict[str, Any] = {f"state {name}": array for name, array in self.q.items()}
         saved |= {f"memory {name}": array for name, array in self._numbers.items()}
         saved |= {"moments": [float(getattr(self._run, name)) for name in RUN_FIELDS], "iterations": self.iterations}
@@ -362,7 +362,7 @@ class IndexedRun(OneThread, RunTimeSizes):
         memory = read_saved(saved, interface, to_a_time=plan is not None)
         with damage_as_state_error():
             unset_inputs = tuple(name for name in interface.inputs if name in memory["unset_inputs"].tolist())
-            problem = IndexedProblem(interface, binding, saved_arrays(memory, interface), unset_inputs)
+            problem = ArrayProblem(interface, binding, saved_arrays(memory, interface), unset_inputs)
             shared_arguments: dict[str, Any] = {"plan": plan, "options": options, "threads": threads}
             run = cls(problem, problem.arrays.state, (None, ""), h=0.0, t=0.0, **shared_arguments)
             restore_memory(run._run, run._numbers, memory)

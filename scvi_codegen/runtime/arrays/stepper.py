@@ -1,4 +1,4 @@
-"""Compiled integrator of an indexed system."""
+"""Compiled integrator of an array system."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from scvi_codegen.rendering.thread_partition import MOST_THREADS
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.arrays.constraints import consistent, project
 from scvi_codegen.runtime.arrays.interface import Numbers, RunArrays, read_arrays
-from scvi_codegen.runtime.arrays.problem import IndexedProblem
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.problem import ArrayProblem
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
-from scvi_codegen.runtime.arrays.trajectory import IndexedRecord, IndexedTrajectory
+from scvi_codegen.runtime.arrays.trajectory import ArrayRecord, ArrayTrajectory
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.core.validation import check_inputs_given, check_left_to_inputs, inputs_not_given
@@ -44,11 +44,11 @@ from scvi_codegen.runtime.run.times import steps_to
 from scvi_codegen.validation.argument_types import FUNCTION, MAPPING, checks_arguments
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = ["IndexedStepper"]
+__all__ = ["ArrayStepper"]
 
 
-class IndexedStepper(RunTimeSizes):
-    """Compiled integrator of an indexed system, for any number of coordinates.
+class ArrayStepper(RunTimeSizes):
+    """Compiled integrator of an array system, for any number of coordinates.
 
     Args:
         variants: source with adaptive steps, ``"controlled"``.
@@ -76,7 +76,7 @@ class IndexedStepper(RunTimeSizes):
         return (_rebuild, (self.source, self.interface, self._variants, self.flags))
 
     def __repr__(self) -> str:
-        return clipped(f"IndexedStepper({self.interface.title})", LONGEST)
+        return clipped(f"ArrayStepper({self.interface.title})", LONGEST)
 
     @property
     def momentum_map_names(self) -> tuple[str, ...]:
@@ -120,7 +120,7 @@ class IndexedStepper(RunTimeSizes):
         tables: Mapping[str, ArrayLike] | None = None,
         options: SolverOptions | None = None,
         threads: int | None = None,
-    ) -> IndexedRun:
+    ) -> ArrayRun:
         """Return a run with fixed steps h, or with adaptive steps to t_end; arguments as of :meth:`integrate`.
 
         Raises:
@@ -130,8 +130,8 @@ class IndexedStepper(RunTimeSizes):
         plan, binding = _plan(h, t_end, tolerance), self._binding if t_end is None else self._controlled
         arrays, moving = self._given(q, p, velocity, parameters, tables)
         length = 0.0 if h is None else checked_step(h)
-        run = IndexedRun(
-            IndexedProblem(self.interface, binding, arrays, inputs_not_given(self.interface, parameters)),
+        run = ArrayRun(
+            ArrayProblem(self.interface, binding, arrays, inputs_not_given(self.interface, parameters)),
             arrays.state,
             moving,
             h=length,
@@ -170,8 +170,8 @@ class IndexedStepper(RunTimeSizes):
         if not self.interface.layout.constraints:
             raise MethodError(f"'{self.interface.system}' has no constraints")
         arrays, moving = self._given(q, p, velocity, parameters, tables)
-        problem = IndexedProblem(self.interface, self._binding, arrays)
-        run = IndexedRun(problem, arrays.state, moving, h=0.0, t=checked_number(t, "t"))
+        problem = ArrayProblem(self.interface, self._binding, arrays)
+        run = ArrayRun(problem, arrays.state, moving, h=0.0, t=checked_number(t, "t"))
         project(run)
         return run.q, run.p
 
@@ -192,15 +192,15 @@ class IndexedStepper(RunTimeSizes):
         tolerance: float | None = None,
         options: SolverOptions | None = None,
         threads: int | None = None,
-    ) -> IndexedRun:
-        """Restore a run from :meth:`IndexedRun.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
+    ) -> ArrayRun:
+        """Restore a run from :meth:`ArrayRun.checkpoint`; it continues bitwise equally if ``t_end`` is passed again.
 
         Raises:
             StateError: if the bytes are no saved run or belong to another integrator.
         """
         plan = None if t_end is None else StepPlan.checked(t_end, tolerance)
         binding = self._controlled if plan else self._binding
-        return IndexedRun.restored(self.interface, binding, saved, options, plan, self._threads(threads))
+        return ArrayRun.restored(self.interface, binding, saved, options, plan, self._threads(threads))
 
     @checks_arguments(
         StateError, parameters=MAPPING, tables=MAPPING, inputs=MAPPING, observe=FUNCTION, progress=FUNCTION
@@ -220,14 +220,14 @@ class IndexedStepper(RunTimeSizes):
         t: float = 0.0,
         parameters: Mapping[str, ArrayLike] | None = None,
         tables: Mapping[str, ArrayLike] | None = None,
-        observe: Callable[[IndexedRun], ArrayLike] | None = None,
+        observe: Callable[[ArrayRun], ArrayLike] | None = None,
         options: SolverOptions | None = None,
         threads: int | None = None,
         progress: Callable[[int], None] | None = None,
         events: EventLike | Sequence[EventLike] | None = None,
         error: float | None = None,
         check_growth: bool | None = None,
-    ) -> IndexedTrajectory:
+    ) -> ArrayTrajectory:
         """Integrate ``steps`` steps of h, or to t_end, and save every ``save_every``-th state and the initial one.
 
         Args:
@@ -254,7 +254,7 @@ class IndexedStepper(RunTimeSizes):
             error, check_growth: as of :meth:`Stepper.integrate`; error needs all states, without ``observe``.
 
         Returns:
-            :class:`IndexedTrajectory` of steps // save_every + 1 states, plus that at t_end or at a terminal event.
+            :class:`ArrayTrajectory` of steps // save_every + 1 states, plus that at t_end or at a terminal event.
 
         Raises:
             StateError: if a name, shape or number is invalid, an index would leave its array, an observation is not
@@ -284,7 +284,7 @@ class IndexedStepper(RunTimeSizes):
             )
         to = t_end if h is None else None
         run = self.start(q, p, velocity=velocity, h=h, t_end=to, tolerance=tolerance, **shared_arguments)
-        record = IndexedRecord(run, observe, as_events(events))
+        record = ArrayRecord(run, observe, as_events(events))
         if data is None:
             check = GrowthCheck(run, check_growth)
             if h is None or t_end is None:
@@ -322,7 +322,7 @@ def _step_count(h: float | None, steps: int | None, t: float, t_end: float | Non
     return np.inf if steps is None else checked_count(steps, "steps", least=0)
 
 
-def _planned_segments(run: IndexedRun, t_end: float, h: float) -> Iterator[int]:
+def _planned_segments(run: ArrayRun, t_end: float, h: float) -> Iterator[int]:
     """Set the step size of the run for each segment of equal steps to t_end, and yield its number of steps."""
     for part in planned_segments(run.t, t_end, h, {}):
         run.update(h=part.h)
@@ -342,7 +342,7 @@ def _plan(h: float | None, t_end: float | None, tolerance: float | None) -> Step
     return None
 
 
-def _with_warnings(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajectory:
+def _with_warnings(record: ArrayRecord, check: GrowthCheck) -> ArrayTrajectory:
     """Return the trajectory, after warnings about its step size, its energy and its error growth."""
     trajectory = record.trajectory()
     check.warn(trajectory)
@@ -352,7 +352,7 @@ def _with_warnings(record: IndexedRecord, check: GrowthCheck) -> IndexedTrajecto
     return trajectory
 
 
-def _warn_of_energy_error(trajectory: IndexedTrajectory) -> None:
+def _warn_of_energy_error(trajectory: ArrayTrajectory) -> None:
     """Warn of an energy error of adaptive runs, and of fixed-step runs without an error estimate.
 
     For a Hamiltonian the kinetic part, which sets the scale, is 0.
@@ -364,5 +364,5 @@ def _warn_of_energy_error(trajectory: IndexedTrajectory) -> None:
         warn_of_energies(first, last, size, tolerable=GROSS_ERROR, why=FIXED_STEP_REMEDY)
 
 
-def _rebuild(source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...]) -> IndexedStepper:
-    return IndexedStepper(source, interface, variants=variants, flags=flags)
+def _rebuild(source: Source, interface: Interface, variants: Variants, flags: tuple[str, ...]) -> ArrayStepper:
+    return ArrayStepper(source, interface, variants=variants, flags=flags)

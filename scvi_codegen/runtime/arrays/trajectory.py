@@ -16,9 +16,9 @@ from scvi_codegen.files.export import write_whole
 from scvi_codegen.native.arguments import real_array
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.runtime.arrays.dense_output import Continuation, states_between
-from scvi_codegen.runtime.arrays.events import IndexedCrossings, IndexedSearch
+from scvi_codegen.runtime.arrays.events import ArrayCrossings, ArraySearch
 from scvi_codegen.runtime.arrays.interface import Numbers
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.arrays.run_time_sizes import RunTimeSizes
 from scvi_codegen.runtime.events.event import Event
 from scvi_codegen.runtime.run.global_error import Confirmed, GlobalError
@@ -27,11 +27,11 @@ from scvi_codegen.runtime.trajectory.dense_output import checked_times
 from scvi_codegen.runtime.trajectory.saved_states import checked_row, checked_rows
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
-__all__ = ["IndexedRecord", "IndexedTrajectory", "check_npz"]
+__all__ = ["ArrayRecord", "ArrayTrajectory", "check_npz"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndexedTrajectory(Confirmed, RunTimeSizes):
+class ArrayTrajectory(Confirmed, RunTimeSizes):
     """States along a run at k times, beginning with the initial one.
 
     Attributes:
@@ -67,14 +67,14 @@ class IndexedTrajectory(Confirmed, RunTimeSizes):
     worst_step_time: float
     plan: StepPlan | None = None
     rejected_steps: int = 0
-    events: tuple[IndexedCrossings, ...] = ()
+    events: tuple[ArrayCrossings, ...] = ()
     continuations: tuple[Continuation, ...] = field(default=(), repr=False)
     confirmation: GlobalError | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         arrays = ", ".join(f"{name} {values.shape}" for name, values in self.q.items())
         lengths = "" if self.plan else f" of {self.h:g}"
-        return clipped(f"<IndexedTrajectory of {self.steps} steps{lengths}: {arrays}>", LONGEST)
+        return clipped(f"<ArrayTrajectory of {self.steps} steps{lengths}: {arrays}>", LONGEST)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -158,7 +158,7 @@ class IndexedTrajectory(Confirmed, RunTimeSizes):
         write_whole(path, lambda temporary: np.savez(temporary, h=self.h, **arrays))
 
 
-class IndexedRecord:
+class ArrayRecord:
     """Recorder of a run.
 
     Args:
@@ -169,12 +169,12 @@ class IndexedRecord:
 
     def __init__(
         self,
-        run: IndexedRun,
-        observe: Callable[[IndexedRun], ArrayLike] | None = None,
+        run: ArrayRun,
+        observe: Callable[[ArrayRun], ArrayLike] | None = None,
         events: Sequence[Event] = (),
     ) -> None:
         self.run, self.observe = run, observe
-        self.search = IndexedSearch(run, events) if events else None
+        self.search = ArraySearch(run, events) if events else None
         self.continuations: list[Continuation] = []
         self.t: list[float] = []
         self.energies: list[tuple[float, float, float]] = []
@@ -258,11 +258,11 @@ class IndexedRecord:
             )
         return array
 
-    def trajectory(self) -> IndexedTrajectory:
+    def trajectory(self) -> ArrayTrajectory:
         """Return the recorded trajectory."""
         run = self.run
         names = list(run.interface.coordinates)
-        return IndexedTrajectory(
+        return ArrayTrajectory(
             t=np.array(self.t),
             q={name: np.array([q[name] for q, _ in self.states]) for name in names},
             p={name: np.array([p[name] for _, p in self.states]) for name in names},

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.runtime.arrays.run import IndexedRun
+from scvi_codegen.runtime.arrays.run import ArrayRun
 from scvi_codegen.runtime.constraints.projection import projected
 from scvi_codegen.runtime.run.accuracy import warnings_wanted
 from scvi_codegen.runtime.run.memory import Memory
@@ -74,7 +74,7 @@ class GrowthCheck:
     """
 
     def __init__(
-        self, run: Memory | IndexedRun, requested: bool | None, advance_until: Callable[[float], None] | None = None
+        self, run: Memory | ArrayRun, requested: bool | None, advance_until: Callable[[float], None] | None = None
     ) -> None:
         adaptive = run.plan is not None and not run.plan.tau
         if requested and not adaptive:

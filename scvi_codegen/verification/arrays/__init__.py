@@ -1,4 +1,4 @@
-"""Certificates of integrators of indexed systems.
+"""Certificates of integrators of array systems.
 
 At small sizes, cut out of the arrays, the loops are compared with the unrolled system (:func:`unroll_sums`): its
 equations in 60 digits, its exact motion and its compiled steps, none of which has loops. At full size, the rates are
@@ -24,7 +24,7 @@ from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS
 from scvi_codegen.runtime.arrays.interface import read_arrays
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 from scvi_codegen.validation.argument_types import MAPPING, checks_arguments, of
@@ -43,7 +43,7 @@ ROUNDINGS = 16.0 * SMALL_STEPS
 """Bound on the deviation after ``SMALL_STEPS`` steps, in units of rounding."""
 
 
-@checks_arguments(system=ARRAYS, parameters=MAPPING, tables=MAPPING, stepper=of("an IndexedStepper", IndexedStepper))
+@checks_arguments(system=ARRAYS, parameters=MAPPING, tables=MAPPING, stepper=of("an ArrayStepper", ArrayStepper))
 @without_accuracy_warnings()
 def verify_arrays(
     system: ArraySystem,
@@ -56,7 +56,7 @@ def verify_arrays(
     t: float = 0.0,
     parameters: Mapping[str, ArrayLike] | None = None,
     tables: Mapping[str, ArrayLike] | None = None,
-    stepper: IndexedStepper | None = None,
+    stepper: ArrayStepper | None = None,
     flags: Sequence[str] = TUNED_FLAGS,
 ) -> Certificate:
     """Measure the guaranteed properties of the integrator of arrays of run-time sizes and return a certificate.
@@ -64,9 +64,9 @@ def verify_arrays(
     Properties are measured on a few indices of the arrays first, then at full size.
 
     Args:
-        system: indexed system.
+        system: array system.
         method: method, or its name.
-        q, p, velocity, h, t, parameters, tables: as of :meth:`IndexedStepper.integrate`; the state of the certificate
+        q, p, velocity, h, t, parameters, tables: as of :meth:`ArrayStepper.integrate`; the state of the certificate
             is that of the few indices.
         stepper: stepper under test; by default compiled now.
         flags: flags of the C compiler.

@@ -16,8 +16,8 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.rendering.source import Interface
 from scvi_codegen.runtime.arrays.interface import RunArrays, check_accesses
-from scvi_codegen.runtime.arrays.run import IndexedRun
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.run import ArrayRun
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
 __all__ = ["SmallStepper", "small_start"]
 
@@ -31,7 +31,7 @@ MAX_COORDINATES = 9
 
 @dataclass(frozen=True, slots=True)
 class SmallStart:
-    """Arrays of small sizes and their momenta, as of :meth:`IndexedStepper.start`."""
+    """Arrays of small sizes and their momenta, as of :meth:`ArrayStepper.start`."""
 
     arrays: RunArrays
     p: dict[str, Numbers]
@@ -141,7 +141,7 @@ class SmallStepper:
 
     interface = SimpleNamespace(has_action=False, has_fallback=False, map_names=(), map_exact=(), energy_parameter="")
 
-    def __init__(self, stepper: IndexedStepper, start: SmallStart, unrolled: MechanicalSystem) -> None:
+    def __init__(self, stepper: ArrayStepper, start: SmallStart, unrolled: MechanicalSystem) -> None:
         self.stepper, self.arrays, self.unrolled = stepper, start.arrays, unrolled
         self.defaults = [float(value) for value in unrolled.defaults]
 
@@ -158,7 +158,7 @@ class SmallStepper:
     ) -> SimpleNamespace:
         """Return every state, (steps + 1, m), and the iterations of each step.
 
-        Raises as :meth:`IndexedStepper.integrate`.
+        Raises as :meth:`ArrayStepper.integrate`.
         """
         run = self._run(q, p, h, t, parameters, options)
         states, counts, times = [self._flat(run)], [0], [run.t]
@@ -180,7 +180,7 @@ class SmallStepper:
         parameters: Any = None,
         options: SolverOptions | None = None,
     ) -> tuple[Numbers, Numbers]:
-        """Return the state after one step; raises as :meth:`IndexedStepper.integrate`."""
+        """Return the state after one step; raises as :meth:`ArrayStepper.integrate`."""
         run = self._run(q, p, h, t, parameters, options)
         run.advance(1)
         end = self._flat(run)
@@ -200,7 +200,7 @@ class SmallStepper:
 
     def _run(
         self, q: Numbers, p: Numbers, h: float, t: float, parameters: Any, options: SolverOptions | None
-    ) -> IndexedRun:
+    ) -> ArrayRun:
         values = self._values(parameters)
         return self.stepper.start(
             self._arrays(q),
@@ -231,7 +231,7 @@ class SmallStepper:
             start += values.size
         return result
 
-    def _flat(self, run: IndexedRun) -> tuple[Numbers, Numbers]:
+    def _flat(self, run: ArrayRun) -> tuple[Numbers, Numbers]:
         return _joined(run.q), _joined(run.p)
 
 

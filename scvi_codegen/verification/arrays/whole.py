@@ -1,4 +1,4 @@
-"""Checks of indexed systems at full size: rates against NumPy, reversibility and conserved quantities."""
+"""Checks of array systems at full size: rates against NumPy, reversibility and conserved quantities."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.methods.method import Method
 from scvi_codegen.runtime.arrays.interface import RunArrays
-from scvi_codegen.runtime.arrays.run import IndexedRun
-from scvi_codegen.runtime.arrays.stepper import IndexedStepper
+from scvi_codegen.runtime.arrays.run import ArrayRun
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.verification.certificate import Check, Finding, checked, information
 
 __all__ = ["WholeStart", "whole_checks"]
@@ -44,7 +44,7 @@ class WholeStart:
 
     system: ArraySystem
     method: Method
-    stepper: IndexedStepper
+    stepper: ArrayStepper
     arrays: RunArrays
     p: Mapping[str, Numbers]
     h: float
@@ -64,11 +64,11 @@ class WholeStart:
         """Return all index values of loops."""
         return Elements(loops, self.arrays.sizes, self.arrays.places)
 
-    def run(self, h: float | None = None) -> IndexedRun:
+    def run(self, h: float | None = None) -> ArrayRun:
         """Start a run at the initial state, optionally with another step size."""
         return self.begin(self.arrays.state, self.p, self.h if h is None else h, self.t)
 
-    def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> IndexedRun:
+    def begin(self, q: Mapping[str, Numbers], p: Mapping[str, Numbers], h: float, t: float) -> ArrayRun:
         """Start a run at a state."""
         names = [parameter.name for parameter in self.system.parameters]
         numbers = dict(zip(names, self.arrays.numbers, strict=True))

@@ -1,4 +1,4 @@
-"""Indexed systems: their form, their symmetries, and their unrolled systems."""
+"""Array systems: their form, their symmetries, and their unrolled systems."""
 
 import numpy as np
 import pytest

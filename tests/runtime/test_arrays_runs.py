@@ -1,4 +1,4 @@
-"""Runs of indexed systems compared with unrolled ones: controlled steps, events, inputs, dense output."""
+"""Runs of array systems compared with unrolled ones: controlled steps, events, inputs, dense output."""
 
 import math
 import pickle

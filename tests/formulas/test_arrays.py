@@ -3,7 +3,7 @@
 import pytest
 
 from scvi_codegen.errors import ExpressionError, SystemDefinitionError
-from scvi_codegen.formulas.arrays import IndexedTerm, parse_array, parse_indexed
+from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_sums
 from scvi_codegen.formulas.symbols import symbol
 
 ARRAYS = [parse_array(text) for text in ("q[N]", "r[N, 3]", "u[NX, NY]", "k[B]")]
@@ -11,9 +11,9 @@ TABLES = [parse_array("bonds[B, 2]")]
 NAMES = {name: symbol(name) for name in ("c", "t")}
 
 
-def terms(text: str) -> tuple[IndexedTerm, ...]:
+def terms(text: str) -> tuple[ArrayTerm, ...]:
     """Return the parsed terms."""
-    return parse_indexed(text, ARRAYS, NAMES, TABLES)
+    return parse_sums(text, ARRAYS, NAMES, TABLES)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
 from scvi_codegen.errors import StateError
-from scvi_codegen.runtime.arrays import saving as indexed_saving
+from scvi_codegen.runtime.arrays import saving as array_saving
 from scvi_codegen.runtime.arrays.memory import RUN_FIELDS
 
 BONDS = [[0, 1], [1, 2]]
@@ -22,7 +22,7 @@ K = np.array([1.0, 2.0])
 
 
 @pytest.fixture(scope="module")
-def chain() -> sc.IndexedStepper:
+def chain() -> sc.ArrayStepper:
     system = sc.LagrangianSystem.from_text(
         name="chain",
         coordinates=["q[N]"],
@@ -36,7 +36,7 @@ def chain() -> sc.IndexedStepper:
 
 
 @pytest.fixture(scope="module")
-def pendulums() -> sc.IndexedStepper:
+def pendulums() -> sc.ArrayStepper:
     """Return pendulums with constraints, whose memory depends on positions."""
     system = sc.LagrangianSystem.from_text(
         name="pendulums",
@@ -47,7 +47,7 @@ def pendulums() -> sc.IndexedStepper:
     return sc.compile_stepper(system, "stoermer-verlet", flags=QUICK_FLAGS)
 
 
-def start(stepper: sc.IndexedStepper, **given: Any) -> Any:
+def start(stepper: sc.ArrayStepper, **given: Any) -> Any:
     """A run of either system."""
     if stepper.interface.layout.constraints:
         return stepper.start({"x": [0.6, 1.0], "y": [0.8, 0.0]}, **({"h": 0.05} | given))
@@ -137,8 +137,8 @@ def parts(saved: bytes) -> dict[str, Any]:
 def put_together(found: dict[str, Any], *, checksum: bool = True) -> bytes:
     """Bytes of such arrays, whose checksum is right if that is wanted."""
     if checksum:
-        found = {name: array for name, array in found.items() if name != indexed_saving.CHECKSUM}
-        found[indexed_saving.CHECKSUM] = indexed_saving._checksum(found)
+        found = {name: array for name, array in found.items() if name != array_saving.CHECKSUM}
+        found[array_saving.CHECKSUM] = array_saving._checksum(found)
     file = io.BytesIO()
     np.savez(file, **found)
     return file.getvalue()
@@ -151,7 +151,7 @@ class TestDamage:
         run = start(chain)
         run.advance(2)
         for name, array in parts(run.checkpoint()).items():
-            if name == indexed_saving.CHECKSUM:
+            if name == array_saving.CHECKSUM:
                 continue
             spoiled = array + 1 if array.dtype.kind in "if" else ~array if array.dtype.kind == "b" else array + "x"
             if array.size:
@@ -159,13 +159,13 @@ class TestDamage:
                     chain.from_checkpoint(put_together(parts(run.checkpoint()) | {name: spoiled}, checksum=False))
 
     @pytest.mark.parametrize("value", [-1.0, 3.0, 0.5, 1e300, -1e300, np.nan, np.inf, 2.0**63, -(2.0**62)])
-    @pytest.mark.parametrize("name", indexed_saving.RANGES)
+    @pytest.mark.parametrize("name", array_saving.RANGES)
     def test_invalid_counts_are_rejected(self, chain: Any, name: str, value: float) -> None:
         run = start(chain, h=None, t_end=2.0)
         run.advance(3)
         found = parts(run.checkpoint())
         found["moments"][RUN_FIELDS.index(name)] = value
-        least, most = indexed_saving.RANGES[name]
+        least, most = array_saving.RANGES[name]
         if least <= value <= most and value == int(value):
             chain.from_checkpoint(put_together(found), t_end=2.0).advance(3)
             return

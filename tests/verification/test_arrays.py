@@ -1,4 +1,4 @@
-"""Certificates of indexed systems: correct integrators pass, faults in their loops are detected."""
+"""Certificates of array systems: correct integrators pass, faults in their loops are detected."""
 
 from __future__ import annotations
 

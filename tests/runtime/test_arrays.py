@@ -1,4 +1,4 @@
-"""Integrators of indexed systems, compared with those of the unrolled systems, which are derived independently."""
+"""Integrators of array systems, compared with those of the unrolled systems, which are derived independently."""
 
 import pickle
 from dataclasses import dataclass
@@ -282,7 +282,7 @@ def test_velocities_depend_on_masses() -> None:
     going.advance(3)
     assert np.array_equal(going.velocity["r"], run.velocity["r"][-1])
     shown = [repr(one) for one in (run, going, each.system)]
-    assert shown[0] == "<IndexedTrajectory of 3 steps of 0.05: r (4, 4, 2)>"
+    assert shown[0] == "<ArrayTrajectory of 3 steps of 0.05: r (4, 4, 2)>"
     assert shown[1].endswith("; t = 0.15 after 3 steps of 0.05, solver fixed-point>")
     assert shown[2] == "LagrangianSystem(name='case', coordinates=(r[N, 2]))"
 
@@ -366,7 +366,7 @@ def test_failures_of_array_runs() -> None:
     )
     with pytest.raises(sc.StateError, match="coordinate 2 of 3 has no positive mass"):
         sc.compile_stepper(bare, "svi:2").start(np.ones(3), h=0.1)
-    with pytest.raises(sc.MethodError, match="not supported for indexed systems"):
+    with pytest.raises(sc.MethodError, match="not supported for array systems"):
         sc.compile_stepper(bare, "scvi:4")
     with pytest.warns(sc.AccuracyWarning):
         sc.compile_stepper(CASES["field"].system, "svi:2").integrate(CASES["field"].q, h=0.4, steps=5)

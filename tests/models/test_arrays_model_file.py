@@ -1,4 +1,4 @@
-"""Model files of indexed systems: arrays by number, list, file and formula; sizes; errors."""
+"""Model files of array systems: arrays by number, list, file and formula; sizes; errors."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_index_has_one_meaning() -> None:
     ("old", "new", "message"),
     [
         ('"svi:2"', '"svi:2"\nsolver = "krylov"', "use 'fixed-point' or 'newton'"),
-        ('"svi:2"', '"svi:2"\nsolver = 2', "unknown solver 2 of an indexed system"),
+        ('"svi:2"', '"svi:2"\nsolver = 2', "unknown solver 2 of an array system"),
         ("N = 3", "M = 3", r"unknown size 'M' in \[sizes\]"),
         ("N = 3", "N = 0", "N"),
         ("N = 3", "", "the size N is undefined"),
@@ -152,11 +152,11 @@ def test_index_has_one_meaning() -> None:
         ('file = "bonds.csv"', "file = 3", "must be a file, .* with text between quotes"),
         ('{ file = "bonds.csv" }', "[[0.5, 1], [1, 2]]", "must be whole numbers"),
         ("steps = 4", "steps = 4\ntolerance = 1e-9", "step.*tolerance"),
-        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not supported for indexed systems"),
+        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not supported for array systems"),
         ("steps = 4", "", "span"),
         ("step = 0.1", "", "has steps but no step"),
         ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
-        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not supported for indexed systems"),
+        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not supported for array systems"),
     ],
 )
 def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str) -> None:
@@ -170,7 +170,7 @@ def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str)
 
 
 def test_one_loader_reads_both_kinds_of_files(net: Path, tmp_path: Path) -> None:
-    assert isinstance(sc.load_model(net), sc.IndexedModel)
+    assert isinstance(sc.load_model(net), sc.ArrayModel)
     sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
     assert isinstance(sc.load_model(tmp_path / "kepler.toml"), sc.Model)
 

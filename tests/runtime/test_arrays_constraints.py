@@ -1,4 +1,4 @@
-"""Constraints of indexed systems: rods and pins over tables, compared with the unrolled system and SciPy."""
+"""Constraints of array systems: rods and pins over tables, compared with the unrolled system and SciPy."""
 
 import subprocess
 

@@ -1,4 +1,4 @@
-"""Threads that share the steps of indexed systems: no bit depends on their number, and every term is counted once."""
+"""Threads that share the steps of array systems: no bit depends on their number, and every term is counted once."""
 
 import os
 import signal
@@ -123,7 +123,7 @@ def system_of(case: Case) -> sc.LagrangianSystem:
 
 
 @cache
-def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.IndexedStepper:
+def stepper_of(name: str, method: str, solver: str = "fixed-point") -> sc.ArrayStepper:
     return sc.compile_stepper(system_of(CASES[name]), method, solver=solver)
 
 

@@ -1,4 +1,4 @@
-"""Source of integrators of indexed systems: strict C99, formatted, of the same length for any number of coordinates."""
+"""Source of integrators of array systems: strict C99, formatted, of the same length for any number of coordinates."""
 
 import subprocess
 from pathlib import Path
@@ -57,7 +57,7 @@ def rendered(name: str, method: str, *, newton: bool = False) -> Source:
         tables=["bonds[B, 2]"],
         forces=FORCES.get(name),
     )
-    program = lower_arrays(system, as_method(method, one_coordinate(system)), "indexed", newton=newton)
+    program = lower_arrays(system, as_method(method, one_coordinate(system)), "arrays", newton=newton)
     control = control_of(program)
     assert control is not None or method == "stoermer-verlet"
     return render(program, control)
@@ -85,7 +85,7 @@ def check_strict(source: Source, tmp_path: Path) -> None:
         (tmp_path / path).write_text(text)
     check_style(source.code)
     check_style(source.header)
-    command = [*find_compiler(), *STRICT, "-c", "indexed.c", "-o", "indexed.o"]
+    command = [*find_compiler(), *STRICT, "-c", "arrays.c", "-o", "arrays.o"]
     built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
 
