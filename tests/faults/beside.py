@@ -245,8 +245,8 @@ C_TEXT = (
         "lanes whose time goes half as fast",
         "driven/svi",
         r"NAME\(advance\)",
-        r"&block->t_low, block->h\)",
-        "&block->t_low, block->h / 2)",
+        r"&block->t_low, block->h, 0\.0\)",
+        "&block->t_low, block->h / 2, 0.0)",
     ),
     (
         "states of the first lane stored for all",
