@@ -1,4 +1,4 @@
-"""Evaluation of sums over indices at all their elements, by NumPy."""
+"""Evaluation of sums of array terms at all their elements, by NumPy."""
 
 from __future__ import annotations
 

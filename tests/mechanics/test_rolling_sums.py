@@ -1,4 +1,4 @@
-"""Lagrangians rolled into sums over indices: the same motion, few term groups, and errors."""
+"""Lagrangians rolled into sums of array terms: the same motion, few term groups, and errors."""
 
 from itertools import pairwise
 
