@@ -155,7 +155,7 @@ def test_planted_faults_are_detected(fault: str, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(compiler, "render", rendered)
     monkeypatch.setattr(compiler, "cached_source", lambda *given: given[-1]())
     found = certificate(name, method)
-    assert edits == 1
+    assert edits > 0
     assert found.violated, found.to_text()
 
 
