@@ -157,15 +157,17 @@ def main() -> None:
     sizes = (1600, 8000, 32_000)
     measured = {count: np.array([best(count, size)[1:] for size in sizes]) for count in (1, 2)}
     times, waited = ({count: found[:, k] for count, found in measured.items()} for k in (0, 1))
-    derivative = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
-    alone = times[1][0] - derivative * sizes[0]
-    meeting = max(0.0, times[2][0] - alone - derivative * sizes[0] / 2)
-    print(f"c = {1e9 * derivative:.0f} ns a place and sweep; a halo and a reduction: {1e6 * meeting:.0f} us")
+    per_element = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
+    alone = times[1][0] - per_element * sizes[0]
+    exchange = max(0.0, times[2][0] - alone - per_element * sizes[0] / 2)
+    print(
+        f"c = {1e9 * per_element:.0f} ns per element; halo and reduction: {1e6 * exchange:.0f} us"
+    )
     for size, seconds in zip(sizes, times[2], strict=True):
-        model = alone + derivative * size / 2 + meeting
-        print(f"{size} places on two: {1e3 * seconds:.3f} ms a sweep, by the model {1e3 * model:.3f}")
+        model = alone + per_element * size / 2 + exchange
+        print(f"{size} elements on two: {1e3 * seconds:.3f} ms per iteration, by the model {1e3 * model:.3f}")
     if (most := max(map(np.max, waited.values()))) > 0.1:
-        print(f"others had the cores for up to {100 * most:.0f} % of these times: they say nothing of the model")
+        print(f"other processes used the cores for up to {100 * most:.0f} % of these times: the model cannot be judged")
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ class ArrayModel(TimeSpan):
     def segments(self, run: ArrayRun) -> Iterator[int | None]:
         """Prepare a run of this model for each segment of equal steps, and yield its number of steps.
 
-        ``None`` stands for steps up to the target time of the run.
+        ``None`` means steps up to the target time of the run.
         """
         if not self.has_shorter_last_step:
             yield None if run.plan else self.step_count

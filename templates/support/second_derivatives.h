@@ -4,7 +4,7 @@
  * kernels of second derivatives, HESSIAN_ARGUMENTS, HESSIAN_VALUES. */
 
 /* Memory for WIDTH tangent and adjoint vectors. Tangent vectors of the inputs (change) and of the unknowns (dz);
- * adjoint variables (slopes), their tangents (adjoint_tangents), and the contributions of the nonlinear terms with
+ * adjoint variables (partials), their tangents (adjoint_tangents), and the contributions of the nonlinear terms with
  * respect to inputs (by_given) and unknowns (by_dz); at the points of a stage group, arguments and results:
  * tangents, adjoint variables, and tangents of these. Last, the arguments u. */
 typedef struct {
@@ -137,7 +137,7 @@ static void add_end_hessian(const second_order_memory *to)
     }
 }
 
-/* Replaces slopes and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
+/* Replaces partials and adjoint_tangents, of (q1, p1, parameters, t + h, h), by those of (q0, p0, parameters, t, h). */
 static void hessian_of_step(const linearised_step *at, const second_order_memory *to)
 {
   const real *partials = at->partials;

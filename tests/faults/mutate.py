@@ -7,9 +7,9 @@ A fault is put into a copy of the checkout, in a folder of its own. Headers of C
 (``golden.py``). Then ``verify`` is asked, of systems by methods whose code the faulty file is part of, then the test
 files that reach the line (``reach.py``), one after the other; the first that notices ends it. Faults that do not
 compile or import are not counted. A fault on which more than ``--seconds`` of processor time were spent without a
-notice counts as one that survives, and its line says so. The results, a line a fault, say where to go on: those that
-stand there are not tried again, survivors are with ``--again``. The faults that were drawn stand in ``results.plan``,
-each with the text around it, so that they are found again in files that changed.
+notice counts as one that survives, as its line reports. A run that was interrupted continues after the last line of
+the results, which has one line per fault; ``--again`` repeats survivors. ``results.plan`` lists the drawn faults, each
+with the text around it, by which they are found in files that changed.
 """
 
 from __future__ import annotations

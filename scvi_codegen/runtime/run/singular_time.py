@@ -52,7 +52,7 @@ class ProgressWatch:
 
 
 def check_energy_surface(states: Trajectory, longest: float) -> None:
-    """Raise an error if states in transformed time lost their energy because the rate of time vanished.
+    """Raise an error if states in transformed time lost their energy because the rate dt/dtau underflowed.
 
     ``longest`` is the longest duration of a step in the run.
     """
