@@ -160,9 +160,7 @@ def main() -> None:
     per_element = (times[1][-1] - times[1][0]) / (sizes[-1] - sizes[0])
     alone = times[1][0] - per_element * sizes[0]
     exchange = max(0.0, times[2][0] - alone - per_element * sizes[0] / 2)
-    print(
-        f"c = {1e9 * per_element:.0f} ns per element; halo and reduction: {1e6 * exchange:.0f} us"
-    )
+    print(f"c = {1e9 * per_element:.0f} ns per element; halo and reduction: {1e6 * exchange:.0f} us")
     for size, seconds in zip(sizes, times[2], strict=True):
         model = alone + per_element * size / 2 + exchange
         print(f"{size} elements on two: {1e3 * seconds:.3f} ms per iteration, by the model {1e3 * model:.3f}")
