@@ -68,6 +68,24 @@ def test_slow_convergence_is_not_mistaken_for_rounding():
             assert found == pytest.approx(np.concatenate(newton.step([1.0], [0.3], h)), abs=1e-12)
 
 
+@pytest.mark.parametrize("deviation", [1e-9, 1e-11])
+def test_rotating_iteration_that_stagnates_has_not_converged(deviation):
+    """A rotation about a moving point contracts by h**2 in two iterations, the first of which enlarges the change."""
+    rotation = HamiltonianSystem.from_text(
+        name="rotation",
+        coordinates=["x", "y"],
+        hamiltonian="p_x + p_y + 2*(x - t - 1)*(p_y - 1) - (y - t - 1)*(p_x - 1)/2",
+    )
+    method, state = SpectralCollocation(1, form="phase-space"), 1 + deviation * np.array([1, 0.3, -0.6, 0.8])
+    iterations, newton = (
+        compile_stepper(rotation, method, solver=solver, flags=QUICK_FLAGS) for solver in ("fixed-point", "newton")
+    )
+    for h in (0.6, 0.9):
+        with nullcontext() if h < 0.8 else suppress(StepFailedError):
+            found = np.concatenate(iterations.step(state[:2], state[2:], h))
+            assert found == pytest.approx(np.concatenate(newton.step(state[:2], state[2:], h)), abs=2e-15)
+
+
 VERDICTS = """
 #include <float.h>
 #include <math.h>

@@ -7,6 +7,7 @@ from samples import fixed_point, tangle
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
 from scvi_codegen.lowering import point_derivatives
+from scvi_codegen.native.options import SolverOptions
 
 WHIRL = LagrangianSystem.from_text(
     name="whirl in a moving trap",
@@ -83,6 +84,22 @@ def test_unconverged_steps_are_differentiated_by_factorisation():
     assert_allclose(*back, rtol=0, atol=1e-12 * np.abs(back[1]).max())
     with pytest.raises(StepFailedError):
         steppers["fixed-point"].integrate([1.0], [0.0], h=0.25, steps=STEPS)
+
+
+def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisation():
+    """Six iterations are too few for the fixed-point iteration and enough for Newton's."""
+    quartic = LagrangianSystem.from_text(
+        name="quartic", coordinates=["x"], lagrangian="x_dot**2/2 - k*x**4/4", parameters={"k": 0.9}
+    )
+    few, found = SolverOptions(max_iterations=6), []
+    for solver in ("auto", "newton"):
+        run = compile_stepper(quartic, SVI(2), solver=solver).integrate([1.0], [0.2], h=0.4, steps=20, options=few)
+        one = run.sensitivity()
+        found.append((one.state, one.parameters, numbers_of(run.pullback(np.ones((21, 2))))))
+    for one, other in zip(*found, strict=True):
+        assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+    with pytest.raises(StepFailedError):
+        compile_stepper(quartic, SVI(2), solver="fixed-point").integrate([1.0], [0.2], h=0.4, steps=1, options=few)
 
 
 def test_large_jacobians_are_factorised(monkeypatch):

@@ -51,6 +51,15 @@ def test_error_estimate_is_independent_of_the_phase(name, method):
     check_all_phases(SYSTEMS[name], method)
 
 
+@pytest.mark.parametrize("method", [sc.SVI(4), sc.SVI(6)])
+def test_error_estimate_of_an_oscillator_hardly_varies_with_the_phase(method):
+    """The leading coefficient of the curve passes through zero twice a period; the error per step does not."""
+    stepper = sc.compile_stepper(SYSTEMS["harmonic"], method, flags=("-O0",))
+    phases = np.linspace(0.0, np.pi, 17)
+    estimates = [stepper.integrate([np.cos(x)], [-np.sin(x)], h=0.3, steps=1).step_error for x in phases]
+    assert min(estimates) > np.median(estimates) / 20
+
+
 def test_newton_and_fixed_point_error_estimates_agree_for_momentum_unknowns():
     vortices = sc.problem("point-vortices")
     steppers = [sc.compile_stepper(vortices.system, sc.SVI(4), solver=each) for each in ("auto", "newton")]
