@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ITERATION_SOLVER_H
+#define SUPPORT_ITERATION_SOLVER_H
+
 /* Step by fixed-point iteration, with a fallback. Requires: a fixed-point iteration, and fall_back. */
 typedef iteration_data solver_data;
 
@@ -36,3 +39,5 @@ HOT int solve(const step_data *step, const solver_data *data, double *memory, lo
   }
   return solve_afresh(step, data, memory, guess, dq, dp, options, report, workspace);
 }
+
+#endif

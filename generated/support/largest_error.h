@@ -1,3 +1,6 @@
+#ifndef SUPPORT_LARGEST_ERROR_H
+#define SUPPORT_LARGEST_ERROR_H
+
 /* Largest error estimate of the steps of a run: by Newton's method alone (NEWTON_ALONE), or by fixed-point iteration
  * with a fallback in another library (LIBRARY_FALLBACK), with an own one (STAGE_POWER) or without one. */
 #if defined(NEWTON_ALONE)
@@ -48,4 +51,6 @@ static double largest_error(const run_memory *run, const step_data *step, const 
   (void)workspace;
   return run->guess > 0 ? curve_error(step, data, run->memory, dq, ALL, now_and_then(run), run->error) : NAN;
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_MASS_MATRIX_H
+#define SUPPORT_MASS_MATRIX_H
+
 /* Linear systems with the mass matrix in every lane, which is diagonal (DIAGONAL_MASS) or full. */
 #ifdef DIAGONAL_MASS
 /* Diagonal mass matrices. Requires: points.h or trajectories.h. */
@@ -50,4 +53,6 @@ static inline void solve_mass(const lanes *mass, lanes *r)
     for (int i = 0; i < j; i++)
       r[i] -= mass[j * M + i] * r[j];
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_NEWTON_H
+#define SUPPORT_NEWTON_H
+
 /* Newton's method for the stage equations, with reuse of the Jacobian's factors (simplified Newton; Hairer & Wanner,
  * Solving ODEs II, sec. IV.8). Requires: stages.h, the tables END_POSITION, MOMENTUM_ROW, STRAIGHT, MOMENTA and MOVES,
  * and evaluate, which computes the equations and their Jacobian; if DAMPED, damping.h. */
@@ -187,3 +190,5 @@ static int newton(const step_data *step, const newton_data *data, const real *q1
     report->iterations++;
   }
 }
+
+#endif

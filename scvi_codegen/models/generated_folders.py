@@ -44,7 +44,7 @@ def source_in(folder: Path, prefix: str) -> Source:
     try:
         header, code = (_read(folder / f"{prefix}.{kind}") for kind in "hc")
         declarations = "\n".join(read_record(folder)["declarations"])
-        support = tuple((name, _read(folder / name)) for name in included(code))
+        support = included(code, lambda name: _read(folder / name))
     except OSError as error:
         raise PackageError(f"{folder} is not a generated package: {error.filename}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:

@@ -81,10 +81,11 @@ def _behind(source: Source, text: str, headers: Sequence[str], declarations: str
         + "#define SECOND_DERIVATIVES\n" * second
         + "".join(f'#include "support/{header}.h"\n' for header in headers)
     )
-    support = tuple((name, support_text(name)) for name in included(tail))
+    own = dict(source.support)
+    code = source.code + tail
     return replace(
         source,
-        code=source.code + tail,
+        code=code,
         declarations=source.declarations + declarations,
-        support=(*source.support, *support),
+        support=included(code, lambda name: own.get(name) or support_text(name)),
     )

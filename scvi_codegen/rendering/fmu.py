@@ -47,6 +47,6 @@ def with_fmu(
         header=environment.get_template("fmu.h.jinja").render(context),
         code=code,
         declarations="",
-        support=tuple((name, support_text(name)) for name in included(code)),
+        support=included(code, support_text),
     )
     return replace(source, beside=beside)

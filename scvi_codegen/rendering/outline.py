@@ -19,9 +19,6 @@ HEAD = re.compile(
     r"\((?P<arguments>[^;{}]*)\)\n\{\n(?P<body>.*?)^\})$",
     re.MULTILINE | re.DOTALL,
 )
-DIRECTIVE = re.compile(r"#(?P<word>ifdef|ifndef|if|elif|else|endif)\b *(?P<condition>.*)$")
-CONDITION = re.compile(r"(?:defined\()?(?!_|SCVI_)(?P<macro>[A-Z]\w*)\)?(?: *//.*)?")
-DEFINITION = re.compile(r"#define (\w+)")
 HOT = re.compile(r"^#define HOT (.*)$", re.MULTILINE)
 WIDTH = 100
 
@@ -50,44 +47,12 @@ class Function:
 def functions_of(code: str) -> dict[str, Function]:
     """Return every function with a body, by name, in order; of preprocessor alternatives the first."""
     found: dict[str, re.Match[str]] = {}
-    for match in HEAD.finditer(_preprocessed("\n".join(_chosen_lines(code)))):
+    for match in HEAD.finditer(_with_names(code)):
         found.setdefault(match["name"], match)
     return {name: _function(match, found) for name, match in found.items()}
 
 
-def _chosen_lines(code: str) -> Iterator[str]:
-    """Yield the lines of the alternatives that macros of the source itself choose; other conditions stay."""
-    macros: set[str] = set()
-    chains: list[tuple[bool | None, bool]] = []  # per open condition: is this branch taken, was this one or one before
-    for line in code.split("\n"):
-        directive = DIRECTIVE.match(line)
-        word = directive["word"] if directive else ""
-        if directive and word.startswith("if"):
-            taken = _holds(directive, macros)
-            chains.append((taken, bool(taken)))
-        elif directive and word in ("elif", "else") and chains[-1][0] is not None:
-            earlier = chains[-1][1]
-            taken = not earlier and (word == "else" or bool(_holds(directive, macros)))
-            chains[-1] = taken, earlier or taken
-        decided = bool(word) and chains[-1][0] is not None
-        if word == "endif":
-            chains.pop()
-        if decided or any(each is False for each, _ in chains):
-            continue
-        if definition := DEFINITION.match(line):
-            macros.add(definition[1])
-        yield line
-
-
-def _holds(directive: re.Match[str], macros: set[str]) -> bool | None:
-    """Return whether a condition on one macro of the source holds; None for others, such as those on the compiler."""
-    condition = CONDITION.fullmatch(directive["condition"])
-    if condition is None or (directive["word"] in ("if", "elif") and not directive["condition"].startswith("defined")):
-        return None
-    return (condition["macro"] in macros) == (directive["word"] != "ifndef")
-
-
-def _preprocessed(code: str) -> str:
+def _with_names(code: str) -> str:
     """Return the source with the macros NAME (prefix of exported names), HOT and SELDOM in function heads replaced."""
     prefix, stored = re.search(r"^#define NAME\(word\) (\w+)##word", code, re.MULTILINE), HOT.search(code)
     text = re.sub(r"\bNAME\((\w+)\)", rf"{prefix[1]}\1", code) if prefix else code

@@ -167,7 +167,7 @@ def _render(prefix: str, context: Mapping[str, object], entry: str = "stepper") 
         header=environment.get_template(f"{entry}.h.jinja").render(context),
         code=code,
         declarations=environment.get_template(DECLARATIONS[entry]).render(context),
-        support=tuple((name, own.get(name) or support_text(name)) for name in included(code)),
+        support=included(code, lambda name: own.get(name) or support_text(name)),
     )
 
 

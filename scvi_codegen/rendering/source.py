@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.indices import Access, Array, ArrayMap, Loop
+from scvi_codegen.rendering.preprocessing import preprocessed
 from scvi_codegen.version import __version__
 
 __all__ = ["ArrayLayout", "Interface", "Source", "check_interface", "included"]
@@ -22,7 +23,7 @@ __all__ = ["ArrayLayout", "Interface", "Source", "check_interface", "included"]
 
 TEXTS = ("header", "code", "declarations")
 PREFIX = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-SUPPORT = re.compile(r"support/\w+\.h", re.ASCII)
+SUPPORT = re.compile(r"support/(?:\w+/)?\w+\.h", re.ASCII)
 """Names of files, which are written into a folder and must not lead out of it."""
 KINDS: dict[str, Callable[[Any], bool]] = {
     "str": lambda value: isinstance(value, str),
@@ -34,7 +35,6 @@ KINDS: dict[str, Callable[[Any], bool]] = {
     "ArrayLayout": lambda value: False,
 }
 """Checks of values read from JSON against the annotations of :class:`Interface`."""
-INCLUDED = re.compile(r'^#include "(support/\w+\.h)"\n', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +65,7 @@ class Source:
     def write(self, folder: Path) -> None:
         """Write all files into a folder."""
         for name, text in self.files.items():
-            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text, encoding="utf-8")
 
     @property
@@ -74,9 +74,8 @@ class Source:
         return (self, self.beside) if self.beside else (self,)
 
     def amalgamated(self) -> Source:
-        """Return the source with support headers inserted where they are included."""
-        texts = dict(self.support)
-        code = INCLUDED.sub(lambda include: texts[include[1]] if include[1] in texts else include[0], self.code)
+        """Return the source as one file: support headers inserted, without alternatives that it does not use."""
+        code, _ = preprocessed(self.code, dict(self.support).__getitem__)
         beside = self.beside.amalgamated() if self.beside else None
         return replace(self, code=code, support=(), beside=beside)
 
@@ -158,9 +157,9 @@ def _compare(name: str, size: int, found: re.Match[str] | None) -> None:
         raise ValueError(f"{name} is {size} in the interface and {wanted} in the C source: they must be equal")
 
 
-def included(code: str) -> tuple[str, ...]:
-    """Return the support headers that a source includes, in order."""
-    return tuple(INCLUDED.findall(code))
+def included(code: str, read: Callable[[str], str]) -> tuple[tuple[str, str], ...]:
+    """Return names and texts of the support headers that a source includes, in order."""
+    return tuple(preprocessed(code, read)[1].items())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ADVANCE_TO_H
+#define SUPPORT_ADVANCE_TO_H
+
 /* Adaptive integration to a given time t_end.
  *
  * Stores every `every`-th state and the one at t_end, and returns after at most `steps` steps. On failure the run is
@@ -51,3 +54,5 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
   save_state(&now.at, run);
   return OK;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
+#define SUPPORT_ARRAY_HAMILTONIAN_ITERATION_H
+
 /* Fixed-point iteration of a step of an array Hamiltonian system: positions and momenta y at the points are updated
  * from their rates until they converge. Requires: points.h, convergence.h, the tables, curve_error.h, forces, which
  * computes the rates G at X: -H_q of the momenta, then H_p of the positions. Momenta follow positions in memory. */
@@ -204,3 +207,5 @@ static void continue_steps(run_memory *run, long long n)
   move(run, G + n, POINT_END_POSITION, POSITION_WEIGHT, 0, n);
   move(run, G, POINT_END_MOMENTUM, MOMENTUM_WEIGHT, n, n);
 }
+
+#endif

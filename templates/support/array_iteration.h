@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_ITERATION_H
+#define SUPPORT_ARRAY_ITERATION_H
+
 /* Fixed-point iteration of a step of arrays. Requires: array_points.h. */
 
 /* Updates all points from the forces; returns the sum of the squared scaled changes. *size, if it is not NULL, is that
@@ -134,3 +137,5 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   report->iterations += small.count + (small.count > 0);
   return examine(w, largest, decay, error) ? OK : NOT_FINITE;
 }
+
+#endif

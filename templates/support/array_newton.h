@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_NEWTON_H
+#define SUPPORT_ARRAY_NEWTON_H
+
 /* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
  * multiplied by vectors, term group by term group. Requires: array_points.h; products and diagonals of F'. */
@@ -147,3 +150,5 @@ static void make_zero(const linear_system *of, lanes *x)
   for (int g = 0; g < GROUPS; g++)
     memset(x + g * of->n + of->own.first, 0, sizeof(lanes) * (size_t)(of->own.end - of->own.first));
 }
+
+#endif

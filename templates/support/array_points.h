@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_POINTS_H
+#define SUPPORT_ARRAY_POINTS_H
+
 /* Step of arrays with constant diagonal masses: the iteration of separable_iteration.h with norms over all coordinates,
  * which are shared by threads in blocks. Requires: separable_iteration.h, array_convergence.h, forces, curve_error.h.
  * Include before solve, by fixed-point iteration or Newton's method. */
@@ -137,3 +140,5 @@ static void continue_steps(run_memory *run, long long n)
     add_compensated(&run->p[i], &run->carry_p[i], end.p, 0.0);
   }
 }
+
+#endif

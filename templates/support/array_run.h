@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_RUN_H
+#define SUPPORT_ARRAY_RUN_H
+
 /* Worker threads. They are started by a call and joined at its end, so that none exists when a process forks. Requires:
  * arrays.h, MOST_THREADS, is_worth_sharing. */
 #ifdef SCVI_THREADS
@@ -104,3 +107,5 @@ double NAME(step_error)(const run_memory *run)
 {
   return pow(run->error, ERROR_POWER);
 }
+
+#endif

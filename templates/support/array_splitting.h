@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_SPLITTING_H
+#define SUPPORT_ARRAY_SPLITTING_H
+
 /* Splitting step of an array system: kicks h KICK[n] F, each followed by a drift h DRIFT[n] v. Requires:
  * arrays.h, add_forces, LEAPS, CHUNK, the tables. */
 
@@ -80,3 +83,5 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   run->guess = ends_with_a_kick();
   return OK;
 }
+
+#endif

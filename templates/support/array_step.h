@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ARRAY_STEP_H
+#define SUPPORT_ARRAY_STEP_H
+
 /* Comparison of a step of arrays with two steps of half its size, as in observed_error.h. The half steps are solved in
  * place, so that F of the step is lost; forces of former steps are preserved. Requires: sizes.h, HALVES_VECTORS, solve
  * and continue_steps of a solver. */
@@ -236,3 +239,5 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
     accept(run, n, error, guess);
   return status;
 }
+
+#endif

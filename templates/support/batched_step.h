@@ -1,3 +1,6 @@
+#ifndef SUPPORT_BATCHED_STEP_H
+#define SUPPORT_BATCHED_STEP_H
+
 /* Arguments and report of a batched step. Requires: the header, NAME, STATUS, vectors.h. */
 enum {
   OK = STATUS(OK),
@@ -18,3 +21,5 @@ typedef struct {
   double t, h;
   const lanes *q0, *p0, *carry_q, *carry_p, *parameters;
 } step_data;
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CASADI_FLOW_H
+#define SUPPORT_CASADI_FLOW_H
+
 /* Flow of FLOW_STEPS steps with a state stored every FLOW_EVERY steps, and its derivatives, under the names by which
  * CasADi finds external functions. Requires: flow.h; EXTERNAL, which forms these names. */
 
@@ -186,4 +189,6 @@ const casadi_int *EXTERNAL(jac_adj1_, _sparsity_out)(casadi_int i)
       : i == 2                           ? TRANSPOSED_SHAPE
                                          : NULL;
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_COLLOCATION_ITERATION_H
+#define SUPPORT_COLLOCATION_ITERATION_H
+
 /* Fixed-point iteration of a collocation method: momenta at the ends, by quadrature of the action (NODES) or by the
  * Legendre transform, and the iteration. */
 #ifdef NODES
@@ -134,3 +137,5 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CONSTRAINED_STEP_H
+#define SUPPORT_CONSTRAINED_STEP_H
+
 /* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
  * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
  * evaluate_constraints, constraint_matrix.h, array_convergence.h, PARTS of a step, PART and their ends, PART_END. */
@@ -215,3 +218,5 @@ static int take_step(run_memory *run, const problem *given, long long n, const s
   run->guess = 1;
   return OK;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CONSTRAINT_MATRIX_H
+#define SUPPORT_CONSTRAINT_MATRIX_H
+
 /* Sparsity pattern of G M^-1 G^T below its diagonal, by rows: which constraints act on the same coordinates. Requires:
  * arrays.h, list_coordinates. */
 
@@ -293,3 +296,5 @@ static int solve_constraint_system(const held *held, double tolerance, solver_re
   }
   return OK;
 }
+
+#endif

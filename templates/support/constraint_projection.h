@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CONSTRAINT_PROJECTION_H
+#define SUPPORT_CONSTRAINT_PROJECTION_H
+
 /* Projection onto the constraints, their values, and their Lagrange multipliers. Requires: constrained_step.h,
  * array_run.h. */
 
@@ -109,3 +112,5 @@ int NAME(multipliers)(run_memory *run, const problem *given, double *lambda)
   }
   return status;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CONSTRAINTS_H
+#define SUPPORT_CONSTRAINTS_H
+
 /* Projection onto holonomic constraints g(q, t) = 0 or linear velocity constraints A(q, t) v + b = 0, and Lagrange
  * multipliers. For the latter, g = 0 and A v + b is the constraint rate.
  *
@@ -259,3 +262,5 @@ int NAME(multipliers)(long long count, const real *t, const real *q, const real 
   }
   return OK;
 }
+
+#endif

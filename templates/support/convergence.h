@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CONVERGENCE_H
+#define SUPPORT_CONVERGENCE_H
+
 /* Convergence criterion of the fixed-point iteration. Requires: FINAL_ITERATIONS, the number of iterations after the
  * last one that is measured. Changes are squared, and so are the thresholds here. */
 
@@ -78,4 +81,6 @@ static inline void invert_sizes(const solver_options *options, double absolute, 
     size[i] =
         (options->absolute ? number_of(absolute) : 1.0 / (size[i] + (DBL_EPSILON * largest + DBL_MIN))) + 0.0 * largest;
 }
+#endif
+
 #endif

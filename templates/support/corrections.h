@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CORRECTIONS_H
+#define SUPPORT_CORRECTIONS_H
+
 /* Arguments of forces and momenta. Requires: points.h or trajectories.h, the tables; PROJECTED if the unknowns are not
  * the velocities at the points. */
 
@@ -103,4 +106,6 @@ static inline void converged_forces(const step_data *step, const iteration_data 
 #endif
   }
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_COUPLED_DERIVATIVES_H
+#define SUPPORT_COUPLED_DERIVATIVES_H
+
 /* Derivatives of a step solved by coupled_iteration.h and their transpose, by fixed-point iteration. With the tables A
  * (positions from velocities) and W (momenta from forces), the variations x, v, f, p of positions, velocities, forces
  * and momenta at the points satisfy
@@ -197,3 +200,5 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
   v[INPUT_T + 1] += by_h / at->step->h;
   return OK;
 }
+
+#endif

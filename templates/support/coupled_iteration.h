@@ -1,3 +1,6 @@
+#ifndef SUPPORT_COUPLED_ITERATION_H
+#define SUPPORT_COUPLED_ITERATION_H
+
 /* Fixed-point iteration of a step for any regular Lagrangian. Requires: points.h or trajectories.h with what they
  * require, point_weights.h, a mass, corrections.h, velocity corrections, the tables, the kernel point_lanes. */
 
@@ -123,4 +126,6 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_CURVE_H
+#define SUPPORT_CURVE_H
+
 /* Collocation curve of a step: its initial velocity, known from p0 (HAMILTONIAN) or an unknown, and with NODES its
  * quadrature points. */
 #ifdef HAMILTONIAN
@@ -118,4 +121,6 @@ static inline double correct_velocity(const lanes *mass, const double *misfit, c
   }
   return total;
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_DENSITY_H
+#define SUPPORT_DENSITY_H
+
 /* Reversible step-size control by an integrated step density; HAMILTONIAN_SYSTEM: the density depends on momenta,
  * not on velocities. */
 #ifdef HAMILTONIAN_SYSTEM
@@ -102,3 +105,5 @@ static void take_step(run_memory *run, trial *now)
   now->turned = 0;
   run->step++;
 }
+
+#endif

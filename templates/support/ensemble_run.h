@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ENSEMBLE_RUN_H
+#define SUPPORT_ENSEMBLE_RUN_H
+
 /* Ensemble runs with compensated sums; trajectories are SIMD lanes. Requires: many_trajectories.h, numbers.h, and
  * prepare_iteration and iteration of a solver, which compute the increments of a step. */
 
@@ -118,3 +121,5 @@ void NAME(advance)(block_memory *block, int count, long long steps, long long ev
   save_state(&now, block);
   memcpy(block->memory, memory, sizeof memory);
 }
+
+#endif

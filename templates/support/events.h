@@ -1,3 +1,6 @@
+#ifndef SUPPORT_EVENTS_H
+#define SUPPORT_EVENTS_H
+
 /* Events: zero crossings of functions along the steps of a run; TIME_TRANSFORMATION: h is a step in tau. */
 #ifdef TIME_TRANSFORMATION
 /* Velocities dq/dt as arguments of event functions of a time-transformed system, whose integrator has dq/dtau, and the
@@ -530,3 +533,5 @@ int NAME(crossings)(event_watch *watch, long long count, const real *h, const re
   }
   return OK;
 }
+
+#endif

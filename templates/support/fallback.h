@@ -1,3 +1,6 @@
+#ifndef SUPPORT_FALLBACK_H
+#define SUPPORT_FALLBACK_H
+
 /* Solver of steps whose fixed-point iteration fails: none (NO_FALLBACK) or Newton's method. */
 #ifdef NO_FALLBACK
 /* No fallback: if the fixed-point iteration fails, the step fails. */
@@ -24,4 +27,6 @@ static SELDOM int fall_back(int status, const step_data *step, double *dq, doubl
     return STATUS(SPURIOUS_SOLUTION);
   return status;
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_FLOW_H
+#define SUPPORT_FLOW_H
+
 /* Flow of many steps as one function, from (q, p, parameters, t, h) to the states (q, p) at the start and after every
  * `every` steps, with JVPs and VJPs along it. Requires: run.h, jvp_and_vjp.h. */
 #include <stdlib.h>
@@ -277,4 +280,6 @@ static int hessian_rows(flow_call *way, long long rows, const real *x, const rea
   free(room);
   return status;
 }
+#endif
+
 #endif

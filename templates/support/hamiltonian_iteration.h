@@ -1,3 +1,6 @@
+#ifndef SUPPORT_HAMILTONIAN_ITERATION_H
+#define SUPPORT_HAMILTONIAN_ITERATION_H
+
 /* Fixed-point iteration of a step for any Hamiltonian (Li, Wu & Leok, eq. (35)). Requires: one_trajectory.h,
  * point_weights.h, the tables, the kernels velocity_lanes and force_lanes. */
 
@@ -125,4 +128,6 @@ static inline void integrals_of_iteration(const step_data *step, const iteration
   for (int k = 0; k < INTEGRALS; k++)
     sum[k] = points_total(part[k]);
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_INPUTS_H
+#define SUPPORT_INPUTS_H
+
 /* Inputs: piecewise polynomials of time. A run ends a step at their breakpoints and continues with the parameters of
  * the next pieces. Requires: step.h, and INPUT_INDEX, the indices of the parameters of each input. */
 
@@ -56,3 +59,5 @@ long long NAME(next_steps)(run_memory *run, real t_end, real h, input_data *inpu
   run->h = length;
   return whole >= 1 ? (long long)whole : 1;
 }
+
+#endif

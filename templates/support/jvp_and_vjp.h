@@ -1,3 +1,6 @@
+#ifndef SUPPORT_JVP_AND_VJP_H
+#define SUPPORT_JVP_AND_VJP_H
+
 /* Tangent and adjoint vectors over a step solved by Newton's method; TIME_TRANSFORMATION: time depends on the state. */
 #ifdef TIME_TRANSFORMATION
 /* Linearised time of a time-transformed system: time is an integral along the curve, by the weights of the first
@@ -241,3 +244,5 @@ static int propagate_vectors(const linearised_step *at, int back, int count, con
   }
   return all_finite(to, count * STEP_INPUTS) ? OK : NOT_FINITE;
 }
+
+#endif

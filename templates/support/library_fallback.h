@@ -1,3 +1,6 @@
+#ifndef SUPPORT_LIBRARY_FALLBACK_H
+#define SUPPORT_LIBRARY_FALLBACK_H
+
 /* Newton solver that one library provides to another, which has only the fixed-point iteration. Requires: step.h. */
 
 /* Computes the increments of a step with their low words, and the relative error of its end if the stages determine it,
@@ -56,4 +59,6 @@ const void *NAME(provided_fallback)(void)
   static const fallback shared_fallback = {provided_step};
   return &shared_fallback;
 }
+#endif
+
 #endif

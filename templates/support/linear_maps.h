@@ -1,3 +1,6 @@
+#ifndef SUPPORT_LINEAR_MAPS_H
+#define SUPPORT_LINEAR_MAPS_H
+
 /* Linear maps between tangent vectors of the inputs of a step, of its unknowns, of the arguments and results of kernels
  * at points, and of the rows of its equations; and their transposes. Requires: real, M, B, STEP_INPUTS, WIDTH, band.h,
  * stages.h; if DAMPED, damping.h. */
@@ -272,3 +275,5 @@ static void solve_wide(const real *a, const band *shape, const real *pivot, int 
     else
       upper_wide(a, shape, k, back, x);
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_LINEARISE_H
+#define SUPPORT_LINEARISE_H
+
 /* Tangent or adjoint vectors over many steps: each by Newton's method, or several at once (VECTORS_BY_ITERATION). */
 #ifndef VECTORS_BY_ITERATION
 /* Tangent and adjoint vectors over steps that are each solved by Newton's method. Requires: vectors_by_newton.h. */
@@ -33,3 +36,5 @@ int NAME(linearise)(long long steps, const real *t, const real *h, const real *q
   }
   return status;
 }
+
+#endif

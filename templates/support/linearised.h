@@ -1,3 +1,6 @@
+#ifndef SUPPORT_LINEARISED_H
+#define SUPPORT_LINEARISED_H
+
 /* Linearisation of a step. Requires: newton.h, linear_maps.h, and STAGE_GROUPS. */
 
 enum {
@@ -15,3 +18,5 @@ typedef struct {
   real growth; /* gamma h */
   real p1[M];
 } linearised_step;
+
+#endif

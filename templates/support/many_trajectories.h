@@ -1,3 +1,6 @@
+#ifndef SUPPORT_MANY_TRAJECTORIES_H
+#define SUPPORT_MANY_TRAJECTORIES_H
+
 /* Fixed-point iteration of many trajectories, which are SIMD lanes: predictor and termination. A step fails for single
  * trajectories, which become inactive, never for all. Requires: trajectories.h, convergence.h, and the tables
  * LAST_ALONE, LAST, BEFORE, which extrapolate stored values into the next step. */
@@ -104,3 +107,5 @@ static inline long long next_guess(long long steps, const progress *now, const s
     largest = report->active[j] > 0.0 ? larger(view.lane[j], largest) : largest;
   return steps_to_continue(steps, largest);
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_NEWTON_FROM_LINE_H
+#define SUPPORT_NEWTON_FROM_LINE_H
+
 /* Newton's method without previous steps. Requires: newton.h. */
 
 /* Initial guess: q moves on a straight line with its initial velocity. */
@@ -37,4 +40,6 @@ static SELDOM int is_spurious(const step_data *step, const real *z, const real *
   return 0;
 #endif
 }
+#endif
+
 #endif

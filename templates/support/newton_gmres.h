@@ -1,3 +1,6 @@
+#ifndef SUPPORT_NEWTON_GMRES_H
+#define SUPPORT_NEWTON_GMRES_H
+
 /* Restarted GMRES with right preconditioning (Y. Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm
  * 9.5) on vectors over all points of all coordinates. Requires: array_newton.h; linear_system with count, state,
  * basis, residual, correction and product; multiply, precondition and reconsider. */
@@ -225,3 +228,5 @@ static int solve(run_memory *run, const problem *given, long long n, const struc
   *guess = steps_to_continue(*guess, now.first);
   return examine(w, largest, decay, error) ? OK : NOT_FINITE;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_NEWTON_SOLVER_H
+#define SUPPORT_NEWTON_SOLVER_H
+
 /* Step by Newton's method. Requires: newton.h, the table EXTRAPOLATION: the predictor is sum_c EXTRAPOLATION[c][b] z_c
  * of the previous step; for multipliers the rows from B on. */
 typedef struct {
@@ -66,3 +69,5 @@ static int solve(const step_data *step, const solver_data *unused, real *memory,
   *guess = POINT > 0 && keep ? 2 : 1;
   return status;
 }
+
+#endif

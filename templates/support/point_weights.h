@@ -1,3 +1,6 @@
+#ifndef SUPPORT_POINT_WEIGHTS_H
+#define SUPPORT_POINT_WEIGHTS_H
+
 /* Quadrature weights times h, constant during a run. Requires: the tables; with damping, damped_points.h. */
 typedef struct {
   weight position_weight[GROUPS], momentum_weight[GROUPS]; /* h beta, h w: the same rounded numbers everywhere */
@@ -24,3 +27,5 @@ static inline void scale(const weight *weights, lanes (*x)[M], lanes (*scaled)[M
     for (int i = 0; i < M; i++)
       scaled[n][i] = weights[n] * x[n][i];
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_PRECONDITIONER_H
+#define SUPPORT_PRECONDITIONER_H
+
 /* Preconditioner for Newton-GMRES: by Fourier modes (ON_LATTICES) or from the diagonal of F'. */
 #ifdef ON_LATTICES
 /* Mean stencil of h^2 F' / m on a lattice by stencil probing: probes are placed so far apart that their responses do
@@ -282,4 +285,6 @@ static void choose_preconditioner(linear_system *of, double left)
 {
   (void)of, (void)left; /* there is no alternative */
 }
+#endif
+
 #endif

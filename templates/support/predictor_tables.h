@@ -1,3 +1,6 @@
+#ifndef SUPPORT_PREDICTOR_TABLES_H
+#define SUPPORT_PREDICTOR_TABLES_H
+
 /* Predictor tables for steps of different sizes. Requires: PREDICTOR_ALONE, PREDICTOR_LAST, PREDICTOR_BEFORE.
  *
  * Step sizes are roots of 2 to the power of a level, so that few tables extrapolate the curve of former steps: from the
@@ -20,3 +23,5 @@ static inline int choose_tables(const run_memory *run, struct predictor_tables_o
   }
   return 1;
 }
+
+#endif

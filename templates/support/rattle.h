@@ -1,3 +1,6 @@
+#ifndef SUPPORT_RATTLE_H
+#define SUPPORT_RATTLE_H
+
 /* Constrained steps on Lobatto points for constant diagonal masses (RATTLE for two points; Lobatto IIIA-IIIB: L.
  * Jay, SIAM J. Numer. Anal. 33, 1996), without the full Newton matrix: simplified Newton iteration for the
  * multipliers that give g = 0 at the points, with the factors at their initial guess, in which the forces are
@@ -261,3 +264,5 @@ static int rattle(const step_data *step, const newton_data *data, real *dp, cons
   status = solve_constraints(step, &now, data, options, report);
   return status == OK ? finish_step(step, &now, data, dp) : status;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_ROWS_FLOW_H
+#define SUPPORT_ROWS_FLOW_H
+
 /* Flow of many rows, for callers with arrays. Requires: flow.h. */
 
 /* part: 0 states, 1 tangent vectors of the states (JVP), 2 gradients with respect to the inputs (VJP); of rows x
@@ -19,4 +22,6 @@ int NAME(hessian_rows)(long long steps, long long every, int count, long long ro
   flow_call way = {.steps = steps, .every = every, .count = count};
   return hessian_rows(&way, rows, x, partials, changes, found, report);
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_SECOND_DERIVATIVES_H
+#define SUPPORT_SECOND_DERIVATIVES_H
+
 /* Second derivatives of a step by forward-over-reverse differentiation: the tangent of the adjoint. The stage equations
  * times the adjoint multipliers are a function of the inputs and the unknowns; its Hessian times a tangent vector is
  * the source of the tangents of the multipliers, which are solved for with the same factors. Requires: jvp_and_vjp.h,
@@ -216,3 +219,5 @@ int NAME(second_order)(long long steps, const real *t, const real *h, const real
   }
   return OK;
 }
+
+#endif

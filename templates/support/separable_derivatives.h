@@ -1,3 +1,6 @@
+#ifndef SUPPORT_SEPARABLE_DERIVATIVES_H
+#define SUPPORT_SEPARABLE_DERIVATIVES_H
+
 /* Derivatives of a step solved by separable_iteration.h and their transpose, by fixed-point iteration. With D = X - q0,
  * the derivatives K = F_q at the points, s = h^2 / m and P the table PRODUCT, the variations x of the points and the
  * adjoint variables y of the forces are the fixed points of
@@ -230,3 +233,5 @@ static __attribute__((noinline)) int vjp_by_iteration(iterated_step *at, double 
 #endif
   return OK;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_SEPARABLE_ITERATION_H
+#define SUPPORT_SEPARABLE_ITERATION_H
+
 /* Fixed-point iteration of a step for constant diagonal masses and forces F(q, t) (Li, Wu & Leok, eqs. (25)-(30)): X_n
  * = q0 + h c_n v0 + h^2 sum_j (a A)_nj F(X_j) / m, with the quadrature points or the trajectories as SIMD lanes.
  * Coefficients are double-double: the sum of a table and its _LOW partner. Values at the points are in flat arrays,
@@ -270,4 +273,6 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+#endif
+
 #endif

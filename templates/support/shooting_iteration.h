@@ -1,3 +1,6 @@
+#ifndef SUPPORT_SHOOTING_ITERATION_H
+#define SUPPORT_SHOOTING_ITERATION_H
+
 /* Fixed-point iteration of a step of a shooting-based variational method (SCVI; Li, Wu & Leok, eqs. (33)-(34), in the
  * stationary form, with multipliers of the collocation equations). Requires: curve.h, the tables, the kernels
  * node_lanes and action_lanes. */
@@ -121,3 +124,5 @@ HOT int fixed_point(const step_data *step, const iteration_data *data, history p
   *steps = next_guess(*steps, &now, report);
   return OK;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_SPLITTING_H
+#define SUPPORT_SPLITTING_H
+
 /* Explicit splitting method: drifts by constant masses (BY_MASSES) or by velocities v(p, t), and kicks. */
 #ifdef BY_MASSES
 /* Drift of splitting methods with constant masses: dq += h part M^-1 p. Requires: step.h, the kernel mass. */
@@ -76,3 +79,5 @@ static int solve(const step_data *step, const solver_data *data, real *memory, l
   *guess = 1;
   return OK;
 }
+
+#endif

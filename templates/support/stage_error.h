@@ -1,3 +1,6 @@
+#ifndef SUPPORT_STAGE_ERROR_H
+#define SUPPORT_STAGE_ERROR_H
+
 /* Error estimate of a step by Newton's method from the leading coefficient of its curve, as in curve_error.h. Requires:
  * stages.h, the tables STAGE_HIGHEST, STAGE_NEXT, STAGE_CURVATURE and STAGE_OTHER_CURVATURE; STAGE_POWER. */
 
@@ -28,3 +31,5 @@ static real stage_error(const step_data *step, const real *z, const real *dq, re
   }
   return least;
 }
+
+#endif

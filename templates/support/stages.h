@@ -1,3 +1,6 @@
+#ifndef SUPPORT_STAGES_H
+#define SUPPORT_STAGES_H
+
 /* Interpolation from the unknowns z to values at points. Requires: real, B, POINTS. Unknown b of site i is z[i B +
  * b]. */
 
@@ -98,4 +101,6 @@ static inline void begin_rows(const step_data *step, const real *z, real *rows, 
   if (jacobian)
     memset(jacobian, 0, sizeof(real) * band_size(shape));
 }
+#endif
+
 #endif

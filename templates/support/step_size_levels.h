@@ -1,3 +1,6 @@
+#ifndef SUPPORT_STEP_SIZE_LEVELS_H
+#define SUPPORT_STEP_SIZE_LEVELS_H
+
 /* Step-size control. Step sizes of adaptive steps are roots of 2 to the power of a grid level, and the error estimate
  * of a step determines the level of the next. Requires: MANTISSA; GROWTH, the factor of the error estimate per level;
  * ERROR_POWER. Include before a trial of a step and trials.h. */
@@ -89,3 +92,5 @@ static real next_size(real length, real rest, int *last)
   *last = length * (1 + LAST_STEP) >= MATH(fabs)(rest);
   return *last ? rest : MATH(copysign)(length, rest);
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_TRAJECTORIES_H
+#define SUPPORT_TRAJECTORIES_H
+
 /* SIMD lanes are trajectories: a vector contains values of LANES trajectories at one point. points.h defines the same
  * names. Requires: vectors.h. */
 enum { GROUPS = S }; /* vectors for all points */
@@ -122,3 +125,5 @@ static inline number total_change(lanes change)
 {
   return change;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_TRIAL_H
+#define SUPPORT_TRIAL_H
+
 /* Trial of an adaptive step of arrays (ARRAYS) or of named coordinates, by fixed-point iteration or by Newton's
  * method (NEWTON_ALONE). */
 #ifdef ARRAYS
@@ -170,4 +173,6 @@ static inline int compare_trial(run_memory *run, trial *now, int momenta, const 
   (void)run;
   return compare_with_halves(&now->step, now->dq, momenta ? now->dp : NULL, options, apart);
 }
+#endif
+
 #endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_VECTOR_CONVERGENCE_H
+#define SUPPORT_VECTOR_CONVERGENCE_H
+
 /* Convergence criterion for the fixed-point iterations of tangent and adjoint vectors. Requires: convergence.h. */
 
 #define MOVED_BY_ROUNDING (4.0 * DBL_EPSILON * DBL_EPSILON) /* squared: relative change that rounding alone may cause */
@@ -31,3 +34,5 @@ static inline int vectors_status(double moved, double size, vector_changes *past
   }
   return finite && relative < INFINITY && k < MAX_ITERATIONS && shrinks ? 0 : -1;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_VECTORS_BY_ITERATION_H
+#define SUPPORT_VECTORS_BY_ITERATION_H
+
 /* Tangent and adjoint vectors over steps that are solved by fixed-point iteration. Blocks of STEPS_AT_ONCE steps are
  * solved first, each with a predictor from the previous one; then the vectors are propagated, forward or backward.
  * Requires: vectors_by_newton.h, which takes over where an iteration fails; iteration, store_step, linearise_points,
@@ -79,3 +82,5 @@ static int propagate_steps(propagation *over, long long first, long long end)
   }
   return status;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_VECTORS_BY_NEWTON_H
+#define SUPPORT_VECTORS_BY_NEWTON_H
+
 /* Tangent and adjoint vectors over steps solved by Newton's method. Requires: jvp_and_vjp.h. */
 
 /* Steps and the vectors propagated over them, of shape (steps + 1, count, STEP_INPUTS). */
@@ -45,3 +48,5 @@ static int vectors_by_newton(propagation *over, long long k, int first)
         vectors_to(over, k) + first * STEP_INPUTS);
   return status;
 }
+
+#endif

@@ -1,3 +1,6 @@
+#ifndef SUPPORT_XLA_FLOW_H
+#define SUPPORT_XLA_FLOW_H
+
 /* Flow as XLA custom calls through the XLA FFI. Requires: flow.h. */
 #include <stdio.h>
 
@@ -94,4 +97,6 @@ XLA_FFI_Error *NAME(xla_vjp_derivative)(XLA_FFI_CallFrame *frame)
   status = hessian_rows(&way, rows_of(x), x->data, partials->data, changes->data, found->data, &report);
   return status == OK ? NULL : failure(frame, status, &report);
 }
+#endif
+
 #endif
