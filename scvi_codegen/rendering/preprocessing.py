@@ -114,7 +114,7 @@ class _Preprocessor:
                     yield line
 
     def define(self, word: str, rest: str) -> None:
-        name, value = re.fullmatch(r"(\w+)(.*)", COMMENT.sub("", rest)).groups()
+        name, value = re.split(r"\b", COMMENT.sub("", rest) + " ", maxsplit=2)[1:]
         self.macros.uncertain.discard(name)
         self.macros.values.pop(name, None)
         if word == "define":
@@ -171,4 +171,4 @@ def preprocessed(text: str, read: Callable[[str], str]) -> tuple[str, dict[str, 
     lines = list(work.lines(text, ""))
     tested = {word for line in lines if line.startswith("#if") for word in re.findall(r"\w+", line)}
     kept = [line for line in lines if not ((guard := GUARD.match(line)) and guard["macro"] not in tested)]
-    return re.sub(r"\n{3,}", "\n\n", "\n".join(kept)), work.files
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(kept).rstrip() + "\n"), work.files
