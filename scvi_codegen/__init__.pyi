@@ -49,7 +49,7 @@ from scvi_codegen.frameworks.torch import TorchFlow as TorchFlow
 from scvi_codegen.frameworks.torch import torch_flow as torch_flow
 from scvi_codegen.mechanics.arrays.rolling import RolledSums as RolledSums
 from scvi_codegen.mechanics.arrays.rolling import roll_sums as roll_sums
-from scvi_codegen.mechanics.arrays.unrolling import unroll_sums as unroll_sums
+from scvi_codegen.mechanics.arrays.rolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
 from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of

@@ -10,7 +10,7 @@
       -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);
                                    plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
       -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration is
-                                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.fallback`)
+                                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.simd`)
       -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
@@ -36,21 +36,19 @@ from sympy import Expr
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.indices import SIZES_REQUIRED
-from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.iteration import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
+from scvi_codegen.lowering.constraints import rattle_of
+from scvi_codegen.lowering.control import control_of, density_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.lowering.loops import with_sums
 from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.predictor_tables import control_of
-from scvi_codegen.lowering.solvers.rattle import rattle_of
-from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of
-from scvi_codegen.lowering.solvers.splitting import splitting_of
-from scvi_codegen.lowering.step_density import density_of
+from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of, splitting_of
+from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.mechanics.arrays.unrolling import unroll_sums
 from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem

@@ -8,7 +8,7 @@ from sympy import Expr, latex
 
 from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.ir.constraints import ConstrainedSteps
+from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import Program

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from scvi_codegen.ir.equations import LoweredStageGroup
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
-from scvi_codegen.ir.stage_groups import LoweredStageGroup
 
 __all__ = ["Derivatives", "InputDerivatives", "PointDerivatives", "TimeDerivatives"]
 

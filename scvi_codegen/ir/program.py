@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.constraints import ConstrainedSteps, Constraints, Rattle
+from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, LoweredStageGroup, Rattle
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.ir.stage_groups import LoweredStageGroup
 
 __all__ = [
     "FEW_UNKNOWNS",

@@ -9,14 +9,13 @@ from __future__ import annotations
 from scvi_codegen.errors import MethodError, ScviCodegenError
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration
 from scvi_codegen.ir.program import Layout, Program
+from scvi_codegen.lowering.constraints import constrained_steps
 from scvi_codegen.lowering.kernels import comment_text
 from scvi_codegen.lowering.loops import looped_terms
 from scvi_codegen.lowering.program import notes_of
-from scvi_codegen.lowering.solvers.base import StepProblem
-from scvi_codegen.lowering.solvers.rattle import constrained_steps
-from scvi_codegen.lowering.solvers.selection import iteration_of
-from scvi_codegen.lowering.solvers.separable import separable_iteration
-from scvi_codegen.lowering.solvers.splitting import splitting_of
+from scvi_codegen.lowering.solvers.points import separable_iteration
+from scvi_codegen.lowering.solvers.selection import iteration_of, splitting_of
+from scvi_codegen.lowering.solvers.tables import StepProblem
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem

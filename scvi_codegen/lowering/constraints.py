@@ -1,19 +1,135 @@
-"""Kernels of constraints: values, derivatives, and the terms of the equation for the Lagrange multipliers."""
+"""RATTLE and its generalisation to s + 1 Lobatto points, for constant masses: only multipliers are solved for.
+
+If masses are constant and diagonal and forces depend on positions and time, positions at the s + 1 Lobatto points are
+explicit in forces and multipliers (Lobatto IIIA and IIIB), which leaves s equations per constraint,
+
+    g(u_i) = 0,   u_i = q0 + h c_i M^-1 p0 + h^2 sum_n a_in M^-1 (F_n + G_n^T lambda_n),   i = 1 .. s, n = 0 .. s - 1,
+
+then one for the momentum at the end, G_s M^-1 (.. + h w_s G_s^T lambda_s) + g_t = 0. The first are solved by a
+simplified Newton iteration with the matrix h^2 a_in G_i M^-1 G_n^T, a band matrix if the constraints form a chain,
+factorised once per step. Changes of forces and derivatives with the positions are neglected, an error of order h^2 that
+the iteration removes. SVI(1) is RATTLE.
+
+Constraints of systems of arrays are solved by RATTLE and its symmetric compositions. A step of h is, with G0 and G1 the
+derivatives of the constraints at its ends,
+
+    p = p0 + h/2 (F0 + G0^T lambda),  q1 = q0 + h M^-1 p  with  g(q1) = 0,
+    p1 = p + h/2 (F1 + G1^T mu)                           with  G1 M^-1 p1 + g_t = 0,
+
+symmetric and symplectic on the constrained phase space; compositions of such steps satisfy the constraints after each
+of them and attain their order. Both systems of multipliers are solved iteratively with G M^-1 G^T at the start or end
+of the step, a sparse matrix whose pattern is computed once per run.
+
+Sources: J.-P. Ryckaert, G. Ciccotti, H. J. C. Berendsen, J. Comput. Phys. 23 (1977); H. C. Andersen, ibid. 52 (1983);
+S. Reich, SIAM J. Numer. Anal. 33 (1996), on compositions; E. Barth, K. Kuczera, B. Leimkuhler, R. D. Skeel, J. Comput.
+Chem. 16 (1995), on the iteration.
+"""
 
 from __future__ import annotations
 
-from scvi_codegen.ir.constraints import Constraints
-from scvi_codegen.lowering.kernels import system_kernel
+from collections.abc import Iterator
+from functools import partial
+
+from sympy import Symbol
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.ir.equations import ConstrainedSteps, Constraints, Rattle
+from scvi_codegen.ir.kernel import LoopedKernel
+from scvi_codegen.ir.numbers import lower_matrix, lower_vector
+from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
+from scvi_codegen.lowering.solvers.tables import velocity_tables
+from scvi_codegen.mechanics.arrays.constraints import (
+    constraint_gradient,
+    constraint_second_rate,
+    constraint_text,
+    coordinate_accesses,
+)
+from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.constraints import (
     constraint_jacobian,
     constraint_rates,
     holonomic_expressions,
+    nonholonomic_expressions,
     time_derivatives,
 )
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.method import Method
+from scvi_codegen.methods.stage_structure import Velocities
+from scvi_codegen.methods.stage_system import StageSystem
+from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.precision import Vector, mp
 
-__all__ = ["lowered_constraints"]
+__all__ = ["constrained_steps", "lowered_constraints", "rattle_of"]
+
+
+def rattle_of(system: MechanicalSystem, stages: StageSystem) -> Rattle | None:
+    """Return the tables of such steps; ``None`` if they are not applicable."""
+    forms, tables = forms_of(system), velocity_tables(stages.shape)
+    if not system.constraints or any(nonholonomic_expressions(system)) or not forms.separable or tables is None:
+        return None
+    partials = list(constraint_jacobian(system))
+    at: dict[int, list[int]] = {}
+    for e, (_, i) in enumerate(partials):
+        at.setdefault(i, []).append(e)
+    products = tuple((e, f) for own in at.values() for e in own for f in own)
+    position, momentum = tables.position[1:], tuple(line[:-1] for line in tables.momentum)
+    return Rattle(
+        force=system_kernel(system, "constrained_force", forms.force, of=system.coordinates, purpose="L_q at u = q."),
+        mass=system_kernel(system, "constrained_mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        products=products,
+        entries=tuple((partials[e][0], partials[f][0]) for e, f in products),
+        abscissae=lower_vector(tables.abscissae),
+        weights=lower_vector(tables.end_momentum),
+        position=lower_matrix(transpose(position)),
+        start=lower_vector(tuple(line[0] / tables.end_momentum[0] - 1 for line in momentum)),
+        momentum=lower_matrix(transpose(momentum)),
+        response=lower_matrix(transpose(matrix_product(position, momentum))),
+    )
+
+
+def constrained_steps(system: ArraySystem, stages: StageSystem, method: Method) -> ConstrainedSteps:
+    """Return the kernels and fractions of constrained steps.
+
+    Raises:
+        MethodError: for other methods, and for velocity-dependent forces.
+    """
+    if system.velocities:
+        raise MethodError(
+            "velocity-dependent forces are not supported for array systems with constraints: remove "
+            "the forces or the constraints"
+        )
+    pairs = list(_kernels(system))
+    conditions, curvatures = (tuple(kernels) for kernels in zip(*pairs, strict=True))
+    return ConstrainedSteps(conditions=conditions, curvatures=curvatures, parts=lower_vector(_parts(stages, method)))
+
+
+def _parts(stages: StageSystem, method: Method) -> Vector:
+    """Return the fractions of h of the RATTLE steps of which a step is composed."""
+    shape = stages.shape
+    if method.fractions and not getattr(method, "drifts_first", False):
+        return method.fractions
+    if isinstance(shape, Velocities) and shape.variational and shape.abscissae == (0, 1) and len(shape.blocks) == 1:
+        return (mp.one,)
+    raise MethodError(
+        f"{method.name} does not support constraints of array systems: use 'stoermer-verlet', which is "
+        "RATTLE, as is SVI(1, 'gauss-lobatto:2'), or 'composition:8' of it"
+    )
+
+
+def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
+    """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
+    for number, term in enumerate(system.constraints):
+        u = coordinate_accesses(term, system.coordinates)
+        v = [Symbol(f"{slot.name} along", real=True) for slot, _ in u]
+        *partials, rate = constraint_gradient(term, system.coordinates, system.time)
+        second = constraint_second_rate(term, system.coordinates, system.time, v)
+        values, purpose = [term.formula, rate, *partials], "g, g_t, and the derivatives of g."
+        looped = partial(looped_kernel, system, of=term, u=u, text=constraint_text(term))
+        yield (
+            looped(f"condition_{number}", values, purpose=purpose),
+            looped(f"curvature_{number}", [second], along=v, purpose="d^2 g / dt^2 along v."),
+        )
 
 
 def lowered_constraints(system: MechanicalSystem) -> Constraints | None:

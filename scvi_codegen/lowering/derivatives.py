@@ -1,22 +1,28 @@
-"""Derivatives of the stage equations with respect to parameters and time, and their second derivatives, as kernels."""
+"""Derivatives of a step with respect to all inputs, as kernels: of the stage equations, and at the points.
+
+The derivatives of the stage equations with respect to parameters and time, and their second derivatives, serve Newton's
+factors; those of forces and momenta at the points serve tangent vectors by fixed-point iteration.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sympy import Add, Expr, Mul, S, Symbol
 
 from scvi_codegen.formulas.derivatives import gradient, jacobian
-from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, TimeDerivatives
+from scvi_codegen.ir.derivatives import Derivatives, InputDerivatives, PointDerivatives, TimeDerivatives
+from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.point_derivatives import point_derivatives_of
-from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.derived_expressions import Entries, forms_of
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 
-__all__ = ["derivatives_of"]
+__all__ = ["derivatives_of", "point_derivatives_of"]
 
 
 def derivatives_of(
@@ -110,3 +116,93 @@ def _curvature(system: MechanicalSystem, group: StageGroup) -> Kernel | None:
         of=(*group.arguments, *multipliers, *changes),
         purpose="Hessian-vector product of multipliers . results with a variation of all arguments.",
     )
+
+
+MOST_DERIVATIVES = 4096
+"""Largest number of derivatives at a point; those of all points are on the stack, a quarter of a megabyte."""
+NOTHING: Entries = {(0, 0): S.Zero}
+"""Replacement for an empty set of entries: C has no empty arrays."""
+
+
+def point_derivatives_of(system: MechanicalSystem, fixed_point: FixedPointIteration) -> PointDerivatives | None:
+    """Return the kernels for a system whose steps are solved by the iteration; ``None`` if unsupported or too large."""
+    twin, make = equivalent_lagrangian(system), MAKERS.get(fixed_point.derivatives_part)
+    found = make(twin) if twin and make else None
+    return found if found and found.count + len(found.given.entries) <= MOST_DERIVATIVES else None
+
+
+def _separable(system: LagrangianSystem) -> PointDerivatives:
+    """Return the derivatives of forces at u = q, and those of constant masses with respect to parameters."""
+    forms, q = forms_of(system), tuple(system.coordinates)
+    partials = jacobian(forms.force, q) or NOTHING
+    different = tuple(dict.fromkeys(partials.values()))
+    masses = jacobian(tuple(forms.mass.values()), system.parameters)
+    purpose = "Derivatives of the constant masses with respect to parameters."
+    kernel = system_kernel(system, "mass_by_inputs", masses.values(), of=(), purpose=purpose)
+    return PointDerivatives(
+        partials=system_kernel(
+            system, "point_derivatives", different, of=q, purpose="The distinct entries of L_qq at all points."
+        ),
+        beside=0,
+        products=_products(system, partials, different, size=len(q)),
+        given=_at_points_by_inputs(system, forms.force, q),
+        masses=InputDerivatives(entries=tuple(masses), kernel=kernel) if masses else None,
+    )
+
+
+def _coupled(system: LagrangianSystem) -> PointDerivatives:
+    """Return the derivatives of (L_q, -L_v) at u = (q, v); those of L_v with respect to v, the mass, separately."""
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    m = system.dimension
+    partials = jacobian(forms.force, of)
+    by_position = jacobian(forms.momentum, system.coordinates)
+    partials |= {(m + i, j): Mul(S.NegativeOne, value) for (i, j), value in by_position.items()}
+    partials = partials or NOTHING
+    different = tuple(dict.fromkeys(partials.values()))
+    at_points = system_kernel(
+        system,
+        "point_derivatives",
+        (*forms.momentum, *different),
+        of=of,
+        partials=forms.lower_mass.values(),
+        purpose="L_v, the distinct entries of L_qq, L_qv and -L_vq, and the lower triangle of L_vv at all points.",
+    )
+    return PointDerivatives(
+        partials=at_points,
+        beside=m,
+        products=_products(system, partials, different, size=2 * m),
+        given=_at_points_by_inputs(system, (*forms.force, *forms.momentum), of),
+    )
+
+
+MAKERS: dict[str, Callable[[LagrangianSystem], PointDerivatives]] = {
+    "separable_derivatives": _separable,
+    "coupled_derivatives": _coupled,
+}
+
+
+def _at_points_by_inputs(system: LagrangianSystem, results: Sequence[Expr], of: Sequence[Symbol]) -> InputDerivatives:
+    entries = jacobian(results, (*system.parameters, system.time)) or NOTHING
+    purpose = "Their derivatives with respect to parameters and time, at all points."
+    kernel = system_kernel(system, "input_derivatives", entries.values(), of=of, purpose=purpose)
+    return InputDerivatives(entries=tuple(entries), kernel=kernel)
+
+
+def _products(
+    system: LagrangianSystem, partials: Entries, different: tuple[Expr, ...], *, size: int
+) -> tuple[Kernel, Kernel]:
+    """Return kernels of the matrix of derivatives times x, and of its transpose; the same kernel if they are equal."""
+    number = {value: k for k, value in enumerate(different)}
+    x = [Symbol(f"x[{i}]", real=True) for i in range(size)]
+    values = [Symbol(f"derivative[{k}]", real=True) for k in range(len(different))]
+    back = {(j, i): value for (i, j), value in partials.items()}
+
+    def product(name: str, matrix: Entries, purpose: str) -> Kernel:
+        rows: list[list[Expr]] = [[] for _ in x]
+        for (i, j), value in matrix.items():
+            rows[i].append(Mul(values[number[value]], x[j]))
+        return system_kernel(system, name, [Add(*row) for row in rows], of=(*x, *values), purpose=purpose)
+
+    forward = product("derivative_product", partials, "The matrix of derivatives times x, u = (x, its entries).")
+    turned = product("transposed_product", back, "Its transpose times x.") if back != partials else forward
+    return forward, turned

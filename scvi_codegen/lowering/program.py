@@ -9,7 +9,7 @@ import sympy
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.constraints import Rattle
+from scvi_codegen.ir.equations import LoweredStageGroup, Rattle
 from scvi_codegen.ir.iteration import FixedPointIteration
 from scvi_codegen.ir.iterations import Splitting
 from scvi_codegen.ir.kernel import Kernel
@@ -24,13 +24,10 @@ from scvi_codegen.ir.program import (
     StageCurve,
     StageEquations,
 )
-from scvi_codegen.ir.stage_groups import LoweredStageGroup
-from scvi_codegen.lowering.bandwidth_ordering import bandwidth, places
 from scvi_codegen.lowering.constraints import lowered_constraints
 from scvi_codegen.lowering.kernels import comment_text, damping_kernel, integrand_kernel, system_kernel
-from scvi_codegen.lowering.solvers.velocity_tables import resolved_degree, velocity_tables
-from scvi_codegen.lowering.stage_groups import has_action, lowered_stage_group
-from scvi_codegen.lowering.unknown_layout import layout_of
+from scvi_codegen.lowering.solvers.tables import resolved_degree, velocity_tables
+from scvi_codegen.lowering.stage_groups import bandwidth, bandwidth_ordering, has_action, layout_of, lowered_stage_group
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -66,7 +63,7 @@ def lower(
         fixed_point: the fixed-point iteration to try first
             (:func:`scvi_codegen.lowering.solvers.selection.iteration_of`).
         splitting: the explicit solver that replaces both
-            (:func:`scvi_codegen.lowering.solvers.splitting.splitting_of`).
+            (:func:`scvi_codegen.lowering.solvers.selection.splitting_of`).
         newton: whether Newton's method is included; with it the discrete Legendre transforms.
         rattle: tables of RATTLE, which is tried before Newton's method, if applicable.
         symmetries: whose momentum maps are included.
@@ -76,7 +73,7 @@ def lower(
     mass = forms_of(system).legendre_jacobian
     stage_groups = tuple(lowered_stage_group(system, group, sites) for group in stages.stage_groups) if newton else ()
     coupled = [*mass, *_coupled_coordinates(stage_groups)]
-    order = places(coupled, sites.count)
+    order = bandwidth_ordering(coupled, sites.count)
     polynomial = method.exactness.curve != 0
     layout = Layout(
         coordinates=tuple(Array(q.name, ()) for q in system.coordinates),

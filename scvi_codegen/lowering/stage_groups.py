@@ -1,27 +1,120 @@
-"""Stage groups: kernels with their derivatives, gathers and scatters as loops over rounded tables."""
+"""Stage groups: kernels with their derivatives, gathers and scatters as loops, and the layout of the unknowns.
+
+There is one group of sites per coordinate, then one per component of other unknowns. Two coordinates are coupled if a
+mixed second derivative of the Lagrangian does not vanish. The Newton matrix has a block for every coupled pair; in a
+good ordering the blocks are in a narrow band, outside of which nothing is stored or computed. An open chain has
+bandwidth 1, a closed one 2, and if all coordinates are coupled the band is the whole matrix.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
+import numpy as np
 import sympy
 
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.derivatives import jacobian
 from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.ir.equations import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
-from scvi_codegen.ir.stage_groups import DerivativeBlock, GatherLoop, LoweredStageGroup, ScatterLoop
 from scvi_codegen.lowering.kernels import system_kernel
-from scvi_codegen.lowering.unknown_layout import UnknownLayout
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.work_and_impulse import work_rates
-from scvi_codegen.methods.stage_system import Gather, StageGroup
+from scvi_codegen.methods.stage_system import Gather, StageGroup, StageSystem
 from scvi_codegen.tables.precision import mp
 
-__all__ = ["argument_name", "has_action", "lowered_stage_group"]
+__all__ = [
+    "UnknownLayout",
+    "argument_name",
+    "bandwidth",
+    "bandwidth_ordering",
+    "has_action",
+    "layout_of",
+    "lowered_stage_group",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownLayout:
+    """Groups of blocks of the same size, each at as many sites: first those with m components, at the coordinates.
+
+    Attributes:
+        first: the first site, by size.
+        columns: the indices of the B blocks, by size.
+        rows: the indices of the B rows, by size.
+        count: number of sites.
+    """
+
+    first: dict[int, int]
+    columns: dict[int, tuple[int, ...]]
+    rows: dict[int, tuple[int, ...]]
+    count: int
+
+
+def layout_of(stages: StageSystem, dimension: int) -> UnknownLayout:
+    """Return the sites of stage equations.
+
+    Raises:
+        MethodError: unless there are as many blocks as rows, and equally many, of every size.
+    """
+    blocks, rows = stages.block_sizes(dimension), stages.row_sizes(dimension)[:-1]
+    sizes = [dimension, *sorted({*blocks, *rows} - {dimension})]
+    columns, lines = ({size: _indices_of_size(size, each) for size in sizes} for each in (blocks, rows))
+    if len({len(places) for group in (columns, lines) for places in group.values()}) > 1:
+        counts = ", ".join(f"{len(columns[size])} blocks and {len(lines[size])} rows of {size}" for size in sizes)
+        raise MethodError(
+            "stage equations must have as many blocks as rows of every size, and equally many of all "
+            f"sizes; got {counts}"
+        )
+    first = {size: sum(sizes[:k]) for k, size in enumerate(sizes)}
+    return UnknownLayout(first, columns, lines, sum(sizes))
+
+
+def _indices_of_size(size: int, sizes: Sequence[int]) -> tuple[int, ...]:
+    return tuple(place for place, each in enumerate(sizes) if each == size)
+
+
+Pairs = Iterable[tuple[int, int]]
+
+
+def bandwidth(pairs: Pairs, positions: tuple[int, ...]) -> int:
+    """Return the largest distance of two coupled coordinates in an ordering.
+
+    >>> bandwidth([(0, 2), (1, 2)], (0, 1, 2))
+    2
+    """
+    return max((abs(positions[i] - positions[j]) for i, j in pairs), default=0)
+
+
+def bandwidth_ordering(pairs: Pairs, count: int) -> tuple[int, ...]:
+    """Return the position of each coordinate: the original order, or reverse Cuthill-McKee if that is narrower.
+
+    >>> bandwidth_ordering([(0, 2), (1, 2)], 3)
+    (2, 0, 1)
+    """
+    coupled = {(max(pair), min(pair)) for pair in pairs if pair[0] != pair[1]}
+    original = tuple(range(count))
+    if bandwidth(coupled, original) <= 1 or 2 * len(coupled) == count * (count - 1):
+        return original
+    found = _cuthill_mckee(coupled, count)
+    return found if bandwidth(coupled, found) < bandwidth(coupled, original) else original
+
+
+def _cuthill_mckee(coupled: set[tuple[int, int]], count: int) -> tuple[int, ...]:
+    # Imported here because SciPy is slow to import and most systems do not need it.
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    rows, columns = np.array(sorted(coupled | {(j, i) for i, j in coupled})).T
+    graph = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    return tuple(int(place) for place in np.argsort(order))
+
 
 MOST_PAIRS_COMPARED, LARGEST_DIFFERENCE = 16, mp.mpf(10) ** -20
 """Number of pairs of mixed derivatives that are compared by value, and their largest relative difference."""

@@ -31,8 +31,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import MODEL, example_of, model_text
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
-from scvi_codegen.rendering.fmu import with_fmu
-from scvi_codegen.rendering.program_source import ExampleRun
+from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, TEXTS, checks_arguments
 from scvi_codegen.version import __version__

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel
-from scvi_codegen.ir.kernel_parts import Part, parts
+from scvi_codegen.ir.kernel import Constant, Kernel, Load, LoopedKernel, Part, parts
 from scvi_codegen.rendering.layout import table, wrapped, wrapped_comment, wrapped_prototype
 from scvi_codegen.rendering.printer import ARRAYS, print_lane_statements, print_statements
 from scvi_codegen.rendering.simd import Lanes

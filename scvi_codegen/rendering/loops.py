@@ -9,17 +9,25 @@ from math import prod
 from typing import Any
 
 from scvi_codegen.indices import Array
-from scvi_codegen.ir.constraints import ConstrainedSteps
-from scvi_codegen.ir.kernel import Kernel, LoopedKernel
-from scvi_codegen.ir.kernel_parts import is_divided
+from scvi_codegen.ir.equations import ConstrainedSteps
+from scvi_codegen.ir.kernel import Kernel, LoopedKernel, is_divided
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.functions import kernel_text
-from scvi_codegen.rendering.loop_nests import DIRECTION, Nest
+from scvi_codegen.rendering.loop_nests import (
+    DIRECTION,
+    MOST_THREADS,
+    Nest,
+    Sharing,
+    count_text,
+    product_text,
+    sharing_of,
+    sharing_text,
+    size_text,
+    sizes_text,
+)
 from scvi_codegen.rendering.printer import inverse_roots, scalar_functions
 from scvi_codegen.rendering.simd import LIBRARY, POINTS, IterationSource, iteration_source
-from scvi_codegen.rendering.sizes import count_text, product_text, size_text, sizes_text
 from scvi_codegen.rendering.target import DOUBLE
-from scvi_codegen.rendering.thread_partition import MOST_THREADS, Sharing, sharing_of, sharing_text
 
 __all__ = ["loop_context"]
 

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias
 
 from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation
-from scvi_codegen.ir.kernel_parts import Part, kept_length, parts
+from scvi_codegen.ir.kernel import Constant, Expression, Kernel, Load, Operation, Part, kept_length, parts
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.rendering.target import DOUBLE, Target
 

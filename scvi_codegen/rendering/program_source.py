@@ -8,23 +8,19 @@ loops over the program's tables and the C that does not depend on it. Kernels ar
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
-from scvi_codegen.ir.control import Control
 from scvi_codegen.ir.derivatives import Derivatives
-from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
-from scvi_codegen.ir.kernel import Kernel
-from scvi_codegen.ir.kernel_parts import is_divided
+from scvi_codegen.ir.iteration import Control, FixedPointIteration, StoredValues
+from scvi_codegen.ir.kernel import Kernel, is_divided
 from scvi_codegen.ir.program import Program
-from scvi_codegen.rendering.control import predictor_text
 from scvi_codegen.rendering.convergence import INPUT_PRECISION, LARGEST_VIOLATION, MAX_ITERATIONS, ROUNDING_UNITS
 from scvi_codegen.rendering.environment import support_text, template_environment
-from scvi_codegen.rendering.fallback import Fallback
 from scvi_codegen.rendering.loops import loop_context
 from scvi_codegen.rendering.printer import constants, inverse_roots
-from scvi_codegen.rendering.simd import POINTS, TRAJECTORIES, iteration_source
+from scvi_codegen.rendering.simd import POINTS, TRAJECTORIES, Fallback, iteration_source, predictor_text
 from scvi_codegen.rendering.source import Interface, Source, included
 from scvi_codegen.rendering.target import DOUBLE, SINGLE, Target
 from scvi_codegen.rendering.unrolled_equations import unrolled_equations
@@ -40,7 +36,9 @@ __all__ = [
     "render_embedded",
     "render_events",
     "render_example",
+    "with_fmu",
 ]
+
 
 Embedded: TypeAlias = Literal["double", "single"]
 """Precision of C source for a microcontroller."""
@@ -314,3 +312,42 @@ def _lane_context(program: Program, fallback: Fallback, beside: Sequence[Kernel]
 def _size(fixed_point: FixedPointIteration) -> int:
     """Return the number of operations of all kernels on lanes."""
     return sum(sum(kernel.operation_counts().values()) for kernel in fixed_point.kernels)
+
+
+def with_fmu(
+    source: Source,
+    interface: Interface,
+    start: ExampleRun,
+    *,
+    by_velocity: bool,
+    input_indices: Sequence[int],
+    token: str,
+) -> Source:
+    """Return the source of an integrator with the functions of FMI.
+
+    Args:
+        source, interface: of the integrator.
+        start: initial state, with velocities instead of p if ``by_velocity``; parameters, time, and the step size.
+        by_velocity: whether initial velocities are set instead of momenta.
+        input_indices: index of the first parameter of each input.
+        token: instantiation token of the model description.
+    """
+    context = {
+        "interface": interface,
+        "prefix": interface.prefix,
+        "start": start,
+        "by_velocity": by_velocity,
+        "places": input_indices,
+        "token": token,
+        "target": DOUBLE,
+    }
+    environment = template_environment()
+    code = environment.get_template("fmu.c.jinja").render(context)
+    beside = Source(
+        prefix=f"{interface.prefix}_fmu",
+        header=environment.get_template("fmu.h.jinja").render(context),
+        code=code,
+        declarations="",
+        support=included(code, support_text),
+    )
+    return replace(source, beside=beside)

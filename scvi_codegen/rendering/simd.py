@@ -2,22 +2,42 @@
 
 A lane is a point of a step of one trajectory, or one of many trajectories; the source of the iterations is the same for
 both (``templates/support``), and so are the kernels except for the variables that differ between lanes.
+
+If the iteration fails, Newton's method is the fallback, in the same or in a second library. Its kernels contain second
+derivatives of the Lagrangian: for larger systems they are most of the source, and of the time of derivation and
+compilation, and most runs never need them. So a source that is compiled here has only the fixed-point iteration and
+uses a second library, compiled when the iteration first fails; an exported source includes Newton's method. The second
+library is set once, for all steppers of a source: one generator makes one Newton solver for the same iteration.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
-from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
+from scvi_codegen.ir.iteration import AdaptivePredictor, FixedPointIteration, StoredValues
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.numbers import Number, NumberTable
-from scvi_codegen.rendering.fallback import Fallback
 from scvi_codegen.rendering.layout import table
 from scvi_codegen.rendering.printer import INVERSE_ROOT, Sources, lane_functions, print_number
 from scvi_codegen.rendering.target import DOUBLE
 
-__all__ = ["LIBRARY", "POINTS", "TRAJECTORIES", "IterationSource", "Lanes", "iteration_source"]
+__all__ = [
+    "LIBRARY",
+    "POINTS",
+    "TRAJECTORIES",
+    "Fallback",
+    "IterationSource",
+    "Lanes",
+    "iteration_source",
+    "predictor_text",
+]
+
+
+Fallback: TypeAlias = Literal["own", "external", "provided", "none"]
+"""Fallback of a source: its own, that of another library (``external``), one for others (``provided``), or none."""
+
 
 LIBRARY = ("sin", "cos", "exp", "log", "pow")
 """Functions that glibc's libmvec has for every x86-64 vector width since 2.22."""
@@ -129,7 +149,7 @@ def iteration_source(
             "FINAL_ITERATIONS": str(fixed_point.final_iterations),
             **{name: str(value) for name, value in fixed_point.facts.items()},
         },
-        functions=tuple(map(_function, sorted(functions))),
+        functions=tuple(map(_vector_function, sorted(functions))),
         tables=tuple(_tables(fixed_point, meaning, changes=changes)),
         kernels=kernels,
         mass=mass,
@@ -157,7 +177,7 @@ def _kept(fixed_point: FixedPointIteration) -> dict[str, str]:
     }
 
 
-def _function(name: str) -> str:
+def _vector_function(name: str) -> str:
     """Return the line that defines a function of vectors."""
     if name.startswith(INVERSE_ROOT):
         k = int(name.removeprefix(INVERSE_ROOT))
@@ -186,3 +206,25 @@ def _table(name: str, numbers: tuple[Number, ...] | NumberTable, points: int = 0
     size = f"[{points}][{points}]" if points else "[POINTS * GROUPS]"
     lines = [[print_number(x) for x in row] for row in rows]
     return table(f"static const {kind} {name}{size}", lines, braces=bool(points))
+
+
+HEAD = "/* Predictor tables from former steps to the next, by changes of the step-size level. Requires: points.h. */\n"
+
+
+def predictor_text(predictor: AdaptivePredictor) -> str:
+    """Return the header."""
+    return HEAD + "".join(f"{table}\n" for table in _predictor_tables(predictor))
+
+
+def _predictor_tables(predictor: AdaptivePredictor) -> Iterator[str]:
+    """Yield the tables from stored values to predicted ones: of the last step, and of each of the last two."""
+    changes, size = len(predictor.alone), "[POINTS * GROUPS]"
+    yield table(f"static const lanes PREDICTOR_ALONE[{changes}]{size}", [_columns(each) for each in predictor.alone])
+    for name, lines in (("LAST", predictor.last), ("BEFORE", predictor.before)):
+        rows = [[f"{{{', '.join(_columns(each))}}}" for each in line] for line in lines]
+        yield table(f"static const lanes PREDICTOR_{name}[{changes}][{changes}]{size}", rows)
+
+
+def _columns(rows: NumberTable) -> list[str]:
+    """Return the table by columns: the contributions of point j to all points."""
+    return [print_number(number) for column in zip(*rows, strict=True) for number in column]

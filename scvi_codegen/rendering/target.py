@@ -1,4 +1,4 @@
-"""Scalar types of C, and their rounding, literals and libm functions.
+"""Scalar types of C, their rounding, literals and libm functions.
 
 The numbers of a program are exact; a target determines how they are rounded and printed, and which functions of libm
 take them. The support headers use the header of its name.

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TypeAlias
 
+from scvi_codegen.ir.equations import LoweredStageGroup
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import FEW_UNKNOWNS, Program
-from scvi_codegen.ir.stage_groups import LoweredStageGroup
 from scvi_codegen.rendering.layout import wrapped
 from scvi_codegen.rendering.printer import print_number
 from scvi_codegen.rendering.target import Target

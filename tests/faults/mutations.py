@@ -38,8 +38,7 @@ from sabotage import changed_property, changed_result, of_entries
 from scvi_codegen.formulas import derivatives
 from scvi_codegen.ir import arithmetic, numbers
 from scvi_codegen.lowering import stage_groups
-from scvi_codegen.lowering.solvers import collocation as collocation_iteration
-from scvi_codegen.lowering.solvers import separable
+from scvi_codegen.lowering.solvers import curves, points
 from scvi_codegen.mechanics import derived_expressions as mechanics
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.methods import (
@@ -213,7 +212,7 @@ MUTATIONS = (
     here(
         "the product of two tables for another",
         case("kepler/gauss"),
-        separable,
+        points,
         "matrix_product",
         lambda original: lambda a, b: original(transposed(a), b) if len(a) > 1 else original(a, b),
     ),
@@ -230,7 +229,7 @@ MUTATIONS = (
     function(
         "L_q and L_v exchanged at both ends",
         case("kepler/printed"),
-        collocation_iteration,
+        curves,
         "_printed_ends",
         changed_result(lambda ends: replace(ends, start_force=ends.end_force, end_force=ends.start_force)),
     ),

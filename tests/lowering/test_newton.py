@@ -20,8 +20,7 @@ from scvi_codegen import (
 )
 from scvi_codegen.errors import MethodError, StepFailedError
 from scvi_codegen.ir.program import LEAST_REUSED_UNKNOWNS
-from scvi_codegen.lowering.stage_groups import lowered_stage_group
-from scvi_codegen.lowering.unknown_layout import layout_of
+from scvi_codegen.lowering.stage_groups import layout_of, lowered_stage_group
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.rendering.program_source import workspace_size

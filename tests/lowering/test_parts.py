@@ -5,7 +5,7 @@ import pytest
 
 import scvi_codegen as sc
 from scvi_codegen.files.cache import CACHE_VARIABLE
-from scvi_codegen.ir import kernel_parts as cutting
+from scvi_codegen.ir import kernel as cutting
 from scvi_codegen.ir.kernel import Constant, Kernel, Load, Operation
 from scvi_codegen.native.building import PORTABLE_FLAGS
 

@@ -19,7 +19,7 @@ import scvi_codegen
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.exact.step import DerivedStep
-from scvi_codegen.lowering.unknown_layout import layout_of
+from scvi_codegen.lowering.stage_groups import layout_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.galerkin import SVI

@@ -8,7 +8,7 @@ from either_system import either_system
 from style import check_style
 
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
-from scvi_codegen.lowering.solvers.predictor_tables import control_of
+from scvi_codegen.lowering.control import control_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
 from scvi_codegen.rendering.program_source import render

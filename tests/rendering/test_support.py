@@ -13,7 +13,7 @@ from programs import needs
 
 from scvi_codegen import SVI, SolverOptions, compile_stepper, problem
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.lowering.solvers.predictor_tables import REACH
+from scvi_codegen.lowering.control import REACH
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.rendering.source import Source
 

@@ -21,7 +21,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
-from scvi_codegen.rendering.thread_partition import Sharing, sharing_of
+from scvi_codegen.rendering.loop_nests import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)
 THREADS = (1, 2, 3, 5)

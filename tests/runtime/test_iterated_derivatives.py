@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from samples import fixed_point, tangle
 
 from scvi_codegen import SVI, Gauss, LagrangianSystem, StepFailedError, compile_stepper, problem
-from scvi_codegen.lowering import point_derivatives
+from scvi_codegen.lowering import derivatives
 from scvi_codegen.native.options import SolverOptions
 
 WHIRL = LagrangianSystem.from_text(
@@ -105,10 +105,10 @@ def test_steps_beyond_the_limit_of_iterations_are_differentiated_by_factorisatio
 def test_large_jacobians_are_factorised(monkeypatch):
     system = problem("kepler").system
     found = fixed_point(system, SVI(2))
-    partials = point_derivatives.point_derivatives_of(system, found)
+    partials = derivatives.point_derivatives_of(system, found)
     assert partials is not None
-    monkeypatch.setattr(point_derivatives, "MOST_DERIVATIVES", partials.count + len(partials.given.entries) - 1)
-    assert point_derivatives.point_derivatives_of(system, found) is None
+    monkeypatch.setattr(derivatives, "MOST_DERIVATIVES", partials.count + len(partials.given.entries) - 1)
+    assert derivatives.point_derivatives_of(system, found) is None
 
 
 def test_convergence_does_not_depend_on_units_of_coordinates():

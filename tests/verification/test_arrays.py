@@ -17,7 +17,7 @@ from samples import QUICK_FLAGS
 import scvi_codegen as sc
 from scvi_codegen import compiler
 from scvi_codegen.cli import main
-from scvi_codegen.ir.control import Control
+from scvi_codegen.ir.iteration import Control
 from scvi_codegen.ir.program import Program
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.rendering.source import Source

@@ -1,7 +1,9 @@
-"""Rolling of repeated terms into loops: a system of many similar terms becomes an array system, compiled once.
+"""Rolling of repeated terms into loops, and unrolling for known sizes.
 
-Terms that differ only in their coordinates, parameters and numbers form one group, sum(b in B, f(q[at[b, 0]],
-q[at[b, 1]], c[b])), with an index table and arrays of numbers.
+A system of many similar terms becomes an array system, compiled once: terms that differ only in their coordinates,
+parameters and numbers form one group, sum(b in B, f(q[at[b, 0]], q[at[b, 1]], c[b])), with an index table and arrays of
+numbers. For known sizes, an array system has an equivalent system of named coordinates, which has every feature; its
+integrator is derived independently, so the two can be compared.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sympy import Add, Expr, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
@@ -20,13 +22,16 @@ from scvi_codegen.formulas.arrays import ArrayTerm, term_of
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.symbols import DOT, symbol
 from scvi_codegen.indices import Access, Array, Loop, Place, Size
-from scvi_codegen.mechanics.arrays.system import ArrayHamiltonian, ArrayLagrangian, ArraySystem
+from scvi_codegen.mechanics.arrays.elements import unrolled_fields
+from scvi_codegen.mechanics.arrays.system import ARRAYS, ArrayHamiltonian, ArrayLagrangian, ArraySystem
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.mechanics.term_groups import MAX_GROUPS, SimilarTerms, TermGroup, similar_terms
 from scvi_codegen.representation import summary
-from scvi_codegen.validation.argument_types import checks_arguments
+from scvi_codegen.validation.argument_types import MAPPING, checks_arguments
 
-__all__ = ["RolledSums", "roll_sums"]
+__all__ = ["RolledSums", "roll_sums", "unroll_sums"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,3 +186,33 @@ class _Rolled:
         """Yield the arrays of constants with their values."""
         for slot, column in zip(self.group.constants, self.group.values, strict=True):
             yield self.accesses[slot].array, np.array([float(defaults.get(each, each)) for each in column])
+
+
+@checks_arguments(SystemDefinitionError, system=ARRAYS, sizes=MAPPING, tables=MAPPING, parameters=MAPPING)
+def unroll_sums(
+    system: ArraySystem | MechanicalSystem,
+    sizes: Mapping[str, int],
+    *,
+    tables: Mapping[str, ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
+) -> MechanicalSystem:
+    """Return the system of the coordinates q_0, q_1, .. (r_0_0, r_0_1, ..), the last axis of an array running fastest.
+
+    Args:
+        system: the system of arrays to unroll.
+        sizes: value of every size; those of tables may be left out.
+        tables: index tables of shape (rows, columns) by name.
+        parameters: numbers and arrays by name, others keep their defaults; entries of arrays become parameters k_0, ..
+
+    Raises:
+        SystemDefinitionError: for unknown names, wrong shapes, and an index outside its array.
+
+    >>> chain = LagrangianSystem.from_text(
+    ...     name="chain", coordinates=["q[N]"],
+    ...     lagrangian="sum(i in N, q_dot[i]**2/2) - sum(i in 0..N-2, (q[i+1] - q[i])**2/2)")
+    >>> unroll_sums(chain, {"N": 2}).formula
+    q_0_dot**2/2 + q_1_dot**2/2 - (-q_0 + q_1)**2/2
+    """
+    assert isinstance(system, ArraySystem)
+    kind = HamiltonianSystem if system.momenta else LagrangianSystem
+    return kind(**unrolled_fields(system, sizes, tables, parameters))

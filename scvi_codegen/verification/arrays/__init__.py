@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.lowering.arrays import one_coordinate
+from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import ARRAYS, ArraySystem
-from scvi_codegen.mechanics.arrays.unrolling import unroll_sums
 from scvi_codegen.methods import as_method
 from scvi_codegen.methods.method import Method
 from scvi_codegen.native.building import TUNED_FLAGS

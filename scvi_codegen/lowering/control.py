@@ -1,9 +1,14 @@
-"""Tables for adaptive step sizes on the grid h = 2^(k/4).
+"""Adaptive step sizes on the grid h = 2^(k/4), and the step density of a time transformation.
 
 The stored values of the last step, or of the last two, are extrapolated into the next by least-squares polynomials
-(:mod:`scvi_codegen.lowering.solvers.simd_padding`); the grid has few ratios of step sizes, each with its own table. As
+(:mod:`scvi_codegen.lowering.solvers.tables`); the grid has few ratios of step sizes, each with its own table. As
 predictors they need only double precision, by Stieltjes' procedure (Gautschi, *Orthogonal Polynomials*, 2004, section
 2.2), in sums that round the same on all platforms.
+
+With a time transformation dt = g dtau the density rho = 1/g has an equation of motion, drho/dtau = -d(log g)/dt along
+the motion. Explicit leapfrog steps of rho between the steps of a symmetric method give a method that is symmetric on
+(q, p, rho), for any system, also time-dependent or forced. Source: E. Hairer, G. Soederlind, SIAM J. Sci. Comput. 26
+(2005), section 2.
 """
 
 from __future__ import annotations
@@ -11,13 +16,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scvi_codegen.ir.control import AdaptivePredictor, Control
-from scvi_codegen.ir.iteration import FixedPointIteration, StoredValues
+import sympy
+from sympy import Expr
+
+from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.ir.iteration import AdaptivePredictor, Control, FixedPointIteration, StoredValues
 from scvi_codegen.ir.numbers import Number, NumberTable
 from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.solvers.simd_padding import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
+from scvi_codegen.lowering.kernels import system_kernel
+from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
+from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
 
-__all__ = ["control_of", "predictor_of"]
+__all__ = ["control_of", "density_of", "predictor_of"]
+
 
 LEVELS_PER_BINADE, REACH = 4, 2
 """Levels per factor of two, and the largest change of level for which the predictor is available."""
@@ -47,12 +60,12 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
         _doubles(fixed_point.guess.abscissae),
         [2.0 ** (change / LEVELS_PER_BINADE) for change in range(-REACH, REACH + 1)],
     )
-    alone = _tables(fixed_point, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
+    alone = _tables_by_ratio(fixed_point, ratios, points, min(len(points) - 1, DEGREE_OF_ONE), (1.0,))
     pairs = []
     for ratio in ratios:
         sources = (*points, *((x - 1.0) / ratio for x in points))
         most = min(len(set(sources)) - 1, max(2 * len(points) - 2, INTERPOLATED), DEGREE_OF_TWO)
-        pairs.append(_tables(fixed_point, ratios, sources, most, (1.0, ratio)))
+        pairs.append(_tables_by_ratio(fixed_point, ratios, sources, most, (1.0, ratio)))
     return AdaptivePredictor(
         reach=REACH,
         alone=tuple(table for (table,) in alone),
@@ -62,7 +75,7 @@ def predictor_of(fixed_point: FixedPointIteration) -> AdaptivePredictor:
     )
 
 
-def _tables(
+def _tables_by_ratio(
     fixed_point: FixedPointIteration,
     ratios: Sequence[float],
     sources: Sequence[float],
@@ -126,3 +139,31 @@ def _padded(rows: list[list[float]], through: NumberTable, lanes: int) -> Number
         ]
     wide = [(*row, *(0.0,) * (lanes - count)) for row in rows]
     return (*wide, *(wide[-1],) * (lanes - count))
+
+
+def density_of(system: MechanicalSystem, g: str | Expr) -> Control:
+    """Return the step density of a time-rescaling function of the system.
+
+    Args:
+        system: in physical time.
+        g: as in :func:`~scvi_codegen.mechanics.time_rescaling.time_rescaling_function`, or of time.
+
+    Raises:
+        SystemDefinitionError: for an invalid time-rescaling function.
+    """
+    rate = time_rescaling_function(system, g, in_time=True)
+    forms = forms_of(system)
+    rates = dict(zip(system.coordinates, forms.legendre if system.auxiliaries else system.velocities, strict=True))
+    if system.auxiliaries:
+        rates |= dict(zip(system.auxiliaries, forms.momentum_rate, strict=True))
+    rates[system.time] = sympy.S.One
+    variables = list(rates)
+    change = sympy.Add(*(derivative * rates[variables[i]] for i, derivative in gradient(rate, variables).items()))
+    kernel = system_kernel(
+        system,
+        "density",
+        (1 / rate, -change / rate),
+        of=forms.legendre_arguments,
+        purpose=f"1/g and -d(log g)/dt of the time rescaling g at u = {'(q, p)' if system.auxiliaries else '(q, v)'}.",
+    )
+    return Control(density=kernel)

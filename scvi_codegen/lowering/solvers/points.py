@@ -1,0 +1,211 @@
+"""Fixed-point solvers on velocities, forces or momenta at the points of a step, in SIMD lanes.
+
+**Separable systems.** With a constant diagonal mass and forces of position and time the two tables of a method
+(positions from velocities, momenta from forces) are multiplied into one, q_n = q0 + h c_n v0 + h^2 sum_j product[n][j]
+F_j / m, for every SVI, for the Runge-Kutta methods, and for spectral collocation and the position forms as well; no
+matrix is factorised. A variational method is symplectic because its tables are adjoint; rounded to 53 bits they are not
+exactly, and the energy drifts. So they have 106 bits, including the powers of h. The low words are only used where they
+matter: in the last evaluation of the points and in the increments.
+
+**Hamiltonians.** No mass matrix, no Legendre transform: with positions and momenta at the points, one iteration
+computes forces, momenta, velocities and positions in turn, each from the latest of the others (Gauss-Seidel). Its
+convergence rate is h^2 if H = T(p) + V(q), and h at worst. H need not be regular.
+
+**Any regular Lagrangian.** Velocities are corrected by the mass matrix at each point: the equations are L_v(q_n, V_n) =
+P_n. If the points are not those of the velocities (an SVI with another quadrature), the s velocities z_b give V_n =
+sum_b l_nb z_b and the equations are projected: a correction is interpolated by l, solved with the mass at each point,
+and projected back. If masses depend on positions, a correction changes forces and momenta about as much as the residual
+it removes. So it is computed twice, the second time including its own first-order effect, by F_q, F_v and L_vq of the
+same kernel: one iteration then converges like two, and the final forces include the last correction. This saves a
+quarter of the time of a step of a swinging Atwood machine, 8 to 25 % for pendulums, carts and time-transformed systems.
+
+For a variational method the two tables are adjoint. With mu_nj = a_nj / beta_j, the scaled weights h beta_j rounded
+once and used in stages and updates alike, and A_nj / w_j = 1 - mu_jn, exact since mu is a multiple of 2^-51, the
+rounded map still has a generating function: its energy error does not drift.
+"""
+
+from __future__ import annotations
+
+import sympy
+from sympy import Expr
+
+from scvi_codegen.formulas.derivatives import jacobian
+from scvi_codegen.ir.iterations import CoupledIteration, HamiltonianIteration, SeparableIteration
+from scvi_codegen.lowering.kernels import damping_kernel, integrand_kernel, system_kernel
+from scvi_codegen.lowering.solvers.tables import (
+    MOST_LANES,
+    StepProblem,
+    VelocityTables,
+    lane_count,
+    pad_matrix,
+    pad_vector,
+    predictor_tables_of,
+    resolved_degree,
+    tableau_tables,
+    velocity_tables,
+)
+from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.methods.stage_structure import Accelerations, Velocities
+from scvi_codegen.tables.basis import matrix_product, transpose
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = ["coupled_iteration", "hamiltonian_iteration", "over", "separable_iteration", "weighted_tables"]
+
+
+def separable_iteration(problem: StepProblem, *, velocities: bool = False) -> SeparableIteration | None:
+    """Return the fixed-point iteration of a separable system; ``None`` for others, and with too many points.
+
+    With ``velocities`` it has the table of those at the points, and predicts forces instead of positions. Systems with
+    integrals are excluded, since it does not store the velocities. Position form and phase-space form are the same for
+    separable systems.
+    """
+    system, shape = problem.lagrangian, problem.shape
+    if system is None or not forms_of(system).separable or system.integrands:
+        return None
+    if isinstance(shape, Accelerations):
+        tables: VelocityTables | None = tableau_tables(shape.tableau.c, shape.tableau.A, shape.tableau.b)
+    else:
+        tables = velocity_tables(shape.unrounded or shape if isinstance(shape, Velocities) else None)
+    return _separable(system, tables, velocities=velocities) if tables else None
+
+
+def _separable(system: LagrangianSystem, tables: VelocityTables, *, velocities: bool) -> SeparableIteration | None:
+    lanes = lane_count(len(tables.abscissae))
+    if lanes > MOST_LANES:
+        return None
+    product = matrix_product(tables.position, tables.momentum)
+    drift = tuple(mp.fsum(line) for line in tables.position)
+    highest = min(len(tables.abscissae), len(tables.blocks)) - 1
+    guess = predictor_tables_of(tables.abscissae, lanes, through=None if velocities else product, degree=highest)
+    at_points = matrix_product(tables.velocity, tables.momentum) if tables.velocity else tables.momentum
+    forms = forms_of(system)
+    return SeparableIteration(
+        points=len(tables.abscissae),
+        lanes=lanes,
+        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
+        drift=pad_vector(drift, lanes, repeat=True),
+        product=pad_matrix(product, lanes),
+        end_position=pad_vector(matrix_product((tables.end_position,), tables.momentum)[0], lanes),
+        end_momentum=pad_vector(tables.end_momentum, lanes),
+        guess=guess,
+        force=system_kernel(system, "force_lanes", forms.force, of=system.coordinates, purpose="L_q at all points."),
+        mass=system_kernel(system, "mass", forms.mass.values(), of=(), purpose="The constant masses."),
+        velocity=pad_matrix(at_points, lanes) if velocities else (),
+    )
+
+
+def hamiltonian_iteration(problem: StepProblem) -> HamiltonianIteration | None:
+    """Return the fixed-point iteration of a Hamiltonian; ``None`` with too many or other points than velocities."""
+    system = problem.system
+    tables = velocity_tables(problem.shape) if system.auxiliaries else None
+    if tables is None or tables.velocity or system.damping != 0:
+        return None
+    lanes = lane_count(len(tables.abscissae))
+    if lanes > MOST_LANES:
+        return None
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
+    forms = forms_of(system)
+    of = forms.legendre_arguments
+    return HamiltonianIteration(
+        points=len(tables.abscissae),
+        lanes=lanes,
+        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
+        position=pad_matrix(position, lanes),
+        position_weights=pad_vector(position_weights, lanes),
+        momentum=pad_matrix(momenta, lanes),
+        momentum_weights=pad_vector(momentum_weights, lanes),
+        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
+        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
+        guess=predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables)),
+        kernel=system_kernel(system, "velocity_lanes", forms.legendre, of=of, purpose="H_p at all points, u = (q, p)."),
+        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="-H_q at all points, u = (q, p)."),
+        integrands=integrand_kernel(system, "integrand_lanes", of),
+    )
+
+
+FRACTION_BITS = 51
+MOST_LINEARISED = 8
+"""Largest number of coordinates with linearised forces; beyond, their derivatives cost more than they save."""
+
+
+def coupled_iteration(problem: StepProblem) -> CoupledIteration | None:
+    """Return the fixed-point iteration of a Lagrangian; ``None`` with too many points."""
+    system, tables = problem.lagrangian, velocity_tables(problem.shape)
+    return _coupled(system, tables) if system and tables else None
+
+
+def _coupled(system: LagrangianSystem, tables: VelocityTables) -> CoupledIteration | None:
+    points, blocks = len(tables.abscissae), len(tables.blocks)
+    lanes = lane_count(max(points, blocks))
+    if lanes > MOST_LANES:
+        return None
+    position, position_weights, momenta, momentum_weights = weighted_tables(tables)
+    guess = predictor_tables_of(tables.blocks, lanes, degree=resolved_degree(tables))
+    forms, of = forms_of(system), (*system.coordinates, *system.velocities)
+    followed = () if tables.projection else _linearised_forces(system)
+    evaluated = "L_q, L_v, their derivatives F_q, F_v and L_vq" if followed else "L_q, L_v"
+    return CoupledIteration(
+        points=points,
+        blocks=blocks,
+        lanes=lanes,
+        abscissae=pad_vector(tables.abscissae, lanes, repeat=True),
+        position=pad_matrix(position, lanes),
+        position_weights=pad_vector(position_weights, lanes),
+        momentum=pad_matrix(momenta, lanes),
+        momentum_weights=pad_vector(momentum_weights, lanes),
+        end_position=pad_vector(over(tables.end_position, position_weights), lanes),
+        end_momentum=pad_vector(over(tables.end_momentum, momentum_weights), lanes),
+        velocity=pad_matrix(tables.velocity, lanes) if tables.velocity else (),
+        projection=pad_matrix(tables.projection, lanes) if tables.projection else (),
+        guess=guess,
+        kernel=system_kernel(
+            system,
+            "point_lanes",
+            (*forms.force, *forms.momentum, *followed),
+            of=of,
+            partials=forms.lower_mass.values(),
+            purpose=f"{evaluated} and the lower triangle of L_vv at all points, u = (q, v).",
+        ),
+        force=system_kernel(system, "force_lanes", forms.force, of=of, purpose="L_q at all points."),
+        mass_entries=tuple(forms.lower_mass),
+        followed=bool(followed),
+        integrands=integrand_kernel(system, "integrand_lanes", of),
+        damping=damping_kernel(system),
+    )
+
+
+def _linearised_forces(system: LagrangianSystem) -> tuple[Expr, ...]:
+    """Return F_q, F_v and L_vq by rows, with their zeros, for few coordinates with position-dependent masses.
+
+    Nothing for other systems, whose iterations converge quickly.
+    """
+    forms, m, zero = forms_of(system), system.dimension, sympy.Integer(0)
+    if m > MOST_LINEARISED or not any(
+        entry.free_symbols & {*system.coordinates} for entry in forms.lower_mass.values()
+    ):
+        return ()
+    matrices = (
+        jacobian(forms.force, system.coordinates),
+        jacobian(forms.force, system.velocities),
+        jacobian(forms.momentum, system.coordinates),
+    )
+    return tuple(matrix.get((i, j), zero) for matrix in matrices for i in range(m) for j in range(m))
+
+
+def weighted_tables(tables: VelocityTables) -> tuple[Matrix, Vector, Matrix, Vector]:
+    """Return position table and weights, momentum table and weights, whose products are the method's own tables."""
+    beta, weights = tables.end_position, tables.end_momentum
+    if not tables.variational:
+        ones = (mp.one,) * len(beta)
+        return tables.position, ones, tables.momentum, ones
+    unit = mp.ldexp(1, FRACTION_BITS)
+    mu = tuple(tuple(mp.nint(x * unit) / unit for x in over(line, beta)) for line in tables.position)
+    if tables.projection:
+        return mu, beta, tuple(over(line, weights) for line in tables.momentum), weights
+    return mu, beta, transpose(tuple(tuple(1 - x for x in line) for line in mu)), weights
+
+
+def over(numbers: Vector, divisors: Vector) -> Vector:
+    """Return quotients, entry by entry."""
+    return tuple(x / y for x, y in zip(numbers, divisors, strict=True))

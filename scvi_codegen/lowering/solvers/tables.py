@@ -1,0 +1,241 @@
+"""Common interface and tables of the fixed-point solvers.
+
+A solver is a function from a problem to an iteration, or ``None``, a line in ``FIXED_POINTS``
+(:mod:`scvi_codegen.lowering.solvers.selection`), and a subclass of
+:class:`~scvi_codegen.ir.iteration.FixedPointIteration`, plain data, which declares the tables and the support headers
+from which :mod:`scvi_codegen.rendering.simd` renders C. Solvers share only the problem. They may rely on the following:
+
+* the tables of a shape are numbers of the method in 60 digits, also in the iteration; they are rounded when they are
+  printed, as double-double numbers if one rounding is not accurate enough;
+* the tables of an iteration are padded to its lanes: lanes beyond the last real point repeat it (its row, its abscissa)
+  and have weight 0. They are in the domain of the Lagrangian whenever it is, and never delay convergence;
+* an iteration that does not converge costs time, not correctness: Newton's method follows it.
+
+A method whose unknowns are velocities has two tables, positions from velocities and momenta from forces,
+
+    q_n = q0 + h sum_b position[n][b] V_b,    P_b = p0 + h sum_n momentum[b][n] F_n,
+
+with q1 and p1 by the rows ``end_position`` and ``end_momentum``. The solvers of separable and of coupled systems are
+both derived from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from scvi_codegen.ir.iteration import FixedPointIteration, PredictorTables
+from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
+from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.stage_structure import Velocities
+from scvi_codegen.methods.stage_system import Shape
+from scvi_codegen.tables.basis import continuation, extrapolation, legendre_functional, matrix_product, transpose
+from scvi_codegen.tables.precision import Matrix, Vector, mp
+
+__all__ = [
+    "MOST_LANES",
+    "Solver",
+    "StepProblem",
+    "VelocityTables",
+    "lane_count",
+    "pad_matrix",
+    "pad_vector",
+    "predictor_tables_of",
+    "resolved_degree",
+    "tableau_tables",
+    "velocity_tables",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class StepProblem:
+    """A system, and the shape of its stage equations."""
+
+    system: MechanicalSystem
+    shape: Shape | None
+
+    @property
+    def lagrangian(self) -> LagrangianSystem | None:
+        """The system itself, or for a Hamiltonian that of its Lagrangian, if one is found.
+
+        Both have the same step (35f).
+        """
+        return equivalent_lagrangian(self.system)
+
+
+Solver: TypeAlias = Callable[[StepProblem], FixedPointIteration | None]
+
+
+MOST_LANES = 32
+DEGREE_OF_ONE, DEGREE_OF_TWO = 8, 12
+"""Degrees of the polynomials through the last step, or through the last two, that are extrapolated into the next.
+
+Higher degrees are more accurate, but amplify rounding errors, by about 1e6 for these.
+"""
+INTERPOLATED = 5
+"""Degree up to which the polynomial of two steps interpolates all points; above, least squares predict better."""
+
+
+def lane_count(points: int) -> int:
+    """Return the power of two, at least 2, that is not less than the number of points."""
+    return max(2, 1 << (points - 1).bit_length())
+
+
+def pad_matrix(entries: Matrix, lanes: int) -> NumberTable:
+    """Return the padded table: rows beyond the last repeat it, columns beyond are zero."""
+    return lower_matrix(_wide(entries, lanes))
+
+
+def pad_vector(entries: Vector, lanes: int, *, repeat: bool = False) -> tuple[Number, ...]:
+    """Return the padded vector; further entries are zero, or repeat the last."""
+    return lower_vector(_longer(entries, lanes, repeat=repeat))
+
+
+def predictor_tables_of(
+    abscissae: Vector, lanes: int, *, through: Matrix | None = None, degree: int | None = None
+) -> PredictorTables:
+    """Return the predictor tables from values at the points in the last one or two steps to those in the next.
+
+    ``through``: a matrix to apply to the prediction; ``degree``: of the leading coefficient that the method resolves,
+    by default the highest that the points determine.
+    """
+    highest = len(abscissae) - 1 if degree is None else degree
+    alone = extrapolation(abscissae, 1, min(len(abscissae) - 1, DEGREE_OF_ONE))
+    distinct = len({*abscissae, *(x - 1 for x in abscissae)})  # one fewer if both ends of a step are points
+    through_most = max(2 * len(abscissae) - 2, INTERPOLATED)
+    tables: tuple[Matrix, ...] = (alone, *continuation(abscissae, min(distinct - 1, through_most, DEGREE_OF_TWO)))
+    if through is not None:
+        tables = tuple(matrix_product(through, table) for table in tables)
+    last_alone, last, before = (pad_matrix(table, lanes) for table in tables)
+    return PredictorTables(
+        abscissae=lower_vector(abscissae),
+        degree=highest,
+        highest=pad_vector(legendre_functional(abscissae, highest), lanes),
+        next=pad_vector(legendre_functional(abscissae, highest - 1), lanes),
+        last_alone=last_alone,
+        last=last,
+        before=before,
+    )
+
+
+def _wide(entries: Matrix, lanes: int) -> Matrix:
+    wide = tuple(_longer(line, lanes) for line in entries)
+    return (*wide, *(wide[-1],) * (lanes - len(wide)))
+
+
+def _longer(entries: Vector, lanes: int, *, repeat: bool = False) -> Vector:
+    return (*entries, *((entries[-1] if repeat else mp.zero),) * (lanes - len(entries)))
+
+
+CONSISTENT = 1e-12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelocityTables:
+    """Tables in 60 digits.
+
+    Attributes:
+        abscissae: (g,) of the points; blocks: (s,) abscissae of the velocities.
+        position: (g, s); momentum: (s, g); end_position: (s,); end_momentum: (g,).
+        velocity, projection: (g, s) from the s velocities to those at the points, (s, g) back; empty if they are the
+            same.
+        variational: whether ``momentum`` is the adjoint of ``position``: beta_b momentum[b][n] = w_n (beta_b -
+            position[n][b]) (summed over the projection, if there is one).
+    """
+
+    abscissae: Vector
+    blocks: Vector
+    position: Matrix
+    momentum: Matrix
+    end_position: Vector
+    end_momentum: Vector
+    velocity: Matrix
+    projection: Matrix
+    variational: bool
+
+
+def velocity_tables(shape: Shape | None) -> VelocityTables | None:
+    """Return the tables of stage equations; ``None`` for other shapes, or if velocities do not determine the curve."""
+    if not isinstance(shape, Velocities):
+        return None
+    if shape.variational:
+        return _variational_tables(shape)
+    return tableau_tables(shape.abscissae, shape.position, shape.weights)
+
+
+def resolved_degree(tables: VelocityTables) -> int:
+    """Return the highest degree of the momenta along a step that forces reach; higher Legendre coefficients are 0.
+
+    The momenta of a Lobatto IIIA-IIIB pair of s stages have degree s - 2. A coefficient that vanishes for all forces is
+    no error estimate.
+    """
+    for degree in range(len(tables.blocks) - 1, 0, -1):
+        (line,) = matrix_product((legendre_functional(tables.blocks, degree),), tables.momentum)
+        if max(map(abs, line)) > CONSISTENT:
+            return degree
+    return 0
+
+
+def tableau_tables(abscissae: Vector, A: Matrix, b: Vector) -> VelocityTables:
+    """Return the tables of a Runge-Kutta method in phase space."""
+    return VelocityTables(
+        abscissae=abscissae,
+        blocks=abscissae,
+        position=A,
+        momentum=A,
+        end_position=b,
+        end_momentum=b,
+        velocity=(),
+        projection=(),
+        variational=False,
+    )
+
+
+def _variational_tables(shape: Velocities) -> VelocityTables | None:
+    """Return the adjoint pair; if the velocities are not those at the points, with the projected equations."""
+    beta, weights = shape.end, shape.weights
+    if any(x == 0 for x in beta):
+        return None
+    rest = tuple(tuple(b - x for x in column) for b, column in zip(beta, transpose(shape.position), strict=True))
+    projection: Matrix = ()
+    if _is_identity(shape.velocity):
+        adjoint: Matrix = tuple(tuple(x / b for x in line) for b, line in zip(beta, rest, strict=True))
+    else:
+        inverse = _inverse_stiffness(shape.velocity, weights)
+        if inverse is None or max(abs(mp.fdot(line, beta) - 1) for line in inverse) > CONSISTENT:
+            return None
+        adjoint = matrix_product(inverse, rest)
+        projection = _columns_scaled(matrix_product(inverse, transpose(shape.velocity)), weights)
+    return VelocityTables(
+        abscissae=shape.abscissae,
+        blocks=shape.blocks if projection else shape.abscissae,
+        position=shape.position,
+        momentum=_columns_scaled(adjoint, weights),
+        end_position=beta,
+        end_momentum=weights,
+        velocity=shape.velocity if projection else (),
+        projection=projection,
+        variational=True,
+    )
+
+
+def _is_identity(entries: Matrix) -> bool:
+    square = len(entries) == len(entries[0])
+    return square and all(x == int(n == b) for n, line in enumerate(entries) for b, x in enumerate(line))
+
+
+def _inverse_stiffness(velocity: Matrix, weights: Vector) -> Matrix | None:
+    """Return K^-1, K = l^T w l: it solves beta_b p1 = sum_n w_n (h a_nb L_q + l_nb L_v) for constant mass."""
+    stiffness = mp.matrix(matrix_product(_columns_scaled(transpose(velocity), weights), velocity))
+    try:
+        inverse = mp.inverse(stiffness)
+    except ZeroDivisionError:
+        return None
+    return tuple(tuple(inverse[i, j] for j in range(inverse.cols)) for i in range(inverse.rows))
+
+
+def _columns_scaled(entries: Matrix, factors: Vector) -> Matrix:
+    return tuple(tuple(x * w for x, w in zip(line, factors, strict=True)) for line in entries)
