@@ -12,12 +12,21 @@ from golden_cells import CELLS, program
 from programs import needs
 
 SANITIZED = ("gcc", "-std=gnu99", "-O0", "-g", "-w", "-DSCVI_THREADS", "-pthread", "-fsanitize=address,undefined")
-QUICK = ("swings", "forms_adaptive", "ring_newton", "double_tangent")
-"""Constraints, several arrays of different sizes, the Fourier preconditioner, derivatives."""
+QUICK = (
+    *("swings", "forms_adaptive", "ring_newton"),
+    *("kepler_fallback", "kepler_many", "rods_newton", "vibration_adaptive", "double_tangent", "kepler_second"),
+)
+"""Arrays: constraints, several sizes, the Fourier preconditioner. Named coordinates: single steps and runs by both
+solvers, ensembles, constraints, adaptive steps of a Hamiltonian, first and second derivatives."""
 
 
 def with_exact_arrays(main: str, *, hamiltonian: bool) -> str:
     """Return the program with an allocation of its own for every array of a run that need not follow another one."""
+    if named := re.search(r"static double work\[(\w+)\],", main):  # named coordinates
+        main = main.replace(named[0], "static double *work,")
+        return main.replace("arguments)\n{\n", f"arguments)\n{{\n  work = calloc({named[1]}, 8);\n").replace(
+            "main(void)\n{\n", f"main(void)\n{{\n  work = calloc({named[1]}, 8);\n"
+        )
     work = re.search(r"run\.q = x \+ (\w+) \* n,", main)
     if work is None:
         return main
