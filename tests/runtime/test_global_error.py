@@ -740,6 +740,8 @@ def test_growth_check_of_linear_systems_is_scale_invariant(power):
 def test_runs_for_comparison_start_from_states_that_differ_in_the_last_place():
     """The errors of runs from equal initial states could be equal."""
     for x in np.random.default_rng(3).uniform(1.0, 2.0, size=50) * 2.0 ** np.arange(-25, 25):
-        several = [perturbed([x, x, x], number) for number in range(4)]
-        assert all(0.0 < abs(perturbed([x], number)[0] - x) <= 2.0 * np.spacing(x) for number in range(4))
-        assert all((one != other).any() for one, other in combinations(several, 2))
+        for size in (1, 3):
+            found = [perturbed([x] * size, number) for number in range(3)]
+            assert all((one != other).any() for one, other in combinations(found, 2))
+            assert all(np.all(abs(each - x) <= 6.0 * np.spacing(x)) for each in found)
+            assert all(np.all(each != x) for each in found)

@@ -166,13 +166,14 @@ def checked_error(error: Any, others: Mapping[str, Any], *, has_tau: bool = Fals
 
 
 def _nudged(values: Any, number: int) -> Any:
-    """Return an initial vector, or several by name, perturbed by about the last place, differently for each run."""
+    """Return an initial vector, or several by name, perturbed by one to three last places, differently for each run."""
     if values is None:
         return None
     if isinstance(values, Mapping):
         return {name: _nudged(each, number) for name, each in values.items()}
     numbers = np.array(values, dtype=float)
-    return numbers * (1.0 + NUDGE * np.cos(np.arange(numbers.size) + 2.0 * number).reshape(numbers.shape))
+    signs = np.sign(np.cos(np.arange(numbers.size) + 2.0 * number)).reshape(numbers.shape)
+    return numbers * (1.0 + (number + 1) * NUDGE * signs)
 
 
 def confirmed_run(
