@@ -1,30 +1,21 @@
 """Benchmark: this package and other integrators, compared at equal error.
 
-    cases               problems, eight initial states each, accelerations derived by hand
-    references          their final states in extended precision, independent of the package's steppers
-    contenders          steppers of this package, at the step sizes that advise() recommends; its peers: REBOUND, CyRK,
+    cases/              problems, eight initial states each, accelerations derived by hand (unforced, adaptive, rods
+                        with forces or constraints, large array systems, texts of systems), and their final
+                        states in extended precision, independent of the package's steppers (references)
+    contenders/         steppers of this package, at the step sizes that advise() recommends; its peers: REBOUND, CyRK,
                         JiTCODE, SciPy and heyoka at several tolerances
-    timing              timing of all of them in turn, in one process
-    comparison          the above for one case, or for an ensemble of 64 trajectories
-    forced_cases        problems with friction and driving forces
-    constrained_cases   problems with constraints (peers: in angles)
-    work_precision      time at equal error, by interpolation
-    report              table and JSON of these; picture: the work-precision plot
-    adaptive            adaptive step size, on adaptive_cases; step_size_plot: plot of the step sizes
-    drift               the energy over ten million steps
-    paper_tables        Tables 6 and 7 of the paper
-    compositions        SVI and explicit composition methods
-    hand_written        generated C and hand-written C
-    cold_start          time from text to the first step
-    compile_times       the same for larger systems (in compile_systems), broken down
-    mechanisms          from SymPy's bodies and loads to a trajectory; lambdify and PyDy
+    comparison          timing of all of them in turn, in one process, for one case, or an ensemble of 64 trajectories
+    report              time at equal error, by interpolation; tables and JSON of results; plots: their pictures
+    adaptive            adaptive step size
+    methods             energy over ten million steps; SVI and explicit composition methods; Tables 6 and 7 of the paper
+    hand_written        generated C and hand-written C; cost of a control step, and of the bare C function
+    first_step          time from text to the first step, also for larger systems and SymPy's bodies and loads
     constrained_bodies  energies and lengths at equal time; MuJoCo
-    control_loop        cost of a control step, and of the bare C function
     lattices            array systems at equal error; hand-written C (lattices.c), SciPy, REBOUND; scaling with size
-    large_cases         the array systems; threads: their steps with several threads
-    array_energies    their energies over a hundred thousand steps
-    thousand_bodies     a thousand bodies; REBOUND
-    compilers           the same source with several compilers, and for several processors
+    array_systems       energies over a hundred thousand steps; several threads; a thousand bodies and REBOUND
+    machine             description and limits of the machine; the same source with several compilers
+    settings            settings of a benchmark; processor times of functions and outputs of fresh processes
 
 The rules: medians of alternating rounds; stepping time only, compile time apart; every peer with the best options and
 the best formulation known to us, which are named; whole work-precision curves, no step or tolerance tuned afterwards.
@@ -40,30 +31,20 @@ from pathlib import Path
 from typing import Any
 
 from scvi_codegen.benchmark.adaptive import run_adaptive
-from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES
-from scvi_codegen.benchmark.array_energies import run_energies
-from scvi_codegen.benchmark.cases import CASES
-from scvi_codegen.benchmark.cold_start import run_cold_start
+from scvi_codegen.benchmark.array_systems import run_energies, run_thousand_bodies, run_threads
+from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES
+from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES
+from scvi_codegen.benchmark.cases.unforced import CASES
 from scvi_codegen.benchmark.comparison import ENSEMBLES, run_case, run_constrained, run_ensemble, run_forced
-from scvi_codegen.benchmark.compile_times import run_compile_times
-from scvi_codegen.benchmark.compilers import run_compilers
-from scvi_codegen.benchmark.compositions import run_compositions
 from scvi_codegen.benchmark.constrained_bodies import run_constrained_bodies
-from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
 from scvi_codegen.benchmark.contenders.peers import PEERS
-from scvi_codegen.benchmark.control_loop import run_control_loop
-from scvi_codegen.benchmark.drift import run_drift
-from scvi_codegen.benchmark.forced_cases import FORCED_CASES
-from scvi_codegen.benchmark.hand_written import run_hand_written
+from scvi_codegen.benchmark.first_step import run_cold_start, run_compile_times, run_mechanisms
+from scvi_codegen.benchmark.hand_written import run_control_loop, run_hand_written
 from scvi_codegen.benchmark.lattices import run_growth, run_lattices
-from scvi_codegen.benchmark.machine import machine
-from scvi_codegen.benchmark.mechanisms import run_mechanisms
-from scvi_codegen.benchmark.paper_tables import run_paper_tables
-from scvi_codegen.benchmark.report import LEGEND, CaseResult, header_lines
+from scvi_codegen.benchmark.machine import machine, run_compilers
+from scvi_codegen.benchmark.methods import run_compositions, run_drift, run_paper_tables
+from scvi_codegen.benchmark.report import LEGEND, CaseResult, ResultTable, header_lines
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.benchmark.thousand_bodies import run_thousand_bodies
-from scvi_codegen.benchmark.threads import run_threads
 from scvi_codegen.errors import ScviCodegenError, StateError, closest
 from scvi_codegen.files.atomic import write_atomically
 
@@ -167,11 +148,11 @@ def benchmark(
         if json_path is not None:
             _write(report, json_path)
     if plot_path is not None and report.cases:
-        from scvi_codegen.benchmark.picture import plot_curves
+        from scvi_codegen.benchmark.plots import plot_curves
 
         plot_curves(report.cases, plot_path)
         if any(result.name.startswith("adaptive:") for result in report.cases):
-            from scvi_codegen.benchmark.step_size_plot import plot_step_sizes
+            from scvi_codegen.benchmark.plots import plot_step_sizes
 
             plot_step_sizes(Path(plot_path).with_stem(f"{Path(plot_path).stem}-steps"))
     return report

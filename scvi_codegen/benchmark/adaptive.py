@@ -14,13 +14,8 @@ from typing import Any
 import numpy as np
 from mpmath import mp
 
-from scvi_codegen.benchmark.adaptive_cases import adaptive_case
-from scvi_codegen.benchmark.cases import Array, Case
-from scvi_codegen.benchmark.comparison import Makers, race
-from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
-from scvi_codegen.benchmark.contenders.ours import compiled, momenta_of
-from scvi_codegen.benchmark.contenders.peers import peer_contenders
-from scvi_codegen.benchmark.references import (
+from scvi_codegen.benchmark.cases.adaptive import adaptive_case
+from scvi_codegen.benchmark.cases.references import (
     Extended,
     Field,
     Reference,
@@ -30,7 +25,11 @@ from scvi_codegen.benchmark.references import (
     states_after,
     two_doubles,
 )
-from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.comparison import Makers, race
+from scvi_codegen.benchmark.contenders.ours import compiled, momenta_of
+from scvi_codegen.benchmark.contenders.peers import peer_contenders
+from scvi_codegen.benchmark.report import OURS, CaseResult, Contender
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError

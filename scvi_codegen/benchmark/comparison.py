@@ -1,27 +1,34 @@
-"""Comparison of all contenders on one case: compile all, then time them in turn."""
+"""Comparison of all contenders on one case: compile all, then time them in turn.
+
+Timing of contenders in turn, in one process: all of them once, then all of them again.
+
+Times are processor times of the process. Every contender steps in one thread and does nothing but compute, so that this
+equals the wall time of an idle machine; on a busy one it excludes the time of other programs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import STATES, Array, Case, case
-from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES, constrained_contenders
-from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.cases.references import Reference, reference, rms_error
+from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES, constrained_contenders
+from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case, case
 from scvi_codegen.benchmark.contenders.ours import our_contenders, our_ensembles
 from scvi_codegen.benchmark.contenders.peers import PEERS, missing_module, peer_contenders
 from scvi_codegen.benchmark.contenders.taylor import heyoka_ensembles
-from scvi_codegen.benchmark.forced_cases import FORCED_CASES
-from scvi_codegen.benchmark.references import Reference, reference
-from scvi_codegen.benchmark.report import CaseResult
+from scvi_codegen.benchmark.report import CaseResult, Contender, Measurement
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.timing import PEER_ERRORS, measure
+from scvi_codegen.errors import ScviCodegenError
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
 __all__ = ["ENSEMBLES", "Makers", "race", "run_case", "run_constrained", "run_ensemble", "run_forced"]
+
 
 ENSEMBLES = ("planar-pendulum", "kepler:0.2", "outer-solar-system")
 """Names of the cases that are run as ensembles."""
@@ -123,3 +130,90 @@ def _peer_contenders(
                 yield from make()
             except PEER_ERRORS as error:
                 skipped[name] = f"{type(error).__name__}: {error}"
+
+
+PEER_ERRORS = (ArithmeticError, AttributeError, ImportError, OSError, RuntimeError, TypeError, ValueError)
+"""Errors that a peer of an unknown version, or without its compiler, may raise; they are reported."""
+
+PATIENCE = 1.0
+"""Seconds per round over all states above which a contender is timed only once."""
+
+
+@dataclass(slots=True)
+class _Record:
+    contender: Contender
+    seconds: list[list[float]] = field(default_factory=list)
+    final: list[Array] = field(default_factory=list)
+    failure: str = ""
+
+    def round(self) -> None:
+        """Integrate from every state once."""
+        taken, final = [], []
+        size = self.contender.trajectories
+        for index in range(STATES if size == 1 else 1):
+            integrate = self.contender.prepare(index)
+            began = time.process_time()
+            q = integrate()
+            taken.append((time.process_time() - began) / size)
+            final.append(q)
+        self.seconds.append(taken)
+        self.final = final
+
+    def wants_more(self) -> bool:
+        return not self.failure and (not self.seconds or sum(self.seconds[0]) * self.contender.trajectories < PATIENCE)
+
+
+def measure(
+    contenders: Sequence[Contender],
+    reference_of: Callable[[Contender], Reference],
+    *,
+    repeats: int,
+    progress: Callable[[], None] = lambda: None,
+) -> list[Measurement]:
+    """Time all contenders alternately; a contender that fails is reported with the reason.
+
+    Args:
+        contenders: contenders to time.
+        reference_of: function that returns the exact final states for a contender.
+        repeats: number of rounds, after one that is not timed.
+        progress: called after each round of all.
+    """
+    records = [_Record(contender) for contender in contenders]
+    for number in range(repeats + 1):
+        for record in records:
+            if record.wants_more():
+                _attempt(record)
+            if number == 0 and record.wants_more():
+                record.seconds.clear()  # caches were cold
+        progress()
+    return [_summary(record, reference_of(record.contender)) for record in records]
+
+
+def _attempt(record: _Record) -> None:
+    try:
+        record.round()
+    except (*PEER_ERRORS, ScviCodegenError) as error:
+        record.failure = f"{type(error).__name__}: {error}"
+
+
+def _summary(record: _Record, reference: Reference) -> Measurement:
+    contender, failed = record.contender, bool(record.failure)
+    columns = [] if failed else list(zip(*record.seconds, strict=True))
+    error = float("nan") if failed else _error(record.final, reference)
+    return Measurement(
+        method=contender.method,
+        setting=contender.setting,
+        options=contender.options,
+        compile_seconds=contender.compile_seconds,
+        seconds=float("nan") if failed else statistics.fmean(map(statistics.median, columns)),
+        fastest=float("nan") if failed else statistics.fmean(map(min, columns)),
+        error=error,
+        repeats=len(record.seconds),
+        failure=record.failure,
+    )
+
+
+def _error(final: list[Array], reference: Reference) -> float:
+    """Return the error of one array for each state, or of one for an ensemble that contains all states repeatedly."""
+    copies = np.concatenate([np.atleast_2d(q) for q in final]).reshape(-1, *reference.high.shape)
+    return float(np.sqrt(np.mean([rms_error(q, reference) ** 2 for q in copies])))

@@ -1,27 +1,263 @@
-"""Benchmark of constrained bodies: errors of energy and rod lengths of this package and of MuJoCo at equal time."""
+"""Constrained bodies in this package and in MuJoCo: the same masses, lengths and initial states.
+
+    chain      5 masses of 1/5 on rods of 1/5, released from 0.6 (the first) to 0.3 from the vertical; MuJoCo uses
+               joint angles, which satisfy the constraints identically, and this package is also run in angles
+    four-bar   masses at the two joints of rods of 1, 2 and 1.5 between points that are 2 apart; MuJoCo closes the loop
+               by its equality ``connect``
+
+A contender is a function of (step size, number of steps) that returns the spread of the energies at the ends of ten
+equal parts, the largest error of the rod lengths there, and the processor time of the steps. It raises
+:class:`ArithmeticError` if a step is too large.
+
+Benchmark of constrained bodies: errors of energy and rod lengths of this package and of MuJoCo at equal time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.contenders.constrained_contenders import (
-    LINKAGES,
-    PARTS,
-    ContenderRun,
-    Linkage,
-    motion_in_angles,
-    mujoco_motion,
-    our_motion,
-)
-from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.cases.unforced import Array
+from scvi_codegen.benchmark.report import FLOOR, OURS, Point, ResultTable, error_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.benchmark.work_precision import FLOOR, Point, error_at
+from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.runtime.core.stepper import Stepper
 
-__all__ = ["run_constrained_bodies"]
+__all__ = ["LINKAGES", "motion_in_angles", "mujoco_motion", "our_motion", "run_constrained_bodies"]
+
+
+GRAVITY = 9.81
+PARTS = 10
+"""Number of parts of a run; energies are computed after each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linkage:
+    """Masses in the plane at (x, y), and rods between two of them, or one and a fixed point.
+
+    Attributes:
+        rods: (i, j); i < 0 is the fixed point ``anchors[-1 - i]``.
+        closed: True if the last rod ends at a fixed point: a closed loop.
+    """
+
+    name: str
+    masses: tuple[float, ...]
+    start: tuple[tuple[float, float], ...]
+    rods: tuple[tuple[int, int], ...]
+    anchors: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    closed: bool = False
+
+    def point(self, i: int) -> Array:
+        """Return the initial position of a mass, or a fixed point."""
+        return np.array(self.anchors[-1 - i] if i < 0 else self.start[i])
+
+    def length(self, i: int, j: int) -> float:
+        """Return the length of a rod."""
+        return float(np.linalg.norm(self.point(j) - self.point(i)))
+
+    @property
+    def weight(self) -> float:
+        """Unit of energy errors: the weight of all masses times a length of 1."""
+        return GRAVITY * sum(self.masses)
+
+
+def hanging_chain(n: int) -> Linkage:
+    """Return a chain of n rods."""
+    angles = np.linspace(0.6, 0.3, n)
+    positions = np.cumsum(np.column_stack([np.sin(angles), -np.cos(angles)]) / n, axis=0)
+    return Linkage(
+        name="chain",
+        masses=(1.0 / n,) * n,
+        start=tuple(map(tuple, positions.tolist())),
+        rods=tuple((i - 1, i) for i in range(n)),
+    )
+
+
+def four_bar() -> Linkage:
+    """Return a four-bar linkage at rest; the second joint follows from the first."""
+    first, end, b, c = np.array([0.0, 1.0]), np.array([2.0, 0.0]), 2.0, 1.5
+    difference = float(np.linalg.norm(end - first))
+    along = (difference**2 + b**2 - c**2) / (2 * difference)
+    towards = (end - first) / difference
+    second = first + along * towards + np.sqrt(b**2 - along**2) * np.array([-towards[1], towards[0]])
+    return Linkage(
+        name="four-bar",
+        masses=(1.0, 1.0),
+        start=(tuple(first.tolist()), tuple(second.tolist())),
+        rods=((-1, 0), (0, 1), (1, -2)),
+        anchors=((0.0, 0.0), (2.0, 0.0)),
+        closed=True,
+    )
+
+
+LINKS = 5
+LINKAGES: Mapping[str, Callable[[], Linkage]] = {"chain": lambda: hanging_chain(LINKS), "four-bar": four_bar}
+"""Functions that build a case, by name."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContenderRun:
+    """Result of a run: processor seconds of its steps, spread of the energy, largest relative error of a rod length."""
+
+    seconds: float
+    energy: float
+    length_error: float
+
+
+def our_motion(linkage: Linkage, method: str) -> Callable[[float, int], ContenderRun]:
+    """Return a run with constraints in Cartesian coordinates."""
+    n = len(linkage.masses)
+    kinetic = " + ".join(f"{linkage.masses[i]!r}*(x{i}_dot**2 + y{i}_dot**2)/2" for i in range(n))
+    weights = " ".join(f"- {linkage.masses[i] * GRAVITY!r}*y{i}" for i in range(n))
+    constraints = []
+    for i, j in linkage.rods:
+        (a, b), (c, d) = (
+            map(repr, map(float, linkage.anchors[-1 - k])) if k < 0 else (f"x{k}", f"y{k}") for k in (i, j)
+        )
+        constraints.append(f"({c} - {a})**2 + ({d} - {b})**2 - {linkage.length(i, j) ** 2!r}")
+    system = LagrangianSystem.from_text(
+        name=f"{linkage.name} on rods",
+        coordinates=[f"{axis}{i}" for i in range(n) for axis in "xy"],
+        lagrangian=f"{kinetic} {weights}",
+        constraints=constraints,
+    )
+    stepper = compile_stepper(system, method)
+    q, p = stepper.project(np.ravel(linkage.start))
+    return _by(stepper, q, p, lambda x: _length_error(linkage, x.reshape(n, 2)))
+
+
+def motion_in_angles(linkage: Linkage, method: str) -> Callable[[float, int], ContenderRun]:
+    """Return a run of an open chain in the angles of its rods, without constraints."""
+    n = len(linkage.masses)
+    lengths, angles = [linkage.length(i, j) for i, j in linkage.rods], [f"a{k}" for k in range(n)]
+    kinetic, height = [], []
+    for mass, last in zip(linkage.masses, range(1, n + 1), strict=True):
+        pairs = list(zip(lengths[:last], angles[:last], strict=True))
+        speeds = [" + ".join(f"{length!r}*{turn}({a})*{a}_dot" for length, a in pairs) for turn in ("cos", "sin")]
+        kinetic.append(f"{mass!r}/2*(({speeds[0]})**2 + ({speeds[1]})**2)")
+        height += [f"{mass * GRAVITY * length!r}*cos({a})" for length, a in pairs]
+    system = LagrangianSystem.from_text(
+        name=f"{linkage.name} in angles", coordinates=angles, lagrangian=" + ".join([*kinetic, *height])
+    )
+    stepper = compile_stepper(system, method)
+    along = [linkage.point(j) - linkage.point(i) for i, j in linkage.rods]
+    q = np.array([np.arctan2(x, -y) for x, y in along])
+    return _by(stepper, q, np.zeros(n), lambda x: 0.0)
+
+
+def _by(
+    stepper: Stepper, q: Array, p: Array, length_error: Callable[[Array], float]
+) -> Callable[[float, int], ContenderRun]:
+    """Return a run of a stepper, for a step size and a number of steps."""
+
+    def move(h: float, steps: int) -> ContenderRun:
+        run, seconds, energies, worst = stepper.start(q, p, h=h), 0.0, [float(stepper.energy(q, p))], 0.0
+        for _ in range(PARTS):
+            began = time.process_time()
+            run.advance(steps // PARTS)
+            seconds += time.process_time() - began
+            energies.append(float(stepper.energy(run.q, run.p)))
+            worst = max(worst, length_error(run.q))
+        return ContenderRun(seconds, float(np.ptp(energies)), worst)
+
+    return move
+
+
+def _length_error(linkage: Linkage, positions: Array) -> float:
+    """Return the largest relative error of a rod length."""
+    result = 0.0
+    for i, j in linkage.rods:
+        ends = [np.array(linkage.anchors[-1 - k]) if k < 0 else positions[k] for k in (i, j)]
+        length = linkage.length(i, j)
+        result = max(result, abs(float(np.linalg.norm(ends[1] - ends[0])) - length) / length)
+    return result
+
+
+def mujoco_motion(linkage: Linkage, integrator: str, *, stiff: bool = False) -> Callable[[float, int], ContenderRun]:
+    """Return a run of MuJoCo: hinges, and for a closed loop its equality constraint, soft or as stiff as a step allows.
+
+    Raises:
+        ImportError: without ``mujoco``.
+    """
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda _: None)  # otherwise it writes MUJOCO_LOG.TXT to the working directory
+
+    def move(h: float, steps: int) -> ContenderRun:
+        model = mujoco.MjModel.from_xml_string(_document(linkage, integrator, h, stiff=stiff))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        seconds, energies, length_error = 0.0, [float(data.energy.sum())], 0.0
+        with _warnings() as warnings_seen:
+            for _ in range(PARTS):
+                began = time.process_time()
+                mujoco.mj_step(model, data, nstep=steps // PARTS)
+                seconds += time.process_time() - began
+                mujoco.mj_forward(model, data)
+                energies.append(float(data.energy.sum()))
+                positions = data.site_xpos[:, [0, 2]]
+                length_error = max(length_error, _length_error(linkage, positions[: len(linkage.masses)]))
+        if warnings_seen:
+            raise ArithmeticError(warnings_seen[0])
+        return ContenderRun(seconds, float(np.ptp(energies)), length_error)
+
+    return move
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, which it would otherwise write to a file MUJOCO_LOG.TXT."""
+    import mujoco
+
+    warnings_seen: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings_seen.append)
+    try:
+        yield warnings_seen
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _document(linkage: Linkage, integrator: str, h: float, *, stiff: bool) -> str:
+    """Return MJCF: bodies nested along the rods; y is MuJoCo's z, the axis of hinges its y."""
+    open_rods = linkage.rods[:-1] if linkage.closed else linkage.rods
+    bodies, tail = "", ""
+    for i, j in open_rods:
+        last = linkage.closed and (i, j) == open_rods[-1]
+        at, to = linkage.point(i), linkage.point(j)
+        before = np.zeros(2) if i < 0 else at - linkage.point(open_rods[open_rods.index((i, j)) - 1][0])
+        mass = linkage.masses[j] / (2.0 if last else 1.0)
+        bodies += _body(f"b{j}", before, to - at, mass, f"s{j}")
+        tail = "</body>" + tail
+    loop, equality = "", ""
+    if linkage.closed:
+        i, j = linkage.rods[-1]
+        end, other = linkage.point(j), linkage.point(i)
+        loop = _body("closing", end, other - end, linkage.masses[i] / 2.0, "closing") + "</body>"
+        soft = f'solref="{2 * h!r} 1" solimp="0.9999 0.9999 0.001 0.5 2"' if stiff else ""
+        equality = f'<equality><connect site1="s{i}" site2="closing" {soft}/></equality>'
+    return f"""<mujoco>
+      <option timestep="{h!r}" integrator="{integrator}" gravity="0 0 {-GRAVITY}" tolerance="1e-15" iterations="200">
+        <flag contact="disable" energy="enable"/>
+      </option>
+      <worldbody>{bodies}{tail}{loop}</worldbody>{equality}
+    </mujoco>"""
+
+
+def _body(name: str, before: Array, rod: Array, mass: float, site: str) -> str:
+    """Return the opening of a body: a hinge at a position of its parent, with a mass at the end of a rod."""
+    position, end = (" ".join(map(repr, (float(x), 0.0, float(y)))) for x, y in (before, rod))
+    return (
+        f'<body name="{name}" pos="{position}"><joint type="hinge" axis="0 1 0"/>'
+        f'<inertial pos="{end}" mass="{mass!r}" diaginertia="1e-12 1e-12 1e-12"/><site name="{site}" pos="{end}"/>'
+    )
+
 
 SPAN = 10.0
 METHODS = ("svi:1", "svi:2", "svi:4")

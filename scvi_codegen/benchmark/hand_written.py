@@ -1,28 +1,33 @@
-"""Benchmark of generated C and hand-written C (``hand_written.c``) of the Gauss method of eight stages."""
+"""Benchmark of generated C and hand-written C (``hand_written.c``) of the Gauss method of eight stages.
+
+Benchmark of a control step: set an input, step, read the state; compared with the bare C function and NumPy.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import Array, Case, case
-from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.compiler import compile_stepper
+from scvi_codegen.benchmark.cases.unforced import Array, Case, case
+from scvi_codegen.benchmark.report import ResultTable
+from scvi_codegen.benchmark.settings import Plan, ReportActivity, seconds_in_turn
+from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
-from scvi_codegen.tables.basis import continuation, extrapolation, matrix_product
-from scvi_codegen.tables.precision import Matrix, mp
+from scvi_codegen.tables.basis import cardinal_integrals, continuation, extrapolation, matrix_product
+from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import gauss_legendre
 
-__all__ = ["HAND_WRITTEN", "hand_written_source", "run_hand_written"]
+__all__ = ["run_control_loop", "run_hand_written"]
+
 
 HAND_WRITTEN = {"planar-pendulum": 0.8, "kepler:0.2": 0.5, "kepler:0.5": 0.2}
 """Cases with a step size."""
@@ -67,7 +72,8 @@ def hand_written_source(pendulum: bool) -> Source:
 def _constants() -> Iterator[str]:
     """Yield definitions of the type ``lanes``, of vectors (one row) and of tables, column by column."""
     c = gauss_legendre(STAGES).abscissae
-    a, (b,) = (integrals(c, ends) for ends in (c, [mp.one]))
+    table = cardinal_integrals(c, (*c, mp.one), 0)
+    a, b = table[:-1], table[-1]
     product = matrix_product(a, a)
     yield "typedef double lanes __attribute__((vector_size(64)));"
     for name, table in (("C", (tuple(c),)), ("B", (b,)), ("BB", matrix_product((b,), a)), ("AA", product)):
@@ -79,14 +85,6 @@ def _constants() -> Iterator[str]:
         )
     for name, guess in zip(("ALONE", "LAST", "BEFORE"), (extrapolation(c, 1, 7), *continuation(c, 12)), strict=True):
         yield _definition(name, [[float(x) for x in row] for row in matrix_product(product, guess)])
-
-
-def integrals(points: Sequence[Any], ends: Sequence[Any]) -> Matrix:
-    """Return row n: the integrals from 0 to ends[n] of the Lagrange cardinal polynomials of the points."""
-    powers = range(len(points))
-    cardinal = mp.matrix([[x**k for k in powers] for x in points]) ** -1
-    table = mp.matrix([[x ** (k + 1) / (k + 1) for k in powers] for x in ends]) * cardinal
-    return tuple(tuple(table[n, :]) for n in range(table.rows))
 
 
 def _definition(name: str, rows: list[list[float]]) -> str:
@@ -105,21 +103,13 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
         q, v = chosen.q[0].copy(), chosen.velocity[0].copy()
         out = np.empty((count // every, chosen.dimension))
         pointers = [module.ffi.from_buffer("double[]", array) for array in (q, v, out)]
-        iterations_counted = module.lib.hand_written(pointers[0], pointers[1], strength, h, count, every, pointers[2])
-        return out, iterations_counted
+        return out, module.lib.hand_written(pointers[0], pointers[1], strength, h, count, every, pointers[2])
 
-    def generated(count: int, every: int) -> tuple[Array, int]:
-        return _generated(stepper, chosen, h, count, every)
-
-    seconds: dict[str, list[float]] = {"generated": [], "by_hand": []}
-    iterations_counted = {}
-    for _ in range(repeats):
-        for name, function in (("generated", generated), ("by_hand", by_hand)):
-            began = time.process_time()
-            _, iterations_counted[name] = function(steps, steps)
-            seconds[name].append(time.process_time() - began)
+    generated = partial(_generated, stepper, chosen, h)
+    works = {"generated": partial(generated, steps, steps), "by_hand": partial(by_hand, steps, steps)}
+    middle = {name: float(np.median(seconds)) for name, seconds in seconds_in_turn(works, repeats).items()}
+    iterations = {name: work()[1] / steps for name, work in works.items()}
     one, other = generated(COMPARED, 1)[0], by_hand(COMPARED, 1)[0]
-    middle = {name: float(np.median(result)) for name, result in seconds.items()}
     return {
         "case": chosen.name,
         "h": h,
@@ -127,8 +117,8 @@ def _compare(chosen: Case, h: float, *, repeats: int, steps: int) -> dict[str, A
         "by_hand_ns": 1e9 * middle["by_hand"] / steps,
         "ratio": middle["generated"] / middle["by_hand"],
         "apart": float(np.abs(one - other).max() / np.abs(other).max()),
-        "generated_iterations": iterations_counted["generated"] / steps,
-        "by_hand_iterations": iterations_counted["by_hand"] / steps,
+        "generated_iterations": iterations["generated"],
+        "by_hand_iterations": iterations["by_hand"],
     }
 
 
@@ -137,3 +127,102 @@ def _generated(stepper: Stepper, chosen: Case, h: float, count: int, every: int)
         chosen.q[0], stepper.momentum(chosen.q[0], chosen.velocity[0]), h=h, steps=count, save_every=every
     )
     return run.q[1:], int(run.iterations.sum())
+
+
+CALLS = 20_000
+"""Number of calls of each kind in a round."""
+STEP = 0.01
+METHODS = ("svi:2", "svi:4")
+PUSH = 0.1
+SYSTEMS = {
+    "pendulum": LagrangianSystem.from_text(
+        name="pushed pendulum",
+        coordinates=["q"],
+        lagrangian="q_dot**2/2 + cos(q)",
+        forces={"q": "u"},
+        inputs=["u"],
+    ),
+    "cart-pole": LagrangianSystem.from_text(
+        name="cart and pole",
+        coordinates=["x", "a"],
+        lagrangian="(M + m)*x_dot**2/2 + m*l*x_dot*a_dot*cos(a) + m*l**2*a_dot**2/2 - m*g*l*cos(a)",
+        parameters={"M": 1.0, "m": 0.2, "l": 0.5, "g": 9.81},
+        forces={"x": "u"},
+        inputs=["u"],
+    ),
+}
+
+
+class Sampling:
+    """Steps from one state, by each way of performing them.
+
+    Attributes:
+        held, advanced: runs whose input is set before every step, and once.
+        calls: a function without arguments for each column.
+    """
+
+    def __init__(self, system: LagrangianSystem, method: str) -> None:
+        stepper, alone = compile_stepper(system, method), Stepper(*generate_source(system, method))
+        at = np.full(stepper.dimension, 0.3)
+        self.advanced, self.held, bare = (each.start(at, 0.0 * at, h=STEP) for each in (stepper, stepper, alone))
+        for run in (self.advanced, bare):
+            run.set_inputs(u=PUSH)
+        binding, self._values = alone.binding, bare.parameters
+        self._memory, report, room = binding.new("run *"), binding.new("report *"), binding.workspace()
+        binding.buffer(self._memory)[:] = bare.checkpoint()
+        step, values, null = binding.function("advance", self._memory), binding.pointer(self._values), binding.null
+        self.calls: dict[str, Callable[[], object]] = {
+            "bare": lambda: step(1, 2**53, values, null, null, null, null, null, report, room),
+            "assign": self._assign,
+            "hold": lambda: self.advanced.set_inputs(u=PUSH),
+            "advance": lambda: self.advanced.advance(1),
+            "sample": self._sample,
+            "look": lambda: (self.advanced.q, self.advanced.p),
+        }
+
+    def _assign(self) -> None:
+        self._values[-5:] = PUSH, 0.0, 0.0, 0.0, 0.0
+
+    def _sample(self) -> None:
+        self.held.set_inputs(u=PUSH)
+        self.held.advance(1)
+
+    def states(self) -> list[list[float]]:
+        """Return the positions of each run."""
+        return [self.advanced.q.tolist(), self.held.q.tolist(), list(self._memory.q)]
+
+
+def run_control_loop(plan: Plan, report_activity: ReportActivity) -> ResultTable:
+    """Measure microseconds per call: minima of processor time, all in turn, round after round."""
+    rows = []
+    for name, system in SYSTEMS.items():
+        for method in METHODS:
+            report_activity(f"samples: {name} by {method}")
+            times = _fastest(Sampling(system, method).calls, plan)
+            over = {"hold_over": times["hold"] - times["assign"], "advance_over": times["advance"] - times["bare"]}
+            rows.append({"system": name, "by": method} | times | over)
+    return ResultTable(
+        name="control-loop",
+        title="microseconds per control step",
+        columns={"system": "", "by": ""}
+        | dict.fromkeys([key for key in rows[0] if key not in ("system", "by")], ".2f"),
+        rows=tuple(rows),
+        remarks=(
+            "bare: C's function, called with pointers at hand, a step; assign: NumPy's, of the five numbers of an",
+            "input; hold: run.set_inputs(u=...); advance: run.advance(1); sample: both; look: run.q and run.p; over:",
+            "what a call costs beyond NumPy's, and C's. Minima of processor time; a call from a Python function is in",
+            "each.",
+        ),
+    )
+
+
+def _fastest(calls: dict[str, Callable[[], object]], plan: Plan) -> dict[str, Any]:
+    """Return the microseconds of each."""
+    count = max(1, int(CALLS * plan.share))
+
+    def repeated(call: Callable[[], object]) -> None:
+        for _ in range(count):
+            call()
+
+    works = {name: partial(repeated, call) for name, call in calls.items()}
+    return {name: 1e6 * min(seconds) / count for name, seconds in seconds_in_turn(works, plan.rounds).items()}

@@ -1,12 +1,10 @@
-"""Benchmark of array systems: time at equal error (hand-written C, SciPy, REBOUND, OpenMM), and scaling with size."""
+"""Benchmark of array systems: time at equal error (hand-written C, SciPy, REBOUND, OpenMM), and scaling with size.
+
+OpenMM's Verlet integrator for Lennard-Jones atoms.
+"""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
@@ -15,21 +13,21 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from scvi_codegen.benchmark.cases import Array
-from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.contenders.molecules import PLATFORMS, openmm_run
-from scvi_codegen.benchmark.large_cases import Lattice, atoms, bodies, field, ring
-from scvi_codegen.benchmark.machine_limits import machine_limits
-from scvi_codegen.benchmark.settings import Plan, ReportActivity
-from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.benchmark.work_precision import Point, time_at
+from scvi_codegen.benchmark.cases.large import Lattice, atoms, bodies, field, ring
+from scvi_codegen.benchmark.cases.unforced import Array
+from scvi_codegen.benchmark.machine import machine_limits
+from scvi_codegen.benchmark.report import OURS, Point, ResultTable, time_at
+from scvi_codegen.benchmark.settings import Plan, ReportActivity, output_of_process, timed
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods.composition import Composition, kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
+from scvi_codegen.runtime.arrays.run import ArrayRun
+from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings
 
-__all__ = ["reference_of", "rms", "run_growth", "run_lattices"]
+__all__ = ["PLATFORMS", "reference_of", "rms", "run_growth", "run_lattices"]
+
 
 ERRORS = (1e-4, 1e-7, 1e-10)
 OWN = "composition"
@@ -42,6 +40,15 @@ DECLARATIONS = (
 GROWTH = (10**3, 10**4, 10**5, 10**6)
 SIDE = 512
 """Length of the axes of the field."""
+MEASURED = {
+    "first_step_s": ".2f",
+    "ns_a_coordinate_and_step": ".1f",
+    "iterations": ".2f",
+    "gflops": ".2f",
+    "gigabytes_s": ".1f",
+    "memory_mb": ".0f",
+}
+"""Numbers that a process of :mod:`~scvi_codegen.benchmark.contenders.array_process` prints, with their formats."""
 PATIENCE = 0.3
 """Seconds above which a setting is timed only twice."""
 
@@ -108,9 +115,8 @@ def _curves(
             for k, setting in enumerate(settings):
                 known = seconds.setdefault((name, k), [])
                 if number < 2 or min(known) < PATIENCE:
-                    began = time.process_time()
-                    end = setting()
-                    known.append(time.process_time() - began)
+                    elapsed, end = timed(setting)
+                    known.append(elapsed)
                     errors[name, k] = rms(end, reference)
     return {
         name: [Point(seconds=min(seconds[name, k]), error=errors[name, k]) for k in range(len(settings))]
@@ -145,18 +151,19 @@ def _contenders(each: Lattice, plan: Plan) -> dict[str, list[Callable[[], Array]
         result["IAS15"] = [_rebound(each, "ias15", None)]
     if each.name == "atoms" and "openmm" in plan.peers and find_spec("openmm"):
         for name in PLATFORMS:
-            result[name] = [_openmm(name, each, _count(each, each.longest / 2**k)) for k in range(1, 10)]
+            result[name] = [openmm_run(name, each, _count(each, each.longest / 2**k)) for k in range(1, 10)]
     return result
 
 
 def _ours(each: Lattice, method: Any, steps: int) -> Callable[[], Array]:
     stepper, name = compile_stepper(each.system, method), each.system.coordinates[0].name
+    return lambda: advanced(stepper, each, steps).q[name]
 
-    def run() -> Array:
-        result = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
-        result.advance(steps)
-        return result.q[name]
 
+def advanced(stepper: ArrayStepper, each: Lattice, steps: int) -> ArrayRun:
+    """Return a run at the end of the span."""
+    run = stepper.start(each.q, velocity=each.v, h=each.span / steps, parameters=each.parameters)
+    run.advance(steps)
     return run
 
 
@@ -197,25 +204,24 @@ def _dop853(each: Lattice, tolerance: float) -> Callable[[], Array]:
     return run
 
 
-def _openmm(name: str, each: Lattice, steps: int) -> Callable[[], Array]:
-    return openmm_run(name, each.q, each.v, each.accelerations, each.span, steps)
+def states_by_rebound(each: Lattice, integrator: str, steps: int | None) -> tuple[Array, Array]:
+    """Return the final positions and velocities of bodies by REBOUND; ``None``: adaptive steps."""
+    import rebound
+
+    simulation = rebound.Simulation()
+    simulation.softening = float(each.system.defaults[1])
+    for q, v in zip(each.q, each.v, strict=True):
+        simulation.add(m=1 / len(each.q), x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
+    simulation.integrator = integrator
+    if steps is not None:
+        simulation.dt = each.span / steps
+    simulation.integrate(each.span)
+    positions, velocities = np.array([[p.xyz, p.vxyz] for p in simulation.particles]).transpose(1, 0, 2)
+    return positions, velocities
 
 
 def _rebound(each: Lattice, integrator: str, steps: int | None) -> Callable[[], Array]:
-    import rebound
-
-    def run() -> Array:
-        simulation = rebound.Simulation()
-        simulation.softening = float(each.system.defaults[1])
-        for q, v in zip(each.q, each.v, strict=True):
-            simulation.add(m=1 / len(each.q), x=q[0], y=q[1], z=q[2], vx=v[0], vy=v[1], vz=v[2])
-        simulation.integrator = integrator
-        if steps is not None:
-            simulation.dt = each.span / steps
-        simulation.integrate(each.span)
-        return np.array([[p.x, p.y, p.z] for p in simulation.particles])
-
-    return run
+    return lambda: states_by_rebound(each, integrator, steps)[0]
 
 
 @without_accuracy_warnings()
@@ -229,12 +235,7 @@ def run_growth(plan: Plan, report_activity: ReportActivity) -> ResultTable:
             "problem": "",
             "by": "",
             "coordinates": "d",
-            "first_step_s": ".2f",
-            "ns_a_coordinate_and_step": ".1f",
-            "iterations": ".2f",
-            "gflops": ".2f",
-            "gigabytes_s": ".1f",
-            "memory_mb": ".0f",
+            **MEASURED,
         },
         rows=tuple(rows),
         remarks=(
@@ -252,20 +253,43 @@ def _growth(plan: Plan, report_activity: ReportActivity) -> Iterator[dict[str, A
         for name, size in sizes:
             count = size * size if name == "field" else size
             report_activity(f"growth: {name} of {count} coordinates by {method}")
-            with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder:
-                environment = os.environ | {building.CACHE_VARIABLE: folder}
-                command = [
-                    sys.executable,
-                    "-m",
-                    "scvi_codegen.benchmark.contenders.array_process",
-                    method,
-                    name,
-                    str(size),
-                ]
-                run = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
-            yield {"problem": name, "by": f"{OURS} {method}", "coordinates": count} | _numbers(run.stdout.split())
+            arguments = ["-m", "scvi_codegen.benchmark.contenders.array_process", method, name, str(size)]
+            numbers = map(float, output_of_process(arguments).split())
+            named = dict(zip(MEASURED, numbers, strict=True))
+            yield {"problem": name, "by": f"{OURS} {method}", "coordinates": count} | named
 
 
-def _numbers(result: Sequence[str]) -> dict[str, float]:
-    names = ("first_step_s", "ns_a_coordinate_and_step", "iterations", "gflops", "gigabytes_s", "memory_mb")
-    return dict(zip(names, map(float, result), strict=True))
+PLATFORMS = {"OpenMM_CPU": ("CPU", {"Threads": "1"}), "OpenMM_double": ("Reference", {})}
+"""OpenMM's platforms by the name in the table: single precision with vectors in one thread; double precision with
+loops."""
+
+
+def openmm_run(name: str, each: Lattice, steps: int) -> Callable[[], Array]:
+    """Return a function that performs ``steps`` steps of OpenMM's Verlet integrator and returns the (N, 3) positions.
+
+    Atoms have unit mass, depth and diameter. OpenMM's velocities are those half a step before the positions, so that
+    the start is shifted by half a kick; the method is then Stoermer-Verlet. Units are consistent: dalton, nm, ps,
+    kJ/mol.
+    """
+    import openmm
+
+    platform, properties = PLATFORMS[name]
+    system, force = openmm.System(), openmm.NonbondedForce()
+    force.setNonbondedMethod(openmm.NonbondedForce.NoCutoff)
+    for _ in each.q:
+        system.addParticle(1.0)
+        force.addParticle(0.0, 1.0, 1.0)
+    system.addForce(force)
+    h = each.span / steps
+    integrator = openmm.VerletIntegrator(h)
+    context = openmm.Context(system, integrator, openmm.Platform.getPlatformByName(platform), properties)
+    half_before = each.v - h / 2 * each.accelerations(each.q)
+
+    def run() -> Array:
+        context.setPositions(each.q)
+        context.setVelocities(half_before)
+        integrator.step(steps)
+        end: Array = context.getState(positions=True).getPositions(asNumpy=True)._value
+        return end
+
+    return run

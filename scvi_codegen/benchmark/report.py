@@ -1,20 +1,238 @@
-"""Work-precision curves of a case as a table for the terminal and as JSON."""
+"""Results that are one plain table.
+
+Work-precision curves: time at equal error, interpolated between measured settings.
+
+Work-precision curves of a case as a table for the terminal and as JSON.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from scvi_codegen.benchmark.contenders.contenders import OURS
-from scvi_codegen.benchmark.tables import finite, lines_of
-from scvi_codegen.benchmark.timing import Measurement
-from scvi_codegen.benchmark.work_precision import FLOOR, Point, common_error, time_at
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["LEGEND", "CaseResult", "ReportRow", "header_lines", "rows"]
+__all__ = [
+    "FLOOR",
+    "LEGEND",
+    "OURS",
+    "CaseResult",
+    "Contender",
+    "Measurement",
+    "Point",
+    "ResultTable",
+    "common_error",
+    "error_at",
+    "frontier",
+    "header_lines",
+    "rows",
+    "time_at",
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultTable:
+    """Rows with named entries.
+
+    Attributes:
+        name: name of the section on the command line.
+        title: one line that describes what is compared.
+        columns: formats by name of entry, in order.
+        rows: entries by name; one that is missing, None or NaN is shown as a dash.
+        remarks: lines below the table.
+    """
+
+    name: str
+    title: str
+    columns: Mapping[str, str]
+    rows: tuple[Mapping[str, Any], ...]
+    remarks: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Return the table for the terminal."""
+        header = [name.replace("_", " ") for name in self.columns]
+        cells = [[_cell(row.get(name), form) for name, form in self.columns.items()] for row in self.rows]
+        return "\n  ".join([f"{self.name}: {self.title}", *lines_of([header, *cells]), *self.remarks])
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any]) -> ResultTable:
+        """Return the table that :meth:`data` describes."""
+        return cls(**{**data, "rows": tuple(data["rows"]), "remarks": tuple(data["remarks"])})
+
+    def data(self) -> dict[str, Any]:
+        """Return the table as data for JSON."""
+        rows = [finite(dict(row)) for row in self.rows]
+        return {
+            "name": self.name,
+            "title": self.title,
+            "columns": dict(self.columns),
+            "rows": rows,
+            "remarks": list(self.remarks),
+        }
+
+
+def lines_of(cells: list[list[str]]) -> list[str]:
+    """Return cells as lines with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+
+
+def finite(entries: dict[str, Any]) -> dict[str, Any]:
+    """Return entries with numbers that are not finite replaced by None."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in entries.items()
+    }
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return format(value, form)
+
+
+FLOOR = 1e-13
+"""Errors below count as equal to it: they are round-off and chance."""
+
+LEAST = 1e-18
+"""Substitute for an error of 0."""
+
+MARGIN = 2.0
+"""Factor on the smallest error of a method, for chance on the plateau of round-off."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """Measured setting: seconds for one trajectory, and the error at its end."""
+
+    seconds: float
+    error: float
+
+
+def frontier(points: Iterable[Point]) -> list[Point]:
+    """Return the Pareto-optimal points in time and error, fastest first, up to the first below the floor.
+
+    >>> points = [Point(seconds=s, error=e) for s, e in [(1, 1e-3), (2, 1e-6), (3, 1e-5), (4, 1e-15), (5, 1e-16)]]
+    >>> [point.seconds for point in frontier(points)]
+    [1, 2, 4]
+    """
+    points_on: list[Point] = []
+    for point in sorted(points, key=lambda point: (point.seconds, point.error)):
+        last = points_on[-1].error if points_on else math.inf
+        if last > FLOOR and point.error < last:
+            points_on.append(point)
+    return points_on
+
+
+def time_at(points: Iterable[Point], error: float) -> float | None:
+    """Return the seconds to reach an error, linearly interpolated in log-log along the frontier.
+
+    Nothing is extrapolated: a larger error than any measured takes the time of the fastest setting, and for an error
+    that no setting reaches the result is ``None``.
+
+    >>> round(time_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 1e-6), 12)
+    2.0
+    """
+    curve, wanted = frontier(points), max(error, FLOOR)
+    if not curve or wanted < curve[-1].error:
+        return None
+    if wanted >= curve[0].error:
+        return curve[0].seconds
+    after = next(n for n, point in enumerate(curve) if point.error <= wanted)
+    loose, tight = curve[after - 1], curve[after]
+    share = math.log(loose.error / wanted) / math.log(loose.error / max(tight.error, LEAST))
+    return loose.seconds * math.pow(tight.seconds / loose.seconds, share)
+
+
+def error_at(points: Iterable[Point], seconds: float) -> float | None:
+    """Return the error reached in a time, as :func:`time_at`; ``None`` below the time of the fastest setting.
+
+    >>> round(error_at([Point(seconds=1.0, error=1e-4), Point(seconds=4.0, error=1e-8)], 2.0), 12)
+    1e-06
+    """
+    curve = frontier(points)
+    if not curve or seconds < curve[0].seconds:
+        return None
+    if seconds >= curve[-1].seconds:
+        return curve[-1].error
+    after = next(n for n, point in enumerate(curve) if point.seconds > seconds)
+    loose, tight = curve[after - 1], curve[after]
+    share = math.log(seconds / loose.seconds) / math.log(tight.seconds / loose.seconds)
+    return loose.error * math.pow(max(tight.error, LEAST) / loose.error, share)
+
+
+def common_error(one: Sequence[Point], other: Sequence[Point]) -> float | None:
+    """Return the smallest error that both methods reach safely: twice the larger of their smallest, or the floor."""
+    curves = frontier(one), frontier(other)
+    if not all(curves):
+        return None
+    return max(FLOOR, *(MARGIN * curve[-1].error if curve[-1].error > FLOOR else FLOOR for curve in curves))
+
 
 BASELINE, FAST, DEFAULT = "heyoka", "fast_math", "tol=default"
+
+
+OURS = "scvi-codegen"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Contender:
+    """Compiled integrator at one setting.
+
+    Attributes:
+        method: name of the work-precision curve, as in ``"heyoka"``.
+        setting: step size or tolerance.
+        options: formulation and options, for the reader.
+        compile_seconds: time from the equations to a function that can be called.
+        prepare: function from the number of a run, which is that of its initial state, to a function that integrates
+            from it and returns the final q.
+        momenta: (k, m) initial momenta, if they are its state; ``None`` if it starts from velocities.
+        trajectories: number of trajectories of one run; the final q of an ensemble is (trajectories, m).
+    """
+
+    method: str
+    setting: str
+    options: str
+    compile_seconds: float
+    prepare: Callable[[int], Callable[[], NDArray[np.float64]]]
+    momenta: NDArray[np.float64] | None = None
+    trajectories: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """Result of one contender.
+
+    Attributes:
+        method, setting, options, compile_seconds: as of the contender.
+        seconds: time of one trajectory: median of the repeats for each state, averaged over the states.
+        fastest: the same with minima instead of medians.
+        error: relative root-mean-square error over the final states.
+        repeats: number of rounds timed.
+        failure: reason why there is no result, or ``""``.
+    """
+
+    method: str
+    setting: str
+    options: str
+    compile_seconds: float
+    seconds: float
+    fastest: float
+    error: float
+    repeats: int
+    failure: str = ""
+
+    @property
+    def point(self) -> Point:
+        """Point on the work-precision curve."""
+        return Point(seconds=self.seconds, error=self.error)
+
+    @property
+    def fastest_point(self) -> Point:
+        """Point with the shortest time."""
+        return Point(seconds=self.fastest, error=self.error)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,9 +11,9 @@ from mpmath import mp
 
 from scvi_codegen import benchmark as bench
 from scvi_codegen.benchmark import adaptive
-from scvi_codegen.benchmark.adaptive_cases import ADAPTIVE_CASES, adaptive_case
-from scvi_codegen.benchmark.references import field_of, final_states, states_after
-from scvi_codegen.benchmark.step_size_plot import plot_step_sizes, step_sizes
+from scvi_codegen.benchmark.cases.adaptive import ADAPTIVE_CASES, adaptive_case
+from scvi_codegen.benchmark.cases.references import field_of, final_states, states_after
+from scvi_codegen.benchmark.plots import plot_step_sizes, step_sizes
 from scvi_codegen.errors import StateError
 from scvi_codegen.native import building
 

@@ -15,32 +15,15 @@ from mpmath import mp
 from scipy.integrate import solve_ivp
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import (
-    cases,
-    cold_start,
-    compile_systems,
-    compile_times,
-    compilers,
-    compositions,
-    constrained_bodies,
-    control_loop,
-    hand_written,
-    mechanisms,
-    paper_tables,
-    report,
-    timing,
-)
-from scvi_codegen.benchmark.constrained_cases import CONSTRAINED_CASES
-from scvi_codegen.benchmark.contenders import constrained_contenders, ours, peers
-from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark import comparison, constrained_bodies, first_step, hand_written, machine, methods, report
+from scvi_codegen.benchmark.cases import texts, unforced
+from scvi_codegen.benchmark.cases.references import Reference, final_states, gauss_tables, reference, rms_error
+from scvi_codegen.benchmark.cases.rods import CONSTRAINED_CASES, FORCED_CASES, angles_of, rod_accelerations
+from scvi_codegen.benchmark.contenders import ours, peers
 from scvi_codegen.benchmark.contenders.ours import our_ensembles
 from scvi_codegen.benchmark.contenders.tracing import rates_text
-from scvi_codegen.benchmark.drift import drift_rows, fitted_rate
-from scvi_codegen.benchmark.forced_cases import FORCED_CASES
-from scvi_codegen.benchmark.hanging_rods import angles_of, rod_accelerations
-from scvi_codegen.benchmark.references import Reference, final_states, gauss_tables, reference, rms_error
-from scvi_codegen.benchmark.tables import ResultTable
-from scvi_codegen.benchmark.work_precision import FLOOR, Point, common_error, frontier, time_at
+from scvi_codegen.benchmark.methods import drift_rows, fitted_rate
+from scvi_codegen.benchmark.report import FLOOR, Contender, Point, ResultTable, common_error, frontier, time_at
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError, SystemDefinitionError
 from scvi_codegen.formulas.derivatives import gradient
@@ -57,7 +40,7 @@ def points(*pairs):
 
 
 def short(name, span):
-    return replace(cases.case(name), span=span)
+    return replace(unforced.case(name), span=span)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +54,9 @@ def own_cache(folder, monkeypatch):
 
 
 class TestCases:
-    @pytest.mark.parametrize("name", [name for name in cases.CASES if name not in ("fput-chain:64", "fput-chain:256")])
+    @pytest.mark.parametrize("name", sorted(unforced.CASES.keys() - {"fput-chain:64", "fput-chain:256"}))
     def test_hand_solved_accelerations_obey_the_lagrangian(self, name):
-        chosen = cases.case(name)
+        chosen = unforced.case(name)
         system, m = chosen.system, chosen.dimension
         x = [sympy.Rational(int(value), 1000) for value in np.random.default_rng(3).integers(100, 600, 2 * m)]
         values = dict(zip(system.parameters, map(sympy.Float, system.defaults), strict=True))
@@ -123,7 +106,7 @@ class TestCases:
         assert np.abs(angles_of(end) - exact).max() < 1e-10
 
     def test_the_formulation_in_momenta_agrees_with_the_one_in_velocities(self):
-        chosen = cases.case("relativistic-particle")
+        chosen = unforced.case("relativistic-particle")
         plain, momenta = chosen.formulations
         q, v = 0.3, 0.6
         p = v / math.sqrt(1 - v * v)
@@ -134,21 +117,21 @@ class TestCases:
         assert not chosen.velocity.any()
 
     def test_every_case_has_eight_different_states(self):
-        for name in cases.CASES:
-            chosen = cases.case(name)
-            assert chosen.q.shape == chosen.velocity.shape == (cases.STATES, chosen.dimension)
-            assert len(np.unique(chosen.q, axis=0)) == cases.STATES
+        for name in unforced.CASES:
+            chosen = unforced.case(name)
+            assert chosen.q.shape == chosen.velocity.shape == (unforced.STATES, chosen.dimension)
+            assert len(np.unique(chosen.q, axis=0)) == unforced.STATES
 
     def test_unknown_names_are_rejected(self):
         with pytest.raises(SystemDefinitionError, match=r"did you mean 'duffing'"):
-            cases.case("dufing")
+            unforced.case("dufing")
         with pytest.raises(StateError, match=r"there is no section 'drif'; did you mean 'drift'\?"):
             bench.benchmark(["drif"])
         with pytest.raises(StateError, match="no peer 'heyoca'"):
             bench.Plan(peers=("heyoca",))
 
     def test_traced_text_computes_the_same(self):
-        chosen = cases.case("outer-solar-system")
+        chosen = unforced.case("outer-solar-system")
         text = rates_text(chosen.formulations[0].rates, chosen.parameters, 36)
         names = {"sqrt": math.sqrt}
         exec(text, names)
@@ -158,7 +141,7 @@ class TestCases:
         np.testing.assert_allclose(out, chosen.formulations[0].rates(x, chosen.parameters, math), rtol=1e-13)
 
     def test_the_loops_of_a_chain_compute_the_same(self):
-        chosen = cases.case("fput-chain:8")
+        chosen = unforced.case("fput-chain:8")
         names = {}
         exec(chosen.loops, names)
         x, out = np.random.default_rng(5).standard_normal(16), np.empty(16)
@@ -215,7 +198,7 @@ class TestReference:
             pytest.fail("again")
 
         again.__qualname__ = "_compute"  # by which it is kept
-        monkeypatch.setattr("scvi_codegen.benchmark.references._compute", again)
+        monkeypatch.setattr("scvi_codegen.benchmark.cases.references._compute", again)
         assert np.array_equal(reference(chosen).low, first.low)
         with pytest.raises(BaseException, match="again"):
             reference(short("planar-pendulum", 6.0))
@@ -266,7 +249,7 @@ class TestCurves:
 
 def measurement(method, seconds, error, **changes):
     entries = {"setting": "h=1", "options": "", "compile_seconds": 0.1, "fastest": seconds, "repeats": 3} | changes
-    return timing.Measurement(method=method, seconds=seconds, error=error, **entries)
+    return report.Measurement(method=method, seconds=seconds, error=error, **entries)
 
 
 def result_of(*found, **skipped):
@@ -355,7 +338,7 @@ class TestMeasuring:
 
         high = np.arange(8.0)[:, None]
         exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
-        good, bad, last = timing.measure(
+        good, bad, last = comparison.measure(
             [contender("one"), contender("bad"), contender("two")], lambda _: exact, repeats=2
         )
         assert order == [*["one"] * 8, "bad", *["two"] * 8, *(["one"] * 8 + ["two"] * 8) * 2]
@@ -369,7 +352,7 @@ class TestMeasuring:
             method="all", setting="", options="", compile_seconds=0.0, prepare=lambda n: lambda: final, trajectories=16
         )
         exact = Reference(high=high, low=np.zeros_like(high), accuracy=0.0)
-        (found,) = timing.measure([ensemble], lambda _: exact, repeats=2)
+        (found,) = comparison.measure([ensemble], lambda _: exact, repeats=2)
         assert found.error == 0.0
         assert found.seconds < 1e-3
 
@@ -434,7 +417,7 @@ class TestCommand:
 
     def test_benchmark_command_draws_a_picture(self, tmp_path):
         pytest.importorskip("matplotlib")
-        from scvi_codegen.benchmark.picture import plot_curves
+        from scvi_codegen.benchmark.plots import plot_curves
 
         plot_curves([TestReport.result, TestReport.result], tmp_path / "curves.svg")
         text = (tmp_path / "curves.svg").read_text()
@@ -446,7 +429,7 @@ class TestCommand:
         names = "scvi-codegen controlled, scvi-codegen fixed, scvi-codegen transformed, heyoka, heyoka fast_math, "
         names += "heyoka.lagrangian, rebound IAS15"
         pytest.importorskip("matplotlib")
-        from scvi_codegen.benchmark.picture import draw_curves
+        from scvi_codegen.benchmark.plots import draw_curves
 
         found = TestReport.result
         many = [replace(each, method=name) for name in names.split(", ") for each in found.measurements]
@@ -470,7 +453,7 @@ class TestDrift:
         assert 0.85 < scores.std() < 1.2
 
     def test_short_run_conserves_energy(self):
-        (row,) = drift_rows(cases.case("kepler:0.2"), 0.2, 20_000, with_heyoka=False)
+        (row,) = drift_rows(unforced.case("kepler:0.2"), 0.2, 20_000, with_heyoka=False)
         assert row["largest"] < 1e-12
 
 
@@ -482,8 +465,8 @@ class TestTables:
 
     @needs_extended
     def test_a_table_of_the_paper(self, monkeypatch):
-        monkeypatch.setattr(paper_tables, "TABLES", paper_tables.TABLES[:1])
-        found = paper_tables.run_paper_tables(bench.Plan(quick=True, repeats=1), lambda text: None)
+        monkeypatch.setattr(methods, "TABLES", methods.TABLES[:1])
+        found = methods.run_paper_tables(bench.Plan(quick=True, repeats=1), lambda text: None)
         errors = {(row["table"], row["scheme"]): row["position_error"] for row in found.rows}
         assert len(errors) == 3
         assert errors[6, "SVI"] < 0.01 * errors[6, "SRK"]
@@ -492,9 +475,9 @@ class TestTables:
     @needs_extended
     @pytest.mark.full
     def test_compositions_on_one_case(self, monkeypatch):
-        monkeypatch.setattr(compositions, "COMPARED", ("henon-heiles",))
-        monkeypatch.setattr(compositions, "METHODS", (SVI(8), StoermerVerlet(), Composition(8)))
-        found = compositions.run_compositions(bench.Plan(quick=True), lambda text: None)
+        monkeypatch.setattr(methods, "COMPARED", ("henon-heiles",))
+        monkeypatch.setattr(methods, "METHODS", (SVI(8), StoermerVerlet(), Composition(8)))
+        found = methods.run_compositions(bench.Plan(quick=True), lambda text: None)
         assert [row["error"] for row in found.rows] == [1e-4, 1e-8, 1e-12]
         assert all("stoermer-verlet" in row for row in found.rows)
         assert found.rows[-1]["fastest"] != "stoermer-verlet"
@@ -504,7 +487,7 @@ class TestTables:
         [("links", 3, 3), ("chain", 4, 4), ("bodies", 3, 9), ("lennard_jones", 3, 9), ("cloth", 2, 12)],
     )
     def test_systems_to_compile_have_finite_forces_where_they_begin(self, write, size, dimension):
-        written = getattr(compile_systems, write)(size)
+        written = getattr(texts, write)(size)
         system = LagrangianSystem.from_text(
             name=written.name,
             coordinates=written.coordinates,
@@ -528,7 +511,7 @@ class TestTables:
                 lagrangian=each.lagrangian,
                 parameters=each.parameters,
             )
-            for each in (compile_systems.post_newtonian(2), compile_systems.bodies(2))
+            for each in (texts.post_newtonian(2), texts.bodies(2))
         ]
         c2 = next(parameter for parameter in read[0].parameters if parameter.name == "c2")
         small = sympy.Symbol("small", positive=True)
@@ -536,35 +519,35 @@ class TestTables:
         assert sympy.expand(far - read[1].lagrangian) == 0
 
     def test_compiling_is_measured(self, monkeypatch):
-        monkeypatch.setattr(compile_times, "COMPILED", {"Kepler": compile_times.COMPILED["Kepler"]})
-        (row,) = compile_times.run_compile_times(bench.Plan(), lambda text: None).rows
+        monkeypatch.setattr(first_step, "COMPILED", {"Kepler": first_step.COMPILED["Kepler"]})
+        (row,) = first_step.run_compile_times(bench.Plan(), lambda text: None).rows
         assert row["coordinates"] == 2
         assert row["lines_of_C"] > 100
         assert row["compiler_cpu_s"] > 0.0
         assert row["read_s"] + row["symmetries_s"] < row["first_step_s"]
 
     def test_mechanisms_are_measured_at_equal_error(self, monkeypatch):
-        monkeypatch.setattr(mechanisms, "CONTENDERS", ("scvi-codegen", "lambdify", "none"))
-        ours, other, missing = mechanisms.run_mechanisms(bench.Plan(quick=True), lambda text: None).rows
+        monkeypatch.setattr(first_step, "CONTENDERS", ("scvi-codegen", "lambdify", "none"))
+        ours, other, missing = first_step.run_mechanisms(bench.Plan(quick=True), lambda text: None).rows
         assert max(ours["least_error"], other["least_error"]) < 1e-12
         assert min(ours["second_ms"], other["second_ms"], ours["first_step_s"], other["first_step_s"]) > 0.0
         assert "KeyError" in missing["why_not"]
 
     def test_constrained_bodies_agree_in_angles_rods_and_mujoco(self):
         """The chain twice by this project, and both by MuJoCo where it is installed: small steps, one motion."""
-        chain, linkage = (constrained_contenders.LINKAGES[name]() for name in ("chain", "four-bar"))
+        chain, linkage = (constrained_bodies.LINKAGES[name]() for name in ("chain", "four-bar"))
         on_rods, in_angles = (
-            constrained_contenders.our_motion(chain, "svi:4"),
-            constrained_contenders.motion_in_angles(chain, "svi:4"),
+            constrained_bodies.our_motion(chain, "svi:4"),
+            constrained_bodies.motion_in_angles(chain, "svi:4"),
         )
         assert max(move(0.01, 100).energy for move in (on_rods, in_angles)) < 1e-6
         assert on_rods(0.01, 100).length_error < 1e-14
-        assert constrained_contenders.our_motion(linkage, "svi:3")(0.02, 50).energy < 1e-8
+        assert constrained_bodies.our_motion(linkage, "svi:3")(0.02, 50).energy < 1e-8
         if importlib.util.find_spec("mujoco") is None:
             pytest.skip("mujoco is not installed (extra bench)")
-        assert constrained_contenders.mujoco_motion(chain, "RK4")(0.001, 1000).energy < 1e-6
+        assert constrained_bodies.mujoco_motion(chain, "RK4")(0.001, 1000).energy < 1e-6
         soft, stiff = (
-            constrained_contenders.mujoco_motion(linkage, "RK4", stiff=stiff)(0.001, 1000) for stiff in (False, True)
+            constrained_bodies.mujoco_motion(linkage, "RK4", stiff=stiff)(0.001, 1000) for stiff in (False, True)
         )
         assert stiff.length_error < 1e-5 < soft.length_error < 1e-2
         assert stiff.energy < 1e-4
@@ -573,8 +556,8 @@ class TestTables:
         """MuJoCo would write its warnings into the working folder."""
         pytest.importorskip("mujoco", reason="extra bench")
         monkeypatch.chdir(tmp_path)
-        chain = constrained_contenders.LINKAGES["chain"]()
-        move = constrained_contenders.mujoco_motion(chain, "Euler")
+        chain = constrained_bodies.LINKAGES["chain"]()
+        move = constrained_bodies.mujoco_motion(chain, "Euler")
         rows = list(constrained_bodies._rows(chain, "MuJoCo", move, (100, 1000), bench.Plan()))
         assert ["unstable" in row.get("why_not", "") for row in rows] == [True, False]
         assert not list(tmp_path.iterdir())
@@ -594,26 +577,26 @@ class TestTables:
     @needs_extended
     def test_forced_and_constrained_problems_are_measured_at_their_errors(self, monkeypatch):
         monkeypatch.setattr(ours, "QUICK_TOLERANCES", (1e-6,))
-        for name, methods in (("forced:cart-pole", 1), ("constrained:pendulum", 2)):
+        for name, count in (("forced:cart-pole", 1), ("constrained:pendulum", 2)):
             plan = bench.Plan(peers=("scipy",), repeats=1, quick=True)
             found = [each for each in bench.SECTIONS[name](plan, lambda text: None).measurements if not each.failure]
             own = [each for each in found if each.method.startswith("scvi-codegen")]
-            assert len(own) == methods
+            assert len(own) == count
             assert all(each.error < 1e-4 and each.seconds > 0.0 for each in own)
             assert max(each.error for each in found if each not in own) < 1e-10
 
     @pytest.mark.full
     def test_compilers_and_processors_are_measured(self, monkeypatch):
-        monkeypatch.setattr(compilers, "PROBLEMS", ("kepler",))
+        monkeypatch.setattr(machine, "PROBLEMS", ("kepler",))
         monkeypatch.setenv("CC", "cc")
-        table = compilers.run_compilers(bench.Plan(quick=True), lambda text: None)
+        table = machine.run_compilers(bench.Plan(quick=True), lambda text: None)
         assert {row["build"] for row in table.rows} >= {f"{name}, portable" for name in ("gcc",)}
         assert all(0.0 < row[f"kepler, SVI({degree})"] < 1e3 for row in table.rows for degree in (4, 8))
         assert os.environ["CC"] == "cc"
 
     @pytest.mark.parametrize("name", ["pendulum", "cart-pole"])
     def test_a_sample_is_the_step_of_c_called_bare(self, name):
-        sampling = control_loop.Sampling(control_loop.SYSTEMS[name], "svi:2")
+        sampling = hand_written.Sampling(hand_written.SYSTEMS[name], "svi:2")
         for call in [sampling.calls[each] for each in ("assign", "hold", "bare", "advance", "sample")] * 50:
             call()
         q = sampling.states()
@@ -621,12 +604,12 @@ class TestTables:
         assert next(part.tolist() for part in sampling.calls["look"]()) == q[0]
 
     def test_samples_are_measured(self):
-        rows = control_loop.run_control_loop(bench.Plan(quick=True), lambda text: None).rows
+        rows = hand_written.run_control_loop(bench.Plan(quick=True), lambda text: None).rows
         assert [row["system"] for row in rows] == ["pendulum"] * 2 + ["cart-pole"] * 2
         assert all(row[name] > 0.0 for row in rows for name in ("bare", "assign", "hold", "advance", "sample", "look"))
 
     def test_start_up_time_is_measured(self):
-        cold, cached = cold_start.run_cold_start(bench.Plan(repeats=1), lambda text: None).rows
+        cold, cached = first_step.run_cold_start(bench.Plan(repeats=1), lambda text: None).rows
         assert (cold["cache"], cached["cache"]) == ("cold", "cached")
         assert cold["sympy_by_import"] == "False"
         assert cached["first_step_ms"] < cold["first_step_ms"]

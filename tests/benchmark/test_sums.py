@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from scvi_codegen import benchmark as bench
-from scvi_codegen.benchmark import array_energies, lattices, thousand_bodies, threads
-from scvi_codegen.benchmark.contenders.molecules import PLATFORMS
-from scvi_codegen.benchmark.large_cases import atoms, bodies, breather, cloth, field, ring, waves
+from scvi_codegen.benchmark import array_systems, lattices
+from scvi_codegen.benchmark.cases.large import atoms, bodies, breather, cloth, field, ring, waves
+from scvi_codegen.benchmark.lattices import PLATFORMS
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.methods import Composition
 
@@ -46,7 +46,7 @@ def test_accelerations_by_numpy_are_those_of_the_formula(each):
 def test_openmm_makes_the_steps_of_leapfrog(name):
     pytest.importorskip("openmm", reason="needs the extra 'bench'")
     crystal, steps = atoms(1, 0.5), 50
-    theirs = lattices._openmm(name, crystal, steps)()
+    theirs = lattices.openmm_run(name, crystal, steps)()
     ours = lattices._ours(crystal, "stoermer-verlet", steps)()
     rounding = {"OpenMM_CPU": 1e-5, "OpenMM_double": 1e-13}[name]
     assert np.abs(theirs - ours).max() < rounding
@@ -57,7 +57,7 @@ def test_openmm_makes_the_steps_of_leapfrog(name):
 def test_rebound_converges_to_the_same_state():
     pytest.importorskip("rebound", reason="needs the extra 'bench'")
     each = bodies(10, 0.5)
-    ours, theirs = thousand_bodies._ours(each, "svi:8", 32)(), thousand_bodies._rebound(each, "ias15", None)()
+    ours, theirs = array_systems._ours(each, "svi:8", 32)(), lattices.states_by_rebound(each, "ias15", None)
     assert max(np.abs(one - other).max() for one, other in zip(ours, theirs, strict=True)) < 1e-14
 
 
@@ -82,22 +82,22 @@ def test_growth_is_measured(monkeypatch):
 
 @pytest.mark.full
 def test_threads_are_measured():
-    rows = threads.run_threads(QUICK, quiet).rows
+    rows = array_systems.run_threads(QUICK, quiet).rows
     assert [row["problem"] for row in rows] == ["ring"] * 2 + ["atoms"] * 2
     assert all(row["one_us"] > 0.0 and row["threads_2"] > 0.0 for row in rows)
 
 
 @pytest.mark.full
 def test_energies_stay_at_rounding():
-    for row in array_energies.run_energies(QUICK, quiet).rows:
+    for row in array_systems.run_energies(QUICK, quiet).rows:
         exact = row["by"].endswith("svi:8")
         assert row["largest"] < 1e-13 if exact else 1e-8 < row["largest"] < 1e-2
 
 
 @pytest.mark.full
 def test_errors_of_a_cluster_shrink_with_its_steps():
-    rows = thousand_bodies.run_thousand_bodies(QUICK, quiet).rows
-    for name, counts in thousand_bodies.OURS_BY.items():
+    rows = array_systems.run_thousand_bodies(QUICK, quiet).rows
+    for name, counts in array_systems.OURS_BY.items():
         errors = [row["error"] for row in rows if row["by"].endswith(name)]
         assert len(errors) == len(counts)
         assert errors == sorted(errors, reverse=True)

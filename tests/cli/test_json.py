@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 import scvi_codegen as sc
 from scvi_codegen import benchmark
-from scvi_codegen.benchmark.tables import ResultTable
+from scvi_codegen.benchmark.report import ResultTable
 from scvi_codegen.cli import command_group, main
 from scvi_codegen.models.model_file import parse_model
 

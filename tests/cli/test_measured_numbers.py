@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
-from scvi_codegen.benchmark.cases import case
+from scvi_codegen.benchmark.cases.unforced import case
 from scvi_codegen.cli import main
 
 pytestmark = pytest.mark.long

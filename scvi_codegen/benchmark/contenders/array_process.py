@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from scvi_codegen.benchmark.large_cases import field, ring
+from scvi_codegen.benchmark.cases.large import field, ring
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program

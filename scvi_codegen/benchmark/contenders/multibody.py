@@ -21,8 +21,8 @@ import numpy as np
 import sympy
 from sympy.physics.mechanics import KanesMethod, Particle, Point, ReferenceFrame, dynamicsymbols
 
-from scvi_codegen.benchmark.cases import Array
-from scvi_codegen.benchmark.contenders.contenders import OURS
+from scvi_codegen.benchmark.cases.unforced import Array
+from scvi_codegen.benchmark.report import OURS
 from scvi_codegen.errors import StepFailedError
 
 __all__ = ["CONTENDERS", "pendulum"]

@@ -1,19 +1,21 @@
-"""Steppers of this package at the step sizes that :func:`scvi_codegen.advise` recommends for a list of tolerances."""
+"""Contender: one integrator at one setting, ready to be timed.
+
+Steppers of this package at the step sizes that :func:`scvi_codegen.advise` recommends for a list of tolerances.
+"""
 
 from __future__ import annotations
 
 import itertools
-import os
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from scvi_codegen.advice.advice import advise
-from scvi_codegen.benchmark.cases import Array, Case
-from scvi_codegen.benchmark.contenders.contenders import OURS, Contender
+from scvi_codegen.benchmark.cases.unforced import Array, Case
+from scvi_codegen.benchmark.report import OURS, Contender
+from scvi_codegen.benchmark.settings import set_variable
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
 from scvi_codegen.methods.galerkin import SVI
@@ -21,7 +23,8 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.native import building
 from scvi_codegen.runtime.core.stepper import Stepper
 
-__all__ = ["advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
+__all__ = ["OURS", "Contender", "advised_counts", "compiled", "momenta_of", "our_contenders", "our_ensembles"]
+
 
 TOLERANCES = (1e-6, 1e-8, 1e-9, 1e-10, 3e-11, 1e-11, 3e-12, 1e-12, 5e-13, 3e-13, 2e-13, 1e-13)
 """Tolerances for which a step size is recommended; the errors reached are measured."""
@@ -96,7 +99,10 @@ def advised_counts(case: Case, method: Method, momentum: Array, *, quick: bool) 
 
 def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
     """Return the stepper, and the seconds to compile it with an empty cache and a new name."""
-    with tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder, _cache_in(folder):
+    with (
+        tempfile.TemporaryDirectory(prefix="scvi-codegen-bench-") as folder,
+        set_variable(building.CACHE_VARIABLE, folder),
+    ):
         began = time.perf_counter()
         stepper = compile_stepper(case.system, method, prefix=f"bench_{next(_builds)}")
         return stepper, time.perf_counter() - began
@@ -105,19 +111,6 @@ def compiled(case: Case, method: Method) -> tuple[Stepper, float]:
 def momenta_of(stepper: Stepper, case: Case) -> Array:
     """Return (k, m) initial momenta."""
     return np.array([stepper.momentum(q, v) for q, v in zip(case.q, case.velocity, strict=True)])
-
-
-@contextmanager
-def _cache_in(folder: str) -> Iterator[None]:
-    before = os.environ.get(building.CACHE_VARIABLE)
-    os.environ[building.CACHE_VARIABLE] = folder
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[building.CACHE_VARIABLE]
-        else:
-            os.environ[building.CACHE_VARIABLE] = before
 
 
 def _setting(case: Case, count: int, tolerance: float) -> str:

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import Array, Case
-from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders.taylor import heyoka_contenders
 from scvi_codegen.benchmark.contenders.tracing import rates_text
+from scvi_codegen.benchmark.report import Contender
 
 __all__ = ["PEERS", "Peer", "missing_module", "peer_contenders"]
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import STATES, Array, Case, Formulation
-from scvi_codegen.benchmark.contenders.contenders import Contender
+from scvi_codegen.benchmark.cases.unforced import STATES, Array, Case, Formulation
+from scvi_codegen.benchmark.report import Contender
 from scvi_codegen.mechanics.derived_expressions import forms_of
 
 __all__ = ["heyoka_contenders", "heyoka_ensembles", "heyoka_states"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from scvi_codegen.benchmark.cases import Rates
+from scvi_codegen.benchmark.cases.unforced import Rates
 
 __all__ = ["rates_text"]
 

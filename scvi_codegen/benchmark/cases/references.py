@@ -1,7 +1,7 @@
 """Reference solutions to 18 digits: Gauss method of 16 stages in extended precision, fixed step, compensated sums.
 
 NumPy's ``longdouble`` has 80 bits on x86 and 128 on 64-bit Arm under Linux. The computation is independent of the
-package's steppers: right-hand sides are the hand-derived ones of :mod:`.cases`, tables come from mpmath. Tables are
+package's steppers: right-hand sides are the hand-derived ones of :mod:`.unforced`, tables come from mpmath. Tables are
 sums of two numbers and steps are short binary fractions, so that neither causes a systematic error. Each reference is
 computed with two step sizes, and their difference is stored as its accuracy.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from mpmath import mp, polyroots, taylor
 from numpy.typing import NDArray
 
-from scvi_codegen.benchmark.cases import Array, Case
+from scvi_codegen.benchmark.cases.unforced import Array, Case
 from scvi_codegen.benchmark.contenders.tracing import rates_text
 from scvi_codegen.errors import StateError
 from scvi_codegen.files.atomic import write_atomically
@@ -40,6 +40,7 @@ __all__ = [
     "states_after",
     "two_doubles",
 ]
+
 
 Extended = NDArray[np.longdouble]
 Field = Callable[[Extended, Extended], Extended]

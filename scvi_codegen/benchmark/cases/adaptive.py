@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import (
+from scvi_codegen.benchmark.cases.unforced import (
     Bodies,
     Case,
     Formulation,
@@ -26,7 +26,8 @@ from scvi_codegen.benchmark.cases import (
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.models.problems import problem
 
-__all__ = ["ADAPTIVE_CASES", "ECCENTRICITIES", "adaptive_case"]
+__all__ = ["ADAPTIVE_CASES", "adaptive_case"]
+
 
 ECCENTRICITIES = (0.0, 0.2, 0.5, 0.9, 0.99, 0.999)
 KEPLER_SPAN = 2000.0

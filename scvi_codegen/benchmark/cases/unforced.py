@@ -33,6 +33,7 @@ __all__ = [
     "second_order",
 ]
 
+
 Array = NDArray[np.float64]
 Vector = Sequence[Any]
 Rates = Callable[[Vector, Mapping[str, Any], Any], list[Any]]

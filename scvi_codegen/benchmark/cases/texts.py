@@ -10,6 +10,7 @@ import numpy as np
 
 __all__ = ["SystemText", "bodies", "chain", "cloth", "kepler", "lennard_jones", "links", "post_newtonian"]
 
+
 AXES = "xyz"
 
 

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scvi_codegen.benchmark.cases import Array
+from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 
 __all__ = ["Lattice", "atoms", "bodies", "breather", "cloth", "field", "ring", "waves"]
+
 
 SEED = 20261121
 SPACING = 0.98 * 2 ** (2 / 3)

@@ -1,0 +1,1 @@
+"""Problems of the benchmark, and their reference solutions."""
