@@ -29,9 +29,9 @@ enum {
   SCRATCH = 64 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/numbers.h"
-#include "support/status_codes.h"
-#include "support/step.h"
+#include "support/core/numbers.h"
+#include "support/core/status_codes.h"
+#include "support/core/step.h"
 
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
  * STRAIGHT[b] v0 + MOMENTA[b] p0; h z_b is a displacement if MOVES[b]. */
@@ -228,10 +228,10 @@ static void momentum_maps(const double *u, double t, const double *parameters, d
   value[1] = u[2] * u[2] * (u[1] * u[1]) + u[3] * u[3] * (u[0] * u[0]);
 }
 
-#include "support/band.h"
-#include "support/legendre.h"
-#include "support/energies.h"
-#include "support/stages.h"
+#include "support/newton/band.h"
+#include "support/mechanics/legendre.h"
+#include "support/mechanics/energies.h"
+#include "support/newton/stages.h"
 
 /* Quadrature points: adds their part of the rows, and of the Jacobian unless it is NULL. */
 static void add_quadrature(const step_data *step, const double *z, double *rows, double *size, double *jacobian,
@@ -303,7 +303,7 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
   add_node(step, z, rows, size_p, jacobian, shape);
 }
 
-#include "support/newton.h"
+#include "support/newton/newton.h"
 
 #define STAGE_POWER 1.5 /* exponent from the curve's estimate to the error of the end */
 static const double STAGE_HIGHEST[5] = {0.0, -1.0, 1.0, 0.0, 0.0};
@@ -311,9 +311,9 @@ static const double STAGE_NEXT[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_CURVATURE[5] = {0.0, 1.0, 0.0, 0.0, 0.0};
 static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 
-#include "support/stage_error.h"
+#include "support/step_size/stage_error.h"
 #define SPURIOUS_TESTED
-#include "support/newton_from_line.h"
+#include "support/newton/newton_from_line.h"
 
 #ifdef __GNUC__
 #define POINTS 2
@@ -324,8 +324,8 @@ static const double STAGE_OTHER_CURVATURE[5] = {0.0, 0.0, 1.0, 0.0, 0.0};
 #define DIAGONAL_MASS 1
 
 #define INVERSE_ROOTS
-#include "support/vectors.h"
-#include "support/points.h"
+#include "support/core/vectors.h"
+#include "support/core/points.h"
 
 LANES_INVERSE_ROOT(3, (square * y), (inverse * inverse));
 LANES_INVERSE_ROOT(5, (square * square * y), (inverse * inverse * inverse));
@@ -387,13 +387,13 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
   value[1] = -(w0 * u[1]);
 }
 
-#include "support/convergence.h"
-#include "support/one_trajectory.h"
-#include "support/mass_matrix.h"
-#include "support/curve.h"
-#include "support/shooting_iteration.h"
-#include "support/fallback.h"
-#include "support/iteration_solver.h"
+#include "support/iteration/convergence.h"
+#include "support/iteration/one_trajectory.h"
+#include "support/iteration/mass_matrix.h"
+#include "support/iteration/curve.h"
+#include "support/iteration/shooting_iteration.h"
+#include "support/iteration/fallback.h"
+#include "support/iteration/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
@@ -405,10 +405,10 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 static const lanes HIGHEST[GROUPS] = {-1.0, 1.0};
 static const lanes NEXT[GROUPS] = {1.0, 0.0};
 
-#include "support/curve_error.h"
-#include "support/largest_error.h"
-#include "support/sizes.h"
-#include "support/observed_error.h"
+#include "support/step_size/curve_error.h"
+#include "support/step_size/largest_error.h"
+#include "support/step_size/sizes.h"
+#include "support/step_size/observed_error.h"
 #else
 static const double EXTRAPOLATION[5][5] = {
     {1.0, 0.0, 0.0, 0.0, 0.0},
@@ -418,15 +418,15 @@ static const double EXTRAPOLATION[5][5] = {
     {0.0, 0.0, 0.0, 0.0, 1.0}};
 
 #define NEWTON_ALONE
-#include "support/newton_solver.h"
-#include "support/largest_error.h"
+#include "support/newton/newton_solver.h"
+#include "support/step_size/largest_error.h"
 
 #define ERROR_POWER STAGE_POWER
-#include "support/sizes.h"
-#include "support/observed_error.h"
+#include "support/step_size/sizes.h"
+#include "support/step_size/observed_error.h"
 #endif
 
-#include "support/run.h"
+#include "support/run/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
 static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
@@ -453,4 +453,4 @@ static void sums_along(const step_data *step, const double *z, double *sum)
 }
 
 #define DISCRETE_LAGRANGIAN
-#include "support/discrete_legendre.h"
+#include "support/mechanics/discrete_legendre.h"

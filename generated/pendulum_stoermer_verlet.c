@@ -20,9 +20,9 @@ enum {
   SCRATCH = 2 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/numbers.h"
-#include "support/status_codes.h"
-#include "support/step.h"
+#include "support/core/numbers.h"
+#include "support/core/status_codes.h"
+#include "support/core/step.h"
 
 /* Position of each coordinate in a bandwidth-reducing ordering; {i, j}: d y_i / d x_j. */
 static const int POSITION_IN_MATRIX[M] = {0};
@@ -48,9 +48,9 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
   /* clang-format on */
 }
 
-#include "support/band.h"
-#include "support/legendre.h"
-#include "support/energies.h"
+#include "support/newton/band.h"
+#include "support/mechanics/legendre.h"
+#include "support/mechanics/energies.h"
 
 enum { LEAPS = 2 };
 static const double KICK[2] = {0.5, 0.5};
@@ -72,9 +72,9 @@ static void mass(const double *u, double t, const double *parameters, double *va
 }
 
 #define BY_MASSES
-#include "support/splitting.h"
+#include "support/iteration/splitting.h"
 
 #define NO_ERROR_ESTIMATE
-#include "support/run.h"
+#include "support/run/run.h"
 #define EXPLICIT_STEPS
-#include "support/discrete_legendre.h"
+#include "support/mechanics/discrete_legendre.h"

@@ -31,6 +31,7 @@ def main() -> None:
     for path in {*FOLDER.glob("**/*.[ch]")} - {FOLDER / name for name in files}:
         path.unlink()
     for name, text in files.items():
+        (FOLDER / name).parent.mkdir(parents=True, exist_ok=True)
         (FOLDER / name).write_text(text, encoding="utf-8", newline="\n")
 
 

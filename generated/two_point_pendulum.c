@@ -27,9 +27,9 @@ enum {
   SCRATCH = 12 /* arguments, values and derivatives at all points, or the mass matrix with its derivatives */
 };
 
-#include "support/numbers.h"
-#include "support/status_codes.h"
-#include "support/step.h"
+#include "support/core/numbers.h"
+#include "support/core/status_codes.h"
+#include "support/core/step.h"
 
 /* q1 = q0 + h sum_b END_POSITION[b] z_b; row r contains MOMENTUM_ROW[r] p0; the straight-line guess of z_b is
  * STRAIGHT[b] v0 + MOMENTA[b] p0; h z_b is a displacement if MOVES[b]. */
@@ -84,11 +84,11 @@ static void lagrangian(const double *u, double t, const double *parameters, doub
   /* clang-format on */
 }
 
-#include "support/band.h"
-#include "support/legendre.h"
-#include "support/energies.h"
+#include "support/newton/band.h"
+#include "support/mechanics/legendre.h"
+#include "support/mechanics/energies.h"
 #define UNROLLED_EQUATIONS
-#include "support/stages.h"
+#include "support/newton/stages.h"
 
 /* Quadrature points, 2: u = (q, v) at each. */
 static void quadrature_points(const step_data *step, const double *z, double *u)
@@ -132,9 +132,9 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
       (-0.5 * derivative[1] - 0.5 * derivative[3]);
 }
 
-#include "support/newton.h"
+#include "support/newton/newton.h"
 #define SPURIOUS_TESTED
-#include "support/newton_from_line.h"
+#include "support/newton/newton_from_line.h"
 
 #ifdef __GNUC__
 #define POINTS 2
@@ -142,8 +142,8 @@ static void evaluate(const step_data *step, const double *z, double *rows, doubl
 #define FINAL_ITERATIONS 1
 
 #define VECTOR_LIBRARY
-#include "support/vectors.h"
-#include "support/points.h"
+#include "support/core/vectors.h"
+#include "support/core/points.h"
 
 LANES_LIBRARY_FUNCTION(sin);
 
@@ -184,11 +184,11 @@ static void mass(const double *u, double t, const double *parameters, double *va
   value[0] = parameters[0] * (parameters[1] * parameters[1]);
 }
 
-#include "support/convergence.h"
-#include "support/one_trajectory.h"
-#include "support/separable_iteration.h"
-#include "support/fallback.h"
-#include "support/iteration_solver.h"
+#include "support/iteration/convergence.h"
+#include "support/iteration/one_trajectory.h"
+#include "support/iteration/separable_iteration.h"
+#include "support/iteration/fallback.h"
+#include "support/iteration/iteration_solver.h"
 
 /* Error estimate of a curve, and its exponent in the relative error of the end of the step. */
 #define KEPT 2
@@ -200,19 +200,19 @@ static void mass(const double *u, double t, const double *parameters, double *va
 static const lanes HIGHEST[GROUPS] = {0.5, 0.5};
 static const lanes NEXT[GROUPS] = {0.0, 0.0};
 
-#include "support/curve_error.h"
-#include "support/largest_error.h"
-#include "support/sizes.h"
-#include "support/observed_error.h"
+#include "support/step_size/curve_error.h"
+#include "support/step_size/largest_error.h"
+#include "support/step_size/sizes.h"
+#include "support/step_size/observed_error.h"
 #else
 static const double EXTRAPOLATION[1][1] = {{1.0}};
 
 #define NEWTON_ALONE
-#include "support/newton_solver.h"
+#include "support/newton/newton_solver.h"
 #define NO_ERROR_ESTIMATE
 #endif
 
-#include "support/run.h"
+#include "support/run/run.h"
 
 /* Adds h^1 sum_n w_n lagrangian along the curve with unknowns z. */
 static void add_quadrature_sums(const step_data *step, const double *z, double *sum)
@@ -237,4 +237,4 @@ static void sums_along(const step_data *step, const double *z, double *sum)
 }
 
 #define DISCRETE_LAGRANGIAN
-#include "support/discrete_legendre.h"
+#include "support/mechanics/discrete_legendre.h"

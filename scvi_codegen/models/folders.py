@@ -17,7 +17,7 @@ __all__ = ["CERTIFICATE_FILE", "FORMAT", "INTERFACE_FILE", "record_text", "write
 
 INTERFACE_FILE, CERTIFICATE_FILE = "interface.json", "certificate.json"
 FORMAT = 1
-FILE_NAME = re.compile(r"(support/)?[\w.]+")
+FILE_NAME = re.compile(r"(support/(\w+/)?)?[\w.]+")
 
 
 def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None:
@@ -30,7 +30,7 @@ def write_folder(target: Path, texts: Mapping[str, str], *, force: bool) -> None
         for name in stale:
             (target / name).unlink(missing_ok=True)
         for name, text in texts.items():
-            (target / name).parent.mkdir(exist_ok=True)
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
             write_atomically(target / name, partial(_write, text))
     except OSError as error:
         raise PackageError(f"{error.filename or target} cannot be written: {error.strerror or error}") from error

@@ -80,10 +80,10 @@ NO_UNROLL_FLAGS = ("--param=max-completely-peel-times=4",)
 Unrolled they become scalar code (leapfrog of 8 masses: 1.5 times the time). The lanes of ensembles must be unrolled.
 """
 
-UNROLLED_HEADERS = frozenset({"support/newton_solver.h", "support/shooting_iteration.h"})
+UNROLLED_HEADERS = frozenset({"support/newton/newton_solver.h", "support/iteration/shooting_iteration.h"})
 """Headers of steps of one trajectory that are a tenth slower if their short loops are not unrolled."""
 
-THREADS_HEADER, THREADS = "support/arrays.h", ("-DSCVI_THREADS", "-pthread")
+THREADS_HEADER, THREADS = "support/arrays/arrays.h", ("-DSCVI_THREADS", "-pthread")
 """Header of sources whose steps threads may share, and the flags for them."""
 
 COMPILE_SECONDS = 600
@@ -293,7 +293,7 @@ def _passes(part: Source, flags: tuple[str, ...], cut: tuple[str, ...]) -> tuple
     """Return further flags of gcc for a source, with -O3."""
     if "-O3" not in flags:
         return ()
-    rolled = NO_UNROLL_FLAGS if "support/run.h" in part.files and UNROLLED_HEADERS.isdisjoint(part.files) else ()
+    rolled = NO_UNROLL_FLAGS if "support/run/run.h" in part.files and UNROLLED_HEADERS.isdisjoint(part.files) else ()
     return (*cut, *rolled)
 
 

@@ -1,7 +1,7 @@
 """Event functions in C: formulas to a kernel, and a search for its zeros besides the source of an integrator.
 
 The search uses only the public functions of an integrator, so that it is available for every method and solver, and the
-source without events does not change. On a step (``templates/support/events.h``):
+source without events does not change. On a step (``templates/support/run/events.h``):
 
 * the functions are evaluated at its ends and at three states between them, each by a step of a fraction of h, and
   interpolated by polynomials of degree 4;

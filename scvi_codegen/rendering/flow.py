@@ -79,7 +79,7 @@ def _behind(source: Source, text: str, headers: Sequence[str], declarations: str
     tail = (
         text
         + "#define SECOND_DERIVATIVES\n" * second
-        + "".join(f'#include "support/{header}.h"\n' for header in headers)
+        + "".join(f'#include "support/frameworks/{header}.h"\n' for header in headers)
     )
     own = dict(source.support)
     code = source.code + tail

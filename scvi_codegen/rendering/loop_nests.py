@@ -72,7 +72,7 @@ MOST_THREADS = 64
 
 
 class Sharing(Enum):
-    """Kinds of tasks (``window`` of templates/support/arrays.h)."""
+    """Kinds of tasks (``window`` of templates/support/arrays/arrays.h)."""
 
     ALONE = auto()
     IN_TURN = auto()

@@ -38,11 +38,11 @@ Positions, forces, increments; with constraints also constraint forces and trial
 at the points, forces in this step and in two former ones.
 """
 NEWTON_VECTORS = 4 + 17
-"""Further vectors: residual, correction, products, and the basis of GMRES (templates/support/newton_gmres.h)."""
+"""Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
 FOURIER_VECTORS = 2
-"""Further vectors: scratch of Fourier transforms (templates/support/preconditioner.h)."""
+"""Further vectors: scratch of Fourier transforms (templates/support/arrays/preconditioner.h)."""
 HALVES_VECTORS = 7
-"""Further vectors: the state at the start of a step and three increments (templates/support/array_step.h)."""
+"""Further vectors: the state at the start of a step and three increments (templates/support/arrays/array_step.h)."""
 
 
 def loop_context(program: Program) -> dict[str, Any]:

@@ -70,8 +70,8 @@ class Lanes:
         return "lanes" if source in self.sources else "double"
 
 
-POINTS = Lanes(("u", "t"), "points", (), "one_trajectory")
-TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("batched_step",), "many_trajectories")
+POINTS = Lanes(("u", "t"), "points", (), "iteration/one_trajectory")
+TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("core/batched_step",), "iteration/many_trajectories")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,8 +139,9 @@ def iteration_source(
     damping = None if meaning.are_points else fixed_point.damping
     applied = (*kernels, *((mass,) if mass and not meaning.are_points else ()), *((damping,) if damping else ()))
     functions = set().union(*(lane_functions(kernel, meaning.sources) for kernel in applied))
-    tried = "library_fallback" if fallback == "external" else "fallback"
-    solver = (tried, "iteration_solver") if meaning.are_points else ()
+    tried = "newton/library_fallback" if fallback == "external" else "iteration/fallback"
+    solver = (tried, "iteration/iteration_solver") if meaning.are_points else ()
+    parts = (f"iteration/{name}" for name in fixed_point.parts)
     return IterationSource(
         lanes=fixed_point.lanes,
         whole=meaning.are_points and not fixed_point.in_groups,
@@ -154,7 +155,7 @@ def iteration_source(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "convergence", meaning.memory, *fixed_point.parts, *solver),
+        support=(*meaning.before, "iteration/convergence", meaning.memory, *parts, *solver),
         error_defines=_kept(fixed_point),
         highest=_table("HIGHEST", fixed_point.guess.highest),
         next=_table("NEXT", fixed_point.guess.next),

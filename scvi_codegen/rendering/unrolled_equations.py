@@ -1,7 +1,7 @@
 """Unrolled stage equations of the smallest programs: one statement per residual, with the numbers of the tables.
 
-Terms are in the order in which the loops of ``support/stages.h`` add them, so that both round alike; products with 0
-are omitted, products with 1 simplified.
+Terms are in the order in which the loops of ``support/newton/stages.h`` add them, so that both round alike;
+products with 0 are omitted, products with 1 simplified.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ STUDENT = 7.0
 TO_CONVERGENCE = SolverOptions(tolerance=2.0**-68)
 """Solver options that iterate until nothing changes."""
 MAX_RESIDUAL = 0.25
-"""Residual of the fixed-point iteration, in units of rounding; see ``templates/support/convergence.h``."""
+"""Residual of the fixed-point iteration, in units of rounding; see ``templates/support/iteration/convergence.h``."""
 NO_TRUNCATION = 2.0**-56
 """Relative energy change of one exact step below which round-off dominates."""
 

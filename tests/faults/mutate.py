@@ -41,7 +41,7 @@ DERIVING = ("ir", "lowering", "rendering", "methods", "mechanics", "formulas", "
 """What all cases come from; of the others one shows as much."""
 NOT_TRIED = ("errors.py", "text.py", "outline.py", "waiting.py")
 """Words for people; their tests are of words."""
-OF_C = ("support/*.h", "*.c.jinja", "parts/*.c.jinja", "parts/newton/*.c.jinja")
+OF_C = ("support/*/*.h", "*.c.jinja", "parts/*.c.jinja", "parts/newton/*.c.jinja")
 CERTIFIED = (
     "kepler/svi-3",
     "cart/svi",

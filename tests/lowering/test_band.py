@@ -20,7 +20,7 @@ HEAD = """#include "band.h"
 typedef double real;
 #define MATH(f) f
 static int BAND;
-#include "support/band.h"
+#include "support/newton/band.h"
 """
 DECLARATIONS = """int band_shape(int bandwidth, int sites, int blocks, int *shape);
 int band_solve(int bandwidth, int sites, int blocks, double *a, double *pivot, double *x);
@@ -52,13 +52,13 @@ SHAPES = [(0, 5, 2), (1, 4, 2), (1, 12, 1), (1, 12, 3), (2, 15, 2), (3, 40, 1), 
 
 @cache
 def library() -> Any:
-    text = (template_folder() / "support/band.h").read_text(encoding="utf-8")
+    text = (template_folder() / "support/newton/band.h").read_text(encoding="utf-8")
     source = Source(
         prefix="band",
         header=DECLARATIONS,
         code=HEAD + CODE,
         declarations=DECLARATIONS,
-        support=(("support/band.h", text),),
+        support=(("support/newton/band.h", text),),
     )
     return load(source, flags=QUICK_FLAGS)
 

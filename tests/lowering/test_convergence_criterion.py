@@ -114,7 +114,7 @@ void scales(double absolute, double *size)
 def header(folder: Path, after: int):
     """The functions of the headers alone, of changes that are not squared."""
     compiler = needs("cc")
-    headers = Path(__file__).parents[2] / "templates/support"
+    headers = Path(__file__).parents[2] / "templates/support/iteration"
     (folder / f"{after}.c").write_text(VERDICTS.format(after=after, folder=headers))
     command = [compiler, "-std=c99", "-shared", "-fPIC", f"{after}.c", "-o", f"{after}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)

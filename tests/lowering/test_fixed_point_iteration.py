@@ -113,13 +113,13 @@ def test_many_coordinates_do_not_request_the_jacobian():
     names = [f"a{k}" for k in range(9)]
     coupled = " + ".join(f"{a}_dot**2 + {a}_dot*{b}_dot*cos({a} - {b})" for a, b in itertools.pairwise([*names, "a0"]))
     chain = LagrangianSystem.from_text(name="ring of nine", coordinates=names, lagrangian=coupled)
-    assert "support/corrections.h" in iterated(chain).source.files
+    assert "support/iteration/corrections.h" in iterated(chain).source.files
 
 
 def test_momenta_follow_forces_and_velocities_follow_momenta():
     system = hamiltonian_of(problem("charged-particle").system)
     stepper, (derivative, velocity, _) = iterated(system), functions(system)
-    assert "support/hamiltonian_iteration.h" in stepper.source.files
+    assert "support/iteration/hamiltonian_iteration.h" in stepper.source.files
     for q0, p0 in states(system.dimension):
         t, v0 = T + H / 2, velocity(q0, p0, T)
         p = p0 - H / 2 * derivative(q0 + H / 2 * v0, p0, t)

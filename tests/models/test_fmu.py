@@ -218,7 +218,9 @@ def test_all_unsupported_functions_are_errors_with_their_name(fmu):
     [library] = (fmu.folder / "binaries").glob("*/*")
     exported = {name.decode()[4:] for name in re.findall(rb"fmi3[A-Z]\w+", library.read_bytes())}
     text = next(
-        text for name, text in fmu_module._texts(pushed(), "push", "auto")[1].items() if name.endswith("support/fmu.h")
+        text
+        for name, text in fmu_module._texts(pushed(), "push", "auto")[1].items()
+        if name.endswith("support/frameworks/fmu.h")
     ).decode()
     absent = set(re.findall(r"^(?:ABSENT|NO_MODE)\((\w+)", text, re.MULTILINE))
     assert absent < exported

@@ -158,5 +158,5 @@ def test_inputs_on_a_microcontroller(model, precision, tmp_path):
 @pytest.mark.parametrize("method", [SVI(4), StoermerVerlet()], ids=lambda method: method.name)
 def test_generated_source_has_the_project_style(model, method, tmp_path):
     folder = generate_package(replace(model, method=method), tmp_path / "pushed")
-    for path in [*folder.glob("*.[ch]"), folder / "support" / "inputs.h"]:
+    for path in [*folder.glob("*.[ch]"), folder / "support" / "run" / "inputs.h"]:
         check_style(path.read_text())

@@ -13,7 +13,7 @@ from scvi_codegen.files.templates import template_folder
 from scvi_codegen.rendering.source import Source
 
 FOLDER = Path(__file__).parents[2] / "generated"
-SUPPORT = sorted((template_folder() / "support").glob("*.h"))
+SUPPORT = sorted((template_folder() / "support").glob("*/*.h"))
 
 
 @pytest.mark.parametrize("path", SUPPORT, ids=lambda path: path.name)

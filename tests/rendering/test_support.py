@@ -55,7 +55,7 @@ typedef double real;
 typedef struct { int guess; long long change, change_before; } run_memory;
 struct predictor_tables_of { const real *alone, *last, *before; };
 static const real PREDICTOR_ALONE[5][1] = {{0}}, PREDICTOR_LAST[5][5][1] = {{{0}}}, PREDICTOR_BEFORE[5][5][1] = {{{0}}};
-#include "predictor_tables.h"
+#include "step_size/predictor_tables.h"
 int main(void)
 {
   for (int guess = 1; guess <= 2; guess++)

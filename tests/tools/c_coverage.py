@@ -54,7 +54,11 @@ def collect(cache: Path) -> Reached:
         for (entry, _), files in zip(entries, pool.map(lambda one: _report(*one), entries), strict=True):
             for file in files:
                 path = Path(file["file"])
-                name = f"support/{path.name}" if path.parent.name == "support" else f"{entry.name}/{path.name}"
+                name = (
+                    f"support/{path.parent.name}/{path.name}"
+                    if "support" in path.parts
+                    else f"{entry.name}/{path.name}"
+                )
                 if path.is_absolute() and "support" not in path.parts and not path.is_relative_to(cache):
                     continue  # headers of the system
                 for line in file["lines"]:
