@@ -5,7 +5,6 @@ from scvi_codegen.advice.advice import advise as advise
 from scvi_codegen.advice.solve_ivp import OdeResult as OdeResult
 from scvi_codegen.advice.solve_ivp import solve_ivp as solve_ivp
 from scvi_codegen.compiler import compile_stepper as compile_stepper
-from scvi_codegen.compiler import generate_source as generate_source
 from scvi_codegen.derivation.equations import StepEquations as StepEquations
 from scvi_codegen.derivation.equations import derive as derive
 from scvi_codegen.errors import AccuracyWarning as AccuracyWarning
@@ -52,9 +51,9 @@ from scvi_codegen.mechanics.arrays.rolling import roll_sums as roll_sums
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums as unroll_sums
 from scvi_codegen.mechanics.coordinate_change import change_coordinates as change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianSystem
-from scvi_codegen.mechanics.hamiltonian import hamiltonian_of as hamiltonian_of
-from scvi_codegen.mechanics.hamiltonian import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of as hamiltonian_of
+from scvi_codegen.mechanics.legendre import lagrangian_of as lagrangian_of
 from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry as check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry as Symmetry
@@ -94,6 +93,7 @@ from scvi_codegen.pictures.overview import plot_trajectory as plot_trajectory
 from scvi_codegen.pictures.paths import plot_motion as plot_motion
 from scvi_codegen.pictures.paths import plot_phase as plot_phase
 from scvi_codegen.pictures.section import plot_section as plot_section
+from scvi_codegen.pipeline.sources import generate_source as generate_source
 from scvi_codegen.results.recording import RecordedRun as RecordedRun
 from scvi_codegen.results.recording import load_run as load_run
 from scvi_codegen.results.recording import record_run as record_run

@@ -1,92 +1,53 @@
-"""Compilation pipeline: from a mechanical system and a method to a stepper.
+"""Compilation: from a mechanical system and a method to a stepper.
 
     MechanicalSystem, Method
-      -> discretise  StageSystem   points, kernel and tables: the equations of one step
-                                   (:mod:`scvi_codegen.methods.discretise`)
-      -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
-                                   (:mod:`scvi_codegen.lowering.solvers.selection`)
-      -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
-      -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
-      -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);
-                                   plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
-      -> build       library       compiled and cached (:mod:`scvi_codegen.native.building`); Newton's iteration is
-                                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.simd`)
-      -> Stepper                   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
-
-Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
-paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them in 60-digit arithmetic.
-:mod:`scvi_codegen.frameworks` extends the C source of one step and its derivatives to many steps for JAX, PyTorch and
-CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stage equations as CasADi expressions.
+      -> Sources   header, source and interface, derived once (:mod:`scvi_codegen.pipeline.sources`) and cached
+      -> build     library, compiled once (:mod:`scvi_codegen.native.building`); Newton's iteration is
+                   added when a fixed point first fails (:mod:`scvi_codegen.rendering.simd`)
+      -> Stepper   step, integrate (:mod:`scvi_codegen.runtime.core.stepper`)
 
 Each stage is a pure function of frozen data; only ``build`` touches the disk. Sources and compiled libraries are
-cached in the user's cache folder (:mod:`scvi_codegen.rendering.source_cache`), so later calls skip the derivation.
+cached in the user's cache folder (:mod:`scvi_codegen.files.source_cache`). If everything is in the cache, including the
+key of a system defined by text (:mod:`scvi_codegen.mechanics.deferred`), neither SymPy nor the pipeline is imported.
 """
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
-from typing import overload
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, cast, overload
 
 from numpy.typing import ArrayLike
-from sympy import Expr
 
 from scvi_codegen.errors import MethodError
+from scvi_codegen.files.source_cache import cached_source
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.indices import SIZES_REQUIRED
-from scvi_codegen.ir.iteration import Control
-from scvi_codegen.ir.program import Program
-from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
-from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
-from scvi_codegen.lowering.constraints import rattle_of
-from scvi_codegen.lowering.control import control_of, density_of
-from scvi_codegen.lowering.derivatives import derivatives_of
-from scvi_codegen.lowering.loops import with_sums
-from scvi_codegen.lowering.program import lower
-from scvi_codegen.lowering.solvers.selection import check_solver, iteration_of, splitting_of
-from scvi_codegen.mechanics.arrays.rolling import unroll_sums
-from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
-from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
-from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
-from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry, all_symmetries
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
-from scvi_codegen.mechanics.term_groups import rolled
-from scvi_codegen.mechanics.variational import with_tangent_vectors
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
-from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.methods.method import Method
-from scvi_codegen.native.announcements import announced
 from scvi_codegen.native.building import TUNED_FLAGS
-from scvi_codegen.rendering.events import with_events
-from scvi_codegen.rendering.program_source import (
-    EMBEDDED,
-    Embedded,
-    render,
-    render_derivatives,
-    render_embedded,
-    render_ensemble,
-    workspace_size,
-)
-from scvi_codegen.rendering.source import ArrayLayout, Interface, Source
-from scvi_codegen.rendering.source_cache import cached_source
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.runtime.core.compiled_method import Variants
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import EventLike, as_events
-from scvi_codegen.validation.argument_types import MAPPING, SWITCH, TEXT, TEXTS, checks_arguments
+from scvi_codegen.validation.argument_types import MAPPING, TEXT, TEXTS, ArgumentType, check_kind, checks_arguments
 
-__all__ = ["c_identifier", "compile_stepper", "describe", "generate_array_source", "generate_source", "program_of"]
+if TYPE_CHECKING:
+    from sympy import Expr
 
-LONGEST_PREFIX = 64
-C_HEADERS = frozenset(
-    """
-    assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef
-    stdint stdio stdlib string tgmath time wchar wctype unistd
-    """.split()  # noqa: SIM905  (a paragraph of words reads better than thirty quoted ones)
+    from scvi_codegen.mechanics.arrays.system import ArraySystem
+    from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
+    from scvi_codegen.pipeline.sources import ArraySources, Sources
+    from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+
+__all__ = ["compile_stepper"]
+
+SYSTEM_OR_ARRAYS = ArgumentType(
+    "a LagrangianSystem or a HamiltonianSystem", lambda value: isinstance(value, MechanicalSystem)
 )
-SOLVERS = ("auto", "explicit", "fixed-point", "newton")
+"""Type check of systems, also of those with arrays of run-time sizes."""
 
 
 @overload
@@ -117,7 +78,6 @@ def compile_stepper(
     solver=TEXT,
     flags=TEXTS,
     prefix=TEXT,
-    symmetries=SYMMETRIES,
     sizes=MAPPING,
     tables=MAPPING,
 )
@@ -165,379 +125,78 @@ def compile_stepper(
         BuildError: if there is no C compiler.
         MethodError: if the method, the solver or another argument is not available for the system.
     """
+    if symmetries != ():
+        from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES
+
+        check_kind(SYMMETRIES, symmetries, "symmetries")
     if sizes is not None or tables is not None:
+        from scvi_codegen.mechanics.arrays.rolling import unroll_sums
+
         system = unroll_sums(system, sizes or {}, tables=tables)
-    if isinstance(system, ArraySystem):
+    if known_sizes := not hasattr(system, "REQUIRES_SIZES"):
+        method = as_method(method, system)
+    else:
         _check_sizes_not_needed(system, symmetries=symmetries, events=events, time_transformation=time_transformation)
-        array_sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
-        variants = Variants(make=lambda name: array_sources.controlled if name == "controlled" else None)
-        return ArrayStepper(array_sources.plain, array_sources.interface, variants=variants, flags=flags)
-    sources = _Sources(system, as_method(method, system), solver, prefix, symmetries, time_transformation)
-    own = json.loads(cached_source((*sources.key, "integrator"), sources.integrator))
-    source, interface = Source.from_json(own[0]), Interface.from_json(own[1])
-    return Stepper(
-        source,
-        interface,
-        variants=Variants(make=sources.variant),
-        flags=flags,
-        events=as_events(events),
-    )
+        method = as_method(method)
+    sources = CachedSources(system, method, solver, prefix, symmetries, time_transformation)
+    source, interface = sources.integrator()
+    variants = Variants(make=sources.variant)
+    if not known_sizes:
+        from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+
+        return ArrayStepper(source, interface, variants=variants, flags=flags)
+    cast(MechanicalSystem, system).store_key()
+    return Stepper(source, interface, variants=variants, flags=flags, events=as_events(events))
 
 
-def _check_sizes_not_needed(system: ArraySystem, **arguments: object) -> None:
+def _check_sizes_not_needed(system: MechanicalSystem | ArraySystem, **arguments: object) -> None:
     """Raise an error for an argument that requires known sizes."""
     for name, value in arguments.items():
         if value:
             raise MethodError(f"{name} of compile_stepper() is not available for '{system.name}': {SIZES_REQUIRED}")
 
 
-class _Sources:
-    """C sources of one integrator and its variants, derived on first use."""
+class CachedSources:
+    """C sources of one integrator and its variants, from the cache if they were derived before."""
 
     def __init__(
         self,
-        system: MechanicalSystem,
+        system: MechanicalSystem | ArraySystem,
         method: Method,
         solver: str,
         prefix: str | None,
         symmetries: Sequence[Symmetry],
         g: str | Expr | None,
     ) -> None:
-        self.system, self.method, self.solver, self.g = system, method, solver, g
+        self.system, self.method, self.solver, self.prefix = system, method, solver, prefix
+        self.symmetries, self.g = symmetries, g
         self.key = (*system.key(), *method.key(), key_of((solver, prefix, tuple(symmetries), g)))
-        self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
-        self._programs: dict[bool, Program] = {}
 
-    def program(self, *, fallback: bool = False) -> Program:
-        """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
-        if fallback not in self._programs:
-            with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-                self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
-        return self._programs[fallback]
+    @cached_property
+    def derived(self) -> Sources | ArraySources:
+        """The sources that are not in the cache."""
+        from scvi_codegen.pipeline.sources import sources_of
 
-    @property
-    def uses_fallback_library(self) -> bool:
-        """Return whether Newton's iteration comes from a separate fallback library."""
-        return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
+        return sources_of(self.system, self.method, self.solver, self.prefix, self.symmetries, self.g)
 
-    def integrator(self) -> str:
-        """Return the C source and its interface as JSON."""
-        interface = describe(
-            self.program(),
-            self.system,
-            self.method,
-            uses_fallback_library=self.uses_fallback_library,
-            g=self.g,
-        )
-        return json.dumps([self._rendered().to_json(), interface.to_json()])
+    def integrator(self) -> tuple[Source, Interface]:
+        """Return the C source and its interface."""
 
-    def controlled(self) -> Source | None:
-        """Return the source with adaptive steps, or with the step-density controller; else ``None``."""
-        control = control_of(self.program()) if self.g is None else density_of(self.system, self.g)
-        return self._rendered(control) if control else None
+        def derive() -> str:
+            source, interface = self.derived.integrator()
+            return json.dumps([source.to_json(), interface.to_json()])
 
-    def fallback(self) -> Source | None:
-        """Return the source with Newton's iteration if the integrator itself contains none."""
-        return render(self.program(fallback=True), fallback="provided") if self.uses_fallback_library else None
-
-    def tangent(self, *, second: bool = False) -> Source | None:
-        """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
-
-        Second derivatives are unavailable in transformed time and for damped systems.
-        """
-        if second and (self.system.integrands or self.system.damping):
-            return None
-        program = self.program(fallback=True)
-        if not program.newton:  # explicit steps
-            program = self._derived(solver="newton")
-        stages = discretise(self.system, self.method)
-        with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
-            return render_derivatives(derivatives_of(self.system, stages, program, second=second))
-
-    def changes(self, count: int) -> Source | None:
-        """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
-        twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
-        varied = (
-            with_tangent_vectors(twin, count)
-            if twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass
-            else None
-        )
-        if varied is None:
-            return None
-        stages, prefix = discretise(varied, self.method), self.program().prefix
-        program = lower(
-            varied, self.method, stages, prefix=prefix, fixed_point=iteration_of(varied, stages), newton=False
-        )
-        return render_ensemble(program)
-
-    def _rendered(self, control: Control | None = None) -> Source:
-        return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
+        source, interface = json.loads(cached_source((*self.key, "integrator"), derive))
+        if hasattr(self.system, "REQUIRES_SIZES"):  # JSON cannot represent arrays
+            return Source.from_json(source), self.derived.interface
+        return Source.from_json(source), Interface.from_json(interface)
 
     def variant(self, name: str) -> Source | None:
-        """Return the source of a variant (:class:`Variants`) from the cache, or derive it."""
-        kind, _, count = name.partition(" ")
-        made: dict[str, Callable[[], Source | None]] = {
-            "ensemble": lambda: render_ensemble(self.program()),
-            "controlled": self.controlled,
-            "fallback": self.fallback,
-            "derivatives": self.tangent,
-            "second_derivatives": lambda: self.tangent(second=True),
-            "changes": lambda: self.changes(int(count)),
-        }
-        text = cached_source((*self.key, name), lambda: _json_of(made[kind]()))
+        """Return the source of a variant (:class:`Variants`)."""
+
+        def derive() -> str:
+            source = self.derived.variant(name)
+            return "" if source is None else source.to_json()
+
+        text = cached_source((*self.key, name), derive)
         return Source.from_json(text) if text else None
-
-
-def _json_of(source: Source | None) -> str:
-    return "" if source is None else source.to_json()
-
-
-class _ArraySources:
-    """C sources of one integrator of arrays whose sizes are known at run time, derived on first use.
-
-    ArraySystem, Method -> lower -> Program (kernels of terms, tables of one coordinate) -> render -> Source.
-    """
-
-    def __init__(self, system: ArraySystem, method: Method, solver: str, prefix: str | None) -> None:
-        self.solver = "fixed-point" if solver == "auto" else solver
-        check_solver_of_arrays(self.solver)
-        system.check_run_time_sizes()
-        self.system, self.method = system, method
-        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
-
-    @cached_property
-    def program(self) -> Program:
-        """Lowered program with fixed step size."""
-        with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
-            try:
-                return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
-            except MethodError as error:
-                raise MethodError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
-
-    @cached_property
-    def plain(self) -> Source:
-        """C source with fixed step size."""
-        return Source.from_json(self._remembered("arrays", lambda: render(self.program).to_json()))
-
-    @cached_property
-    def controlled(self) -> Source | None:
-        """C source with adaptive steps; ``None`` if the method has no error estimate."""
-
-        def text() -> str:
-            control = control_of(self.program)
-            return render(self.program, control).to_json() if control else ""
-
-        document = self._remembered("arrays, adaptive", text)
-        return Source.from_json(document) if document else None
-
-    def _remembered(self, what: str, make: Callable[[], str]) -> str:
-        return cached_source((*self.system.key(), *self.method.key(), self.prefix, self.solver, what), make)
-
-    @property
-    def interface(self) -> Interface:
-        """Interface of the generated library."""
-        system, method = self.system, self.method
-        layout = ArrayLayout(
-            sizes=system.sizes,
-            coordinates=system.coordinates,
-            momenta=system.momenta,
-            fields=system.fields,
-            tables=system.tables,
-            field_defaults=system.field_defaults,
-            maps=momentum_maps(system),
-            accesses=system.accesses,
-            depends_on_time=system.depends_on_time,
-            constraints=tuple(term.loops for term in system.constraints),
-            continued=not (method.fractions or system.constraints),
-        )
-        return Interface(
-            prefix=self.prefix,
-            title=f"{system.name}: {method.title}",
-            system=system.name,
-            method=method.name,
-            coordinates=tuple(array.name for array in system.coordinates),
-            parameters=tuple(parameter.name for parameter in system.parameters),
-            defaults=system.defaults,
-            inputs=system.inputs,
-            conserves_energy=not (system.momenta or system.changes_energy or system.inputs),
-            solver="rattle" if system.constraints else self.solver,
-            layout=layout,
-        )
-
-
-def generate_array_source(
-    system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
-) -> tuple[Source, Interface]:
-    """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
-    sources = _ArraySources(system, as_method(method, one_coordinate(system)), solver, prefix)
-    return sources.plain, sources.interface
-
-
-@checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
-def generate_source(
-    system: MechanicalSystem,
-    method: Method | str,
-    *,
-    solver: str = "auto",
-    prefix: str | None = None,
-    symmetries: Sequence[Symmetry] = (),
-    events: EventLike | Sequence[EventLike] | None = None,
-    embedded: Embedded | None = None,
-    amalgamate: bool = False,
-    controlled: bool = False,
-    time_transformation: str | Expr | None = None,
-) -> tuple[Source, Interface]:
-    """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
-
-    Args:
-        embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
-            Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
-        amalgamate: include the support headers in the source; always done for a microcontroller.
-        controlled: use adaptive steps, if the method has an error estimate.
-        time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
-
-    Raises:
-        MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
-            events are combined with ``embedded``.
-    """
-    method = as_method(method, system)
-    functions = tuple(event.function for event in as_events(events))
-    _check_embedded(embedded, solver, functions)
-    program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
-    g = time_transformation
-    control = density_of(system, g) if g is not None else control_of(program) if controlled else None
-    source = render_embedded(program, embedded, control) if embedded else render(program, control)
-    interface = describe(program, system, method, g=g)
-    complete = with_events(source, interface, functions) if functions else source
-    return (complete.amalgamated() if amalgamate else complete), interface
-
-
-def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
-    if embedded not in (None, *EMBEDDED):
-        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
-    if embedded and solver == "fixed-point":
-        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
-    if embedded and functions:
-        raise MethodError("source for a microcontroller does not support events: omit events or embedded")
-
-
-def program_of(
-    system: MechanicalSystem,
-    method: Method,
-    *,
-    solver: str = "auto",
-    prefix: str | None = None,
-    symmetries: Sequence[Symmetry] = (),
-    lanes: bool = True,
-    fallback: bool = True,
-) -> Program:
-    """Return the lowered program of an integrator; other arguments as of :func:`compile_stepper`.
-
-    Args:
-        lanes: allow a solver that uses SIMD lanes.
-        fallback: include Newton's iteration as a fallback. Systems with integrals along the curve always include it.
-    """
-    name = c_identifier(prefix or f"{system.name}_{method.name}")
-    tracked = all_symmetries(system, symmetries)
-    program_part = partial(
-        _program, method=method, solver=solver, prefix=name, symmetries=tracked, lanes=lanes, fallback=fallback
-    )
-    parts = rolled(system)
-    looped = with_sums(program_part(parts.rest), parts) if parts else None
-    return looped or program_part(system)
-
-
-def _program(
-    system: MechanicalSystem,
-    *,
-    method: Method,
-    solver: str,
-    prefix: str,
-    symmetries: Sequence[Symmetry],
-    lanes: bool,
-    fallback: bool,
-) -> Program:
-    """Lower a system without rolling its terms into loops."""
-    stages = discretise(system, method)
-    explicit = solver in ("auto", "explicit") and not system.integrands
-    splitting = splitting_of(system, method) if explicit else None
-    use_fixed_point = lanes and solver in ("auto", "fixed-point") and splitting is None
-    fixed_point = iteration_of(system, stages) if use_fixed_point else None
-    check_solver(solver, method, SOLVERS, found=splitting if solver == "explicit" else fixed_point)
-    alone = fixed_point is not None and not fallback and not system.integrands
-    newton = solver in ("auto", "newton") and splitting is None and not alone
-    return lower(
-        system,
-        method,
-        stages,
-        prefix=prefix,
-        fixed_point=fixed_point,
-        splitting=splitting,
-        newton=newton,
-        rattle=rattle_of(system, stages) if solver == "auto" else None,
-        symmetries=symmetries,
-    )
-
-
-def describe(
-    program: Program,
-    system: MechanicalSystem,
-    method: Method,
-    *,
-    uses_fallback_library: bool = False,
-    g: str | Expr | None = None,
-) -> Interface:
-    """Return the interface of a program; ``uses_fallback_library``: a separate library has Newton's iteration."""
-    return Interface(
-        prefix=program.prefix,
-        title=program.title,
-        notes=program.notes,
-        system=system.name,
-        method=method.name,
-        coordinates=program.layout.names,
-        parameters=program.layout.parameters,
-        defaults=program.layout.defaults,
-        unknowns=program.equations.unknowns,
-        workspace=workspace_size(program),
-        has_action=program.action or (uses_fallback_library and program.equations.acts),
-        map_names=tuple(each.name for each in program.quantities.momentum_maps),
-        map_formulas=tuple(each.formula for each in program.quantities.momentum_maps),
-        map_exact=tuple(each.exact for each in program.quantities.momentum_maps),
-        has_fallback=uses_fallback_library or (program.newton and program.fixed_point is not None),
-        momentum_names=tuple(momentum.name for momentum in system.momentum_symbols),
-        time_transformation="" if g is None else str(g),
-        exchange_names=program.quantities.work_and_impulses,
-        constraints=program.constraints.formulas if program.constraints else (),
-        inputs=system.inputs,
-        conserves_energy=not system.changes_energy and not system.inputs,
-        arrays=_arrays_of(system),
-        energy_parameter=system.clock.energy.name if system.clock else "",
-        solver=_solver_of(program),
-    )
-
-
-def _arrays_of(system: MechanicalSystem) -> tuple[str, ...]:
-    """Return the declarations of the arrays whose entries are all of the coordinates, or parameters."""
-    names = [each.name for each in (*system.coordinates, *system.parameters)]
-    known = [array for array in system.arrays if set(array.elements) <= set(names)]
-    listed = [name for array in known for name in array.elements]
-    whole = listed[: system.dimension] == names[: system.dimension]
-    return tuple(str(array) for array in known if array.axes or whole) if whole else ()
-
-
-def _solver_of(program: Program) -> str:
-    """Return the name of the solver that is tried first."""
-    if program.splitting:
-        return "explicit"
-    return "rattle" if program.rattle else "fixed-point" if program.fixed_point else "newton"
-
-
-def c_identifier(name: str) -> str:
-    """Return a name of lower-case letters, digits and underscores that begins with a letter, of limited length.
-
-    Single letters (``X_OK`` is a POSIX macro) and names of C headers get a suffix.
-    """
-    cleaned = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:LONGEST_PREFIX].strip("_")
-    if not cleaned[:1].isalpha():
-        return f"integrator_{cleaned}".rstrip("_")
-    return f"{cleaned}_integrator" if len(cleaned) == 1 or cleaned in C_HEADERS else cleaned

@@ -24,7 +24,7 @@ from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
 from scvi_codegen.methods import ARGUMENTS, Method, as_method, method_from_specification
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.native.arguments import checked_number
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.representation import summary

@@ -15,10 +15,11 @@ import numpy as np
 from scvi_codegen.benchmark.cases.unforced import Array, Case, case
 from scvi_codegen.benchmark.report import ResultTable
 from scvi_codegen.benchmark.settings import Plan, ReportActivity, seconds_in_turn
-from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.native import building
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings

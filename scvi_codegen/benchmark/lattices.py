@@ -19,7 +19,8 @@ from scvi_codegen.benchmark.machine import machine_limits
 from scvi_codegen.benchmark.report import OURS, Point, ResultTable, time_at
 from scvi_codegen.benchmark.settings import Plan, ReportActivity, output_of_process, timed
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.methods.composition import Composition, kicks_and_drifts
+from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.native import building
 from scvi_codegen.rendering.source import Source
 from scvi_codegen.runtime.arrays.run import ArrayRun

@@ -15,7 +15,7 @@ from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, warn
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory

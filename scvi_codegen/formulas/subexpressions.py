@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import sympy
+if TYPE_CHECKING:
+    import sympy
 
 __all__ = ["identity", "key_of", "parts"]
 
@@ -36,13 +38,15 @@ def identity(expression: sympy.Basic) -> str:
     Integer(2)
     Pow(2, 3)
     """
+    from sympy import srepr
+
     numbers: dict[sympy.Basic, int] = {}
     lines: list[str] = []
 
     def number_of(part: sympy.Basic) -> int:
         if part not in numbers:
             inner = ", ".join([str(number_of(argument)) for argument in part.args])
-            lines.append(f"{type(part).__name__}({inner})" if part.args else sympy.srepr(part))
+            lines.append(f"{type(part).__name__}({inner})" if part.args else srepr(part))
             numbers[part] = len(lines) - 1
         return numbers[part]
 
@@ -65,7 +69,7 @@ def key_of(value: Any) -> str:
     if is_dataclass(value) and not isinstance(value, type):
         named = ", ".join(f"{field.name}={key_of(getattr(value, field.name))}" for field in fields(value))
         return f"{type(value).__module__}.{type(value).__qualname__}({named})"
-    if isinstance(value, sympy.Basic):
+    if "sympy" in sys.modules and isinstance(value, sys.modules["sympy"].Basic):
         return repr(identity(value))
     if hasattr(value, "_mpf_"):
         return f"mpf{value._mpf_}"

@@ -14,13 +14,12 @@ import math
 import re
 import unicodedata
 from collections.abc import Sequence
-from typing import Any
-
-from sympy import Symbol
-from sympy.core.function import AppliedUndef
+from typing import TYPE_CHECKING, Any
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.vocabulary import FUNCTIONS
+
+if TYPE_CHECKING:
+    from sympy import Symbol
 
 __all__ = ["C_KEYWORDS", "DOT", "TIME", "check_name", "check_names", "identifier", "name_of_key", "number", "symbol"]
 
@@ -39,6 +38,8 @@ DOT = "_dot"
 
 def symbol(name: str) -> Symbol:
     """Return the real symbol of that name."""
+    from sympy import Symbol
+
     return Symbol(name, real=True)
 
 
@@ -69,10 +70,13 @@ def _letter(character: str) -> str:
 
 def name_of_key(key: object) -> str:
     """Return the name of a parameter that is a symbol, a function of time or text."""
-    if isinstance(key, (Symbol, AppliedUndef)):
-        return str(key.name)
     if isinstance(key, str):
         return key
+    from sympy import Symbol
+    from sympy.core.function import AppliedUndef
+
+    if isinstance(key, (Symbol, AppliedUndef)):
+        return str(key.name)
     raise SystemDefinitionError(f"a parameter must be a symbol or a name, not {key!r} ({type(key).__name__})")
 
 
@@ -86,6 +90,8 @@ def check_name(name: object) -> None:
         )
     if name in C_KEYWORDS:
         raise SystemDefinitionError(f"'{name}' is a keyword of C: rename the symbol, for example to '{name}_'")
+    from scvi_codegen.formulas.vocabulary import FUNCTIONS
+
     if name in FUNCTIONS or name == "pi":
         raise SystemDefinitionError(f"'{name}' is reserved in formulas: rename the symbol, for example to '{name}_'")
 

@@ -17,8 +17,8 @@ from scvi_codegen.ir.kernel import Kernel
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.derived_expressions import Entries, forms_of
-from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_system import StageGroup, StageSystem
 

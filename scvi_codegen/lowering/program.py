@@ -33,7 +33,8 @@ from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.work_and_impulse import work_rates
 from scvi_codegen.methods.constraints import END_VELOCITY
-from scvi_codegen.methods.method import Method, is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_structure import Accelerations, PrintedCurve, ShotCurve, Velocities
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.basis import cardinal_values, legendre_functional

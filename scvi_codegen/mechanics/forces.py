@@ -1,4 +1,4 @@
-"""Generalised forces: friction, drives and motors, given per coordinate or by Rayleigh's dissipation function.
+"""Forces and damping: generalised forces per coordinate or by Rayleigh's function, and damping of all momenta.
 
 With forces f the equations of motion follow from the principle of Lagrange and d'Alembert,
 
@@ -10,6 +10,21 @@ conserved as before. For a Hamiltonian they are forces on momenta, p' = -H_q + f
 
 Sources: C. Kane, J. E. Marsden, M. Ortiz, M. West, Int. J. Numer. Meth. Eng. 49 (2000); J. E. Marsden, M. West, Acta
 Numerica 10 (2001), part 3; C. M. Campos, S. Ober-Bloebaum, Math. Model. Numer. Anal. 49 (2015).
+
+Uniform damping: one rate gamma for all momenta; each step contracts phase-space area by exactly exp(-gamma h).
+
+The damped equations follow from the action of Caldirola and Kanai,
+
+    delta int e^(gamma t) L dt = 0,      that is      d/dt L_v = L_q - gamma L_v,
+
+whose flow is conformally symplectic: it multiplies dq ^ dp by e^(-gamma t). A step discretises this action like any
+other, with time measured from the start of the step, and divides the final momentum by e^(gamma h): the quadrature
+weights w_n become w_n e^(gamma c_n h). Nothing grows from step to step, the order is that of the method, masses are
+unchanged, and the map contracts areas and momentum maps of L by e^(-gamma h), both to round-off, for any step size.
+(A splitting, half of the damping before and half after each step, does so too, at order 2.)
+
+Sources: P. Caldirola, Nuovo Cimento 18 (1941); E. Kanai, Prog. Theor. Phys. 3 (1948); R. McLachlan, M. Perlmutter,
+Conformal Hamiltonian systems, J. Geom. Phys. 39 (2001); J. E. Marsden, M. West, Acta Numerica 10 (2001), section 1.3.
 """
 
 from __future__ import annotations
@@ -24,7 +39,7 @@ from scvi_codegen.errors import SystemDefinitionError, closest
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.symbols import name_of_key
 
-__all__ = ["dissipative_forces", "forces_by_coordinate"]
+__all__ = ["check_damping", "damping_rate", "dissipative_forces", "forces_by_coordinate"]
 
 
 def forces_by_coordinate(
@@ -61,3 +76,19 @@ def dissipative_forces(dissipation: Expr, velocities: Sequence[Symbol]) -> tuple
             "the forces -dD/dv. Add velocities, or remove it"
         )
     return tuple(-derivatives.get(i, sympy.S.Zero) for i in range(len(velocities)))
+
+
+def damping_rate(damping: Any, read: Callable[[Any], Expr]) -> Expr:
+    """Return the damping rate gamma, 0 if it is ``None``."""
+    return sympy.S.Zero if damping is None else read(damping)
+
+
+def check_damping(name: str, damping: Expr, parameters: Sequence[Symbol]) -> None:
+    """Raise :class:`SystemDefinitionError` unless the damping rate depends on parameters only."""
+    others = sorted(free.name for free in damping.free_symbols.difference(parameters))
+    if others:
+        raise SystemDefinitionError(
+            f"the damping {damping} of '{name}' depends on '{others[0]}': damping is one rate for all "
+            "momenta, a number or a formula of parameters. Write damping that varies, or differs "
+            "between momenta, as forces"
+        )

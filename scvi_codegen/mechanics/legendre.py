@@ -1,8 +1,13 @@
-"""Symbolic Legendre transforms: of quadratic forms by matrix inverses, otherwise variable by variable."""
+"""Symbolic Legendre transforms between Lagrangians and Hamiltonians (paper, section 1.1).
+
+Quadratic forms are transformed by matrix inverses, other functions variable by variable.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
 
 import sympy
 from sympy import Expr, Symbol
@@ -10,12 +15,20 @@ from sympy import Expr, Symbol
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.formulas.canonical import unsupported_part
 from scvi_codegen.formulas.derivatives import gradient, hessian
+from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.inputs import input_formulas
+from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.mechanics.constraints import constraints_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.reading import default_momenta
 from scvi_codegen.mechanics.regularity import coupled_blocks, sample_points
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.tables.precision import mp
+from scvi_codegen.validation.argument_types import NAMES, TEXTS, checks_arguments, of
 
-__all__ = ["legendre_dual", "positive_parameters"]
+__all__ = ["equivalent_lagrangian", "hamiltonian_of", "lagrangian_of", "legendre_dual", "positive_parameters"]
 
 LARGEST_INVERSE = 3
 """Largest number of coupled momenta (velocities) whose quadratic form is inverted symbolically."""
@@ -113,3 +126,118 @@ def _is_inverse(system: MechanicalSystem, root: Expr, derivative: Expr, x: Symbo
         if abs(again - point[x]) > NEGLIGIBLE * (1 + abs(point[x])):
             return False
     return tried > 0
+
+
+@checks_arguments(system=of("a LagrangianSystem", LagrangianSystem), momenta=NAMES)
+def hamiltonian_of(system: LagrangianSystem, *, momenta: Sequence[str] | None = None) -> HamiltonianSystem:
+    """Return the Hamiltonian p . v - L of a Lagrangian, with v eliminated by p = dL/dv (paper, section 1.1).
+
+    Args:
+        system: the Lagrangian.
+        momenta: names of the momenta; by default ``p_`` before the name of the coordinate.
+
+    Raises:
+        SystemDefinitionError: if SymPy finds no closed-form solution of p = dL/dv.
+
+    >>> oscillator = LagrangianSystem.from_text(
+    ...     name="oscillator", coordinates=["x"], lagrangian="m*x_dot**2/2 - k*x**2/2", parameters={"m": 1, "k": 2})
+    >>> hamiltonian_of(oscillator).hamiltonian
+    k*x**2/2 + p_x**2/(2*m)
+    """
+    if system.constraints:
+        raise SystemDefinitionError(
+            f"'{system.name}' has constraints, which are supported for Lagrangians only: keep the "
+            "Lagrangian, or convert it without constraints"
+        )
+    names = default_momenta([q.name for q in system.coordinates]) if momenta is None else tuple(momenta)
+    if len(names) != system.dimension:
+        raise SystemDefinitionError(
+            f"there are {system.dimension} coordinates, but {len(names)} momenta: list one momentum per coordinate"
+        )
+    symbols = tuple(symbol(name) for name in names)
+    hamiltonian = legendre_dual(system, system.velocities, symbols)
+    velocities = dict(zip(system.velocities, _gradient_tuple(hamiltonian, symbols), strict=True))
+    return HamiltonianSystem(
+        name=system.name,
+        coordinates=system.coordinates,
+        momenta=symbols,
+        time=system.time,
+        parameters=system.parameters,
+        defaults=system.defaults,
+        hamiltonian=hamiltonian,
+        clock=system.clock,
+        forces=tuple(f.xreplace(velocities) for f in system.forces),
+        damping=system.damping,
+        inputs=system.inputs,
+    )
+
+
+@checks_arguments(system=of("a HamiltonianSystem", HamiltonianSystem), constraints=TEXTS)
+def lagrangian_of(system: HamiltonianSystem, *, constraints: Sequence[str] = ()) -> LagrangianSystem:
+    """Return the Lagrangian p . v - H of a Hamiltonian, with p eliminated by v = dH/dp (paper, section 1.1).
+
+    Args:
+        system: the Hamiltonian.
+        constraints: as of :meth:`LagrangianSystem.from_text`; they add G^T lambda to p' = -H_q. Momenta are those of
+            the Hamiltonian.
+
+    Raises:
+        SystemDefinitionError: if d2H/dp2 is singular, or SymPy finds no closed-form solution of v = dH/dp.
+    """
+    lagrangian = _lagrangian_of(system)
+    if not constraints:
+        return lagrangian
+    known = {x.name: x for x in (*system.coordinates, *lagrangian.velocities, system.time, *system.parameters)}
+    known |= {name: symbol(name) for name in system.inputs}
+    driven = input_formulas(system.inputs, system.time)
+    return replace(
+        lagrangian, constraints=constraints_of(constraints, lambda g: parse_expression(g, known).xreplace(driven))
+    )
+
+
+@lru_cache(maxsize=64)
+def _lagrangian_of(system: HamiltonianSystem) -> LagrangianSystem:
+    if not system.is_regular:
+        raise SystemDefinitionError(
+            f"'{system.name}' has no Lagrangian: d2H/dp2 is singular, so velocities do not determine "
+            "momenta. Use the Hamiltonian"
+        )
+    if system.clock and system.clock.rate.free_symbols & set(system.momenta):
+        raise SystemDefinitionError(
+            f"the time transformation of '{system.name}' depends on momenta, which is not supported for a "
+            "Lagrangian: use the Hamiltonian, or a formula in coordinates only"
+        )
+    lagrangian = legendre_dual(system, system.momenta, system.velocities)
+    momenta = dict(zip(system.momenta, _gradient_tuple(lagrangian, system.velocities), strict=True))
+    return LagrangianSystem(
+        name=system.name,
+        coordinates=system.coordinates,
+        time=system.time,
+        parameters=system.parameters,
+        defaults=system.defaults,
+        lagrangian=lagrangian,
+        clock=system.clock,
+        forces=tuple(f.xreplace(momenta) for f in system.forces),
+        damping=system.damping,
+        inputs=system.inputs,
+    )
+
+
+def equivalent_lagrangian(system: MechanicalSystem) -> LagrangianSystem | None:
+    """Return an equivalent Lagrangian system, possibly ``system`` itself; ``None`` if none is found."""
+    if isinstance(system, LagrangianSystem):
+        return system
+    return _equivalent_lagrangian(system) if isinstance(system, HamiltonianSystem) else None
+
+
+@lru_cache(maxsize=64)
+def _equivalent_lagrangian(system: HamiltonianSystem) -> LagrangianSystem | None:
+    try:
+        return _lagrangian_of(system)
+    except SystemDefinitionError:
+        return None
+
+
+def _gradient_tuple(f: Expr, variables: Sequence[Symbol]) -> tuple[Expr, ...]:
+    partials = gradient(f, variables)
+    return tuple(partials.get(i, sympy.S.Zero) for i in range(len(variables)))

@@ -13,32 +13,27 @@ A new kind of system is a frozen dataclass derived from :class:`MechanicalSystem
 and ``auxiliaries``, and ``formula``, the user's function; it validates itself on construction. Methods and lowering
 use nothing else, and expressions derived from them only through
 :func:`~scvi_codegen.mechanics.derived_expressions.forms_of`. Matrix-free solvers also use an equivalent Lagrangian, if
-one is known (:func:`~scvi_codegen.mechanics.hamiltonian.equivalent_lagrangian`).
+one is known (:func:`~scvi_codegen.mechanics.legendre.equivalent_lagrangian`).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Self
-
-import sympy
-from sympy import Expr, Symbol
+from typing import TYPE_CHECKING, Self
 
 from scvi_codegen.display.cards import Html, card, listed, plain
-from scvi_codegen.display.mathml import mathml_terms
 from scvi_codegen.errors import SystemDefinitionError, closest
-from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.inputs import inputs_by_name
-from scvi_codegen.formulas.subexpressions import key_of
-from scvi_codegen.formulas.symbols import DOT, TIME, check_names, name_of_key, number, symbol
-from scvi_codegen.formulas.writing import format_expression
+from scvi_codegen.formulas.symbols import DOT, number, symbol
 from scvi_codegen.indices import Array
-from scvi_codegen.mechanics.damping import check_damping
+from scvi_codegen.mechanics.deferred import Deferred
 from scvi_codegen.validation.argument_types import of
 
-__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation", "named_parameters"]
+if TYPE_CHECKING:
+    from sympy import Expr, Symbol
+
+__all__ = ["SYSTEM", "MechanicalSystem", "TimeTransformation"]
 
 MAX_OPERATIONS = 200
 """Maximum number of operations of a formula shown in a notebook."""
@@ -62,8 +57,14 @@ class TimeTransformation:
     plain: MechanicalSystem | None = field(default=None, compare=False, repr=False)
 
 
+def _zero() -> Expr:
+    from sympy import S
+
+    return S.Zero
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MechanicalSystem(ABC):
+class MechanicalSystem(Deferred, ABC):
     """Coordinates, time and parameters with default values; subclasses add the function.
 
     Attributes:
@@ -76,7 +77,7 @@ class MechanicalSystem(ABC):
         forces: m generalised forces in addition to the function (:mod:`scvi_codegen.mechanics.derived_expressions`), in
             (q, v, t) for a Lagrangian and (q, p, t) for a Hamiltonian, or empty (:mod:`scvi_codegen.mechanics.forces`).
         damping: damping rate gamma of all momenta, a formula of parameters, 0 without damping
-            (:mod:`scvi_codegen.mechanics.damping`).
+            (:mod:`scvi_codegen.mechanics.forces`).
         inputs: names of inputs, each represented by five of the parameters (:mod:`scvi_codegen.formulas.inputs`).
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.constraints`).
@@ -92,7 +93,7 @@ class MechanicalSystem(ABC):
     forces: tuple[Expr, ...] = ()
     constraints: tuple[Expr, ...] = ()
     inputs: tuple[str, ...] = ()
-    damping: Expr = sympy.S.Zero
+    damping: Expr = field(default_factory=_zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
 
     @property
@@ -109,6 +110,16 @@ class MechanicalSystem(ABC):
     @abstractmethod
     def formula(self) -> Expr:
         """Function that defines the system: L or H."""
+
+    @classmethod
+    def __subclasshook__(cls, other: type) -> bool:
+        """Count systems of arrays of run-time sizes as instances of the class that they name in ``ACTS_AS``."""
+        return getattr(other, "ACTS_AS", None) == cls.__name__ or NotImplemented
+
+    @property
+    def constrained(self) -> bool:
+        """True if there are constraints; reads no formulas."""
+        return bool(self._argument("constraints") if hasattr(self, "_key") else self.constraints)
 
     @property
     def dimension(self) -> int:
@@ -158,13 +169,9 @@ class MechanicalSystem(ABC):
 
     def _constraints_work(self) -> bool:
         """Return whether constraints can do work: they contain time, or A v + b = 0 with non-zero b."""
-        at_rest = dict.fromkeys(self.velocities, sympy.S.Zero)
+        at_rest = dict.fromkeys(self.velocities, _zero())
         rolling = [g for g in self.constraints if g.free_symbols & set(self.velocities)]
         return any(self.time in g.free_symbols for g in self.constraints) or any(g.xreplace(at_rest) for g in rolling)
-
-    def key(self) -> tuple[str, ...]:
-        """Return the key of this system in caches, made from its type and all of its fields."""
-        return (key_of(self),)
 
     def to_text(self) -> str:
         """Return the function as text that ``from_text`` accepts."""
@@ -172,6 +179,9 @@ class MechanicalSystem(ABC):
 
     def text_of(self, formula: Expr) -> str:
         """Return a formula of the system as text, with its inputs by their names."""
+        from scvi_codegen.formulas.inputs import inputs_by_name
+        from scvi_codegen.formulas.writing import format_expression
+
         return format_expression(inputs_by_name(formula, self.inputs))
 
     def with_parameters(self, **values: float) -> Self:
@@ -186,8 +196,12 @@ class MechanicalSystem(ABC):
         return replace(self, defaults=tuple(number(key, value) for key, value in changed.items()))
 
     def _repr_html_(self) -> str:
+        from sympy import Symbol, count_ops
+
+        from scvi_codegen.display.mathml import mathml_terms
+
         letter = "H" if self.auxiliaries else "L"
-        size = sympy.count_ops(self.formula)
+        size = count_ops(self.formula)
         formula = mathml_terms(self.formula, Symbol(letter)) if size <= MAX_OPERATIONS else ()
         written = " ".join(piece for term in formula for piece in term) or plain(f"{letter}: {size} operations")
         parameters = [f"{parameter.name} = {value:g}" for parameter, value in self.constants.items()]
@@ -212,68 +226,9 @@ class MechanicalSystem(ABC):
         for g in self.constraints:
             yield "constraint", plain(f"{self.text_of(g)} = 0")
 
-    def _check(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
-        """Raise :class:`SystemDefinitionError` for invalid names, default values or symbols of the formulas."""
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise SystemDefinitionError(f"the name of a system must be non-empty text, not {self.name!r}")
-        if any("\ud800" <= character <= "\udfff" for character in self.name):
-            raise SystemDefinitionError(
-                f"the name {self.name!r} contains an unpaired surrogate, which cannot be encoded in UTF-8: remove it"
-            )
-        for each in (*self.coordinates, *self.auxiliaries, self.time, *self.parameters):
-            if not isinstance(each, Symbol) or each != symbol(each.name):
-                raise SystemDefinitionError(
-                    f"{each!r} is not a real symbol: build systems with from_sympy or from_text"
-                )
-        if self.time.name != TIME:
-            raise SystemDefinitionError(f"time is called '{TIME}', not '{self.time}': build systems with from_sympy")
-        coordinates, parameters, momenta = (
-            [symbol.name for symbol in group] for group in (self.coordinates, self.parameters, self.auxiliaries)
-        )
-        check_names(coordinates, [*parameters, *self.inputs], momenta)
-        if len(self.defaults) != len(self.parameters):
-            raise SystemDefinitionError(
-                f"there are {len(self.parameters)} parameters, but {len(self.defaults)} default "
-                "values: give one value per parameter"
-            )
-        for parameter, value in self.constants.items():
-            number(parameter.name, value)
-        self._check_symbols_of_formula(what, arguments, kinds)
-
-    def _check_symbols_of_formula(self, what: str, arguments: Sequence[Symbol], kinds: str) -> None:
-        if self.forces and len(self.forces) != self.dimension:
-            raise SystemDefinitionError(
-                f"there are {self.dimension} coordinates, but {len(self.forces)} forces: give one force per coordinate"
-            )
-        check_damping(self.name, self.damping, self.parameters)
-        known = [*self.coordinates, *arguments, self.time, *self.parameters]
-        named = zip(self.coordinates, self.forces, strict=False)
-        formulas = {what: self.formula, **{f"force on {q.name}": force for q, force in named}}
-        formulas |= {"damping": self.damping}
-        formulas |= {f"constraint {k}": g for k, g in enumerate(self.constraints, 1)}
-        for where, formula in formulas.items():
-            problem = unsupported_part(formula)
-            if problem:
-                raise SystemDefinitionError(f"in the {where} of '{self.name}': {problem}")
-            unknown = sorted(free.name for free in formula.free_symbols.difference(known))
-            if unknown:
-                hint = closest(unknown[0], [symbol.name for symbol in known])
-                raise SystemDefinitionError(
-                    f"'{unknown[0]}' in the {where} is neither a coordinate, {kinds}, time nor a parameter{hint} "
-                    "Give it a default value among the parameters, or list it as a coordinate"
-                )
-
 
 def _free(name: str, taken: set[str]) -> str:
     return name if name not in taken else _free(f"_{name}", taken)
-
-
-def named_parameters(parameters: Mapping[Symbol | str, float] | None) -> dict[str, float]:
-    """Return default values by name, for keys that are symbols or names."""
-    by_name = {name_of_key(key): value for key, value in (parameters or {}).items()}
-    if len(by_name) < len(parameters or {}):
-        raise SystemDefinitionError("two parameters have the same name: rename one of them")
-    return by_name
 
 
 SYSTEM = of("a LagrangianSystem or a HamiltonianSystem", MechanicalSystem)

@@ -9,7 +9,7 @@ from typing import Any, Final
 from scvi_codegen.errors import MethodError, closest
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.collocation import SpectralCollocation
-from scvi_codegen.methods.composition import Composition
+from scvi_codegen.methods.composition import Composition, StoermerVerlet
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.methods.method import Method, Specification
 from scvi_codegen.methods.runge_kutta import (
@@ -25,7 +25,6 @@ from scvi_codegen.methods.runge_kutta import (
     RungeKutta,
 )
 from scvi_codegen.methods.shooting import SCVI
-from scvi_codegen.methods.stoermer_verlet import StoermerVerlet
 from scvi_codegen.validation.counts import checked_count
 
 __all__ = [
@@ -108,12 +107,12 @@ def as_method(method: Method | str, system: MechanicalSystem | None = None) -> M
 
 def default_method(system: MechanicalSystem) -> Method:
     """Return SVI(8); for a system with constraints, SVI(6) with Gauss-Lobatto points, at which they are imposed."""
-    return as_method("svi:6", system) if system.constraints else SVI(8)
+    return as_method("svi:6", system) if system.constrained else SVI(8)
 
 
 def fitted(specification: Specification, system: MechanicalSystem | None) -> Specification:
     """Add the default quadrature of an SVI for constraints: Gauss-Lobatto points, one more than the degree."""
-    wants = system is not None and system.constraints and specification.get("method") == "svi"
+    wants = system is not None and system.constrained and specification.get("method") == "svi"
     if not wants or "quadrature" in specification or "degree" not in specification:
         return specification
     return {**specification, "quadrature": f"gauss-lobatto:{int(str(specification['degree'])) + 1}"}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 
 from scvi_codegen.mechanics.derived_expressions import accelerations, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.methods.galerkin_stages import position_block
 from scvi_codegen.methods.stage_structure import Accelerations
 from scvi_codegen.methods.stage_system import (
     Block,
@@ -17,9 +19,11 @@ from scvi_codegen.methods.stage_system import (
     Table,
 )
 from scvi_codegen.tables.basis import (
+    differentiation_matrix,
     matrix_product,
     next_step,
 )
+from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Number, Vector, mp
 from scvi_codegen.tables.tableau import Tableau
 
@@ -28,6 +32,9 @@ __all__ = [
     "acceleration_extrapolation",
     "acceleration_gathers",
     "acceleration_unknowns",
+    "nodal_blocks",
+    "nodal_collocation",
+    "nodal_gathers",
     "position_system",
     "residual_group",
     "single_point",
@@ -146,4 +153,80 @@ def single_point(
             Gather(arguments=system.velocities, table=velocity, power=-1),
         ),
         scatters=(),
+    )
+
+
+def nodal_collocation(system: MechanicalSystem, nodes: Nodes) -> StageSystem:
+    """Return (18) as printed: unknowns Q^1 .. Q^s and v0; v0 from p0, p1 from v1 = V_s by the Legendre transform."""
+    size = nodes.degree
+    momenta = forms_of(system).momentum
+    none, last = Table.constant(size, size + 1), Table.named("", [[int(n == size - 1)] for n in range(size)])
+    group = residual_group(
+        system,
+        nodes.abscissae[1:],
+        nodal_gathers(system, nodes),
+        Scatter(results=(), table=Table.joined(Table.identity(size), Table.constant(size, 2)), power=0),
+        Scatter(results=momenta, table=Table.joined(none, last), power=0),
+    )
+    start = single_point(
+        system,
+        "start",
+        mp.zero,
+        Table.joined(Table.constant(1, 1, 1), Table.constant(1, size + 1)),
+        velocity_block=size,
+    )
+    start_table = Table.joined(Table.constant(1, size), Table.constant(1, 1, -1), Table.constant(1, 1))
+    return StageSystem(
+        blocks=nodal_blocks(nodes),
+        rows=(
+            *(Row(number="18", kind="stage", momentum=mp.zero) for _ in range(size)),
+            Row(number="p0", kind="Legendre", momentum=mp.one),
+        ),
+        stage_groups=(group, replace(start, scatters=(Scatter(results=momenta, table=start_table, power=0),))),
+        end_position=Table.joined(Table.constant(1, size), Table.constant(1, 1, 1), Table.constant(1, 1)),
+        end_momentum=mp.zero,
+        end_numbers=("15", "p1"),
+    )
+
+
+def nodal_blocks(nodes: Nodes) -> tuple[Block, ...]:
+    """Return the blocks Q^1 .. Q^s and v0."""
+    return (*(position_block(v, nodes) for v in range(1, nodes.degree + 1)), VELOCITY_BLOCK)
+
+
+def nodal_gathers(system: MechanicalSystem, nodes: Nodes, *, other_blocks: int = 0) -> tuple[Gather, Gather, Gather]:
+    """Return Q^i, V_i = (A Q + a0 q0)_i (15) and (A V + a0 v0)_i (16) at nodes 1 .. s, from (q0; Q^1 .. Q^s, v0)."""
+    size = nodes.degree
+    full = differentiation_matrix(nodes.points)[1:]
+    first = tuple((line[0],) for line in full)
+    inner = tuple(line[1:] for line in full)
+    zeros = Table.constant(size, 1)
+    padding = Table.constant(size, other_blocks)
+    derivative = Table.named("D", full, column=0)
+    acceleration = Table.joined(
+        Table.named("DD", matrix_product(inner, first), column=0),
+        Table.named("DD", matrix_product(inner, inner)),
+        Table(
+            entries=tuple((x / 2,) for (x,) in first),
+            names=tuple((f"D_{n}_0/2",) for n in range(1, size + 1)),
+        ),
+    )
+    return (
+        Gather(
+            arguments=system.coordinates,
+            table=Table.joined(zeros, Table.identity(size), zeros, padding),
+            power=0,
+        ),
+        Gather(
+            arguments=system.velocities,
+            table=Table.joined(derivative, zeros, padding),
+            power=-1,
+            scale=Fraction(2),
+        ),
+        Gather(
+            arguments=accelerations(system),
+            table=Table.joined(acceleration, padding),
+            power=-2,
+            scale=Fraction(4),
+        ),
     )

@@ -1,4 +1,4 @@
-"""Symmetric compositions of Stoermer-Verlet for separable systems: explicit, symplectic, of order 8 and 10.
+"""Stoermer-Verlet, and its symmetric compositions for separable systems: explicit, symplectic, of order 8 and 10.
 
 A step of size h is s leapfrog steps of sizes gamma_1 h .. gamma_s h with sum gamma_k = 1, gamma_k = gamma_{s+1-k}:
 
@@ -11,29 +11,22 @@ of Kahan & Li, Math. Comp. 66 (1997), and Sofroniou & Spaletta, Optim. Methods S
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import TYPE_CHECKING
 
 from scvi_codegen.errors import MethodError
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.method import Method, Specification
-from scvi_codegen.methods.stage_system import Block, Gather, Row, Scatter, StageGroup, StageSystem, Table
+from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.representation import summary
-from scvi_codegen.tables.basis import identity_matrix
+from scvi_codegen.tables.basis import extrapolation, identity_matrix
 from scvi_codegen.tables.precision import Vector, mp
+from scvi_codegen.tables.tableau import lobatto_iiia
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = [
-    "DRIFT_KICK_DRIFT",
-    "KICK_DRIFT_KICK",
-    "Composition",
-    "check_sequence",
-    "kicks_and_drifts",
-    "leapfrog_system",
-    "sequence_of",
-]
+if TYPE_CHECKING:
+    from scvi_codegen.display.number_tables import Part
+    from scvi_codegen.methods.stage_system import StageSystem
+
+__all__ = ["Composition", "StoermerVerlet"]
 
 KICK_DRIFT_KICK, DRIFT_KICK_DRIFT = "kick-drift-kick", "drift-kick-drift"
 """Sequences of a leapfrog step: forces at both ends, shared between steps, or forces in the middle."""
@@ -73,13 +66,13 @@ FIRST_HALVES = {
 """Coefficients gamma_1, gamma_2, .. before the middle one, which makes the sum 1; by order."""
 
 
-def check_sequence(sequence: str) -> None:
+def _check_sequence(sequence: str) -> None:
     """Raise :class:`MethodError` for an unknown sequence."""
     if sequence not in (KICK_DRIFT_KICK, DRIFT_KICK_DRIFT):
         raise MethodError(f"sequence must be '{KICK_DRIFT_KICK}' or '{DRIFT_KICK_DRIFT}', not {sequence!r}")
 
 
-def sequence_of(sequence: str) -> Specification:
+def _sequence_of(sequence: str) -> Specification:
     """Return the entry of a specification for a sequence; empty for the default."""
     return {} if sequence == KICK_DRIFT_KICK else {"sequence": sequence}
 
@@ -102,7 +95,7 @@ class Composition(Method):
     __repr__ = summary("composition_order", "sequence")
 
     def __post_init__(self) -> None:
-        check_sequence(self.sequence)
+        _check_sequence(self.sequence)
         order = checked_count(self.composition_order, "the order", least=2, error=MethodError)
         if order not in FIRST_HALVES:
             raise MethodError(f"order must be 2, 8 or 10, not {order}")
@@ -162,10 +155,12 @@ class Composition(Method):
 
     def specification(self) -> Specification:
         """See :meth:`Method.specification`."""
-        return {"method": "composition", "order": self.composition_order, **sequence_of(self.sequence)}
+        return {"method": "composition", "order": self.composition_order, **_sequence_of(self.sequence)}
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return the leapfrog equations; unknowns are the velocities V_k of the drifts, determined row after row."""
+        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
+
         return leapfrog_system(system, self)
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
@@ -173,92 +168,93 @@ class Composition(Method):
         return self.stage_system(system)
 
 
-def leapfrog_system(system: MechanicalSystem, method: Method) -> StageSystem:
-    """Return the leapfrog steps of a method, one after the other; unknowns are the velocities V_k of the drifts.
+@dataclass(frozen=True, slots=True)
+class StoermerVerlet(Method):
+    """Stoermer-Verlet: the two-stage Lobatto IIIA-IIIB pair, order 2, symplectic, symmetric.
 
-    Raises:
-        MethodError: for a system that is not separable.
+    For L = v^T M v / 2 - V(q, t) with constant M it is the leapfrog scheme, and the SVI of degree 1 with the
+    trapezoidal rule; for H = T(p) + V(q, t) it is explicit, too; for other systems it is implicit. Source: Hairer,
+    Lubich & Wanner, Geometric Numerical Integration, II.2.
+
+    Args:
+        sequence: ``"kick-drift-kick"``, or ``"drift-kick-drift"``: for separable systems only, with forces at the
+            middle of steps.
     """
-    twin = equivalent_lagrangian(system)
-    if twin is not None and forms_of(twin).separable:
-        system = twin
-    elif not forms_of(system).split:
-        raise MethodError(
-            f"{method.name} requires a separable system, L = sum m_i v_i^2 / 2 - V(q, t) with "
-            f"constant masses, or H = T(p) + V(q, t), without damping; '{system.name}' is not "
-            "separable: use an SVI"
+
+    sequence: str = KICK_DRIFT_KICK
+
+    def __post_init__(self) -> None:
+        _check_sequence(self.sequence)
+
+    @property
+    def drifts_first(self) -> bool:
+        """True if a step begins with a drift."""
+        return self.sequence == DRIFT_KICK_DRIFT
+
+    @property
+    def name(self) -> str:
+        """Name ``stoermer-verlet[-<sequence>]``."""
+        return f"stoermer-verlet{f'-{self.sequence}' * self.drifts_first}"
+
+    @property
+    def title(self) -> str:
+        """Display title."""
+        if self.drifts_first:
+            return "Stoermer-Verlet (drift, kick, drift)"
+        return "Stoermer-Verlet (Lobatto IIIA-IIIB pair of two stages)"
+
+    @property
+    def order(self) -> int | None:
+        """Order 2."""
+        return 2
+
+    @property
+    def symmetric(self) -> bool:
+        """Always true."""
+        return True
+
+    @property
+    def symplectic(self) -> bool:
+        """Always true."""
+        return True
+
+    @property
+    def exactness(self) -> Exactness:
+        """Exactness of straight lines; f may be linear in q."""
+        return Exactness(curve=1, quadrature=2, gauge=1)
+
+    @property
+    def fractions(self) -> Vector:
+        """Fractions of a single leapfrog step: 1."""
+        return (mp.one,)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Tableau of the positions."""
+        return (lobatto_iiia(2),)
+
+    def specification(self) -> Specification:
+        """See :meth:`Method.specification`."""
+        return {"method": "stoermer-verlet", **_sequence_of(self.sequence)}
+
+    def stage_system(self, system: MechanicalSystem) -> StageSystem:
+        """Return the pair by its generating function, unknowns V_1, V_2; drift-kick-drift as leapfrog equations."""
+        from scvi_codegen.methods.galerkin_stages import galerkin_system
+        from scvi_codegen.methods.leapfrog_stages import leapfrog_system
+
+        if self.drifts_first:
+            return leapfrog_system(system, self)
+        tableau = lobatto_iiia(2)
+        return galerkin_system(
+            system,
+            abscissae=tableau.c,
+            weights=tableau.b,
+            position=tableau.A,
+            velocity=identity_matrix(2),
+            end_position=tableau.b,
+            extrapolation=extrapolation(tableau.c, 1),
         )
-    kicks, drifts = kicks_and_drifts(method)
-    moving = [k for k, x in enumerate(drifts) if x]
-    return StageSystem(
-        blocks=tuple(Block(name=f"V_{k}", power=1, straight=(mp.zero, mp.one)) for k, _ in enumerate(moving, start=1)),
-        rows=tuple(Row(number=f"V_{k}", kind="IDEL", momentum=mp.one) for k, _ in enumerate(moving, start=1)),
-        stage_groups=(_kick_group(system, kicks, drifts), _drift_group(system, drifts)),
-        end_position=Table.joined(Table.constant(1, 1, 1), Table.named("gamma", (tuple(drifts[k] for k in moving),))),
-        end_momentum=mp.one,
-        end_numbers=("q1", "p1"),
-        extrapolation=identity_matrix(len(moving)),
-    )
 
-
-def _kick_group(system: MechanicalSystem, kicks: Vector, drifts: Vector) -> StageGroup:
-    """Return L_q at the positions before, between and after the drifts, added to all later velocities (kicks)."""
-    points, moving = ([k for k, x in enumerate(each) if x] for each in (kicks, drifts))
-    drifted = tuple(tuple(drifts[k] if k < n else mp.zero for k in moving) for n in points)
-    before = tuple(tuple(int(n <= k) for k in moving) for n in points)
-    return StageGroup(
-        name="kick",
-        abscissae=tuple(mp.fsum(line) for line in drifted),
-        weights=tuple(kicks[n] for n in points),
-        weight_names=tuple(f"w_{n}" for n in points),
-        gathers=(
-            Gather(
-                arguments=system.coordinates,
-                table=Table.joined(Table.constant(len(points), 1, 1), Table.named("a", drifted)),
-                power=0,
-            ),
-        ),
-        scatters=(
-            Scatter(
-                results=forms_of(system).force,
-                table=Table.joined(Table.named("", before), Table.constant(len(points), 1, 1)),
-                power=1,
-            ),
-        ),
-    )
-
-
-def _drift_group(system: MechanicalSystem, drifts: Vector) -> StageGroup:
-    """Return L_v at the velocity of each drift, which is its momentum."""
-    moving = [k for k, x in enumerate(drifts) if x]
-    size = len(moving)
-    return StageGroup(
-        name="drift",
-        abscissae=tuple(mp.fsum(drifts[:k]) for k in moving),
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=(
-            Gather(
-                arguments=system.velocities,
-                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
-                power=-1,
-            ),
-        ),
-        scatters=(
-            Scatter(
-                results=forms_of(system).momentum,
-                table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)),
-                power=0,
-            ),
-        ),
-    )
-
-
-def kicks_and_drifts(method: Method) -> tuple[Vector, Vector]:
-    """Return the weights of the kicks and of the drifts: kick 0, drift 0, kick 1, .., the last drift being 0.
-
-    If drifts come first, kick 0 has weight 0.
-    """
-    padded = (mp.zero, *method.fractions, mp.zero)
-    halves = tuple((a + b) / 2 for a, b in pairwise(padded))
-    return ((mp.zero, *method.fractions), halves) if method.drifts_first else (halves, (*method.fractions, mp.zero))
+    def paper_form(self, system: MechanicalSystem) -> StageSystem:
+        """Return the same equations: the paper uses the method without printing it."""
+        return self.stage_system(system)

@@ -14,8 +14,8 @@ dL/dt = L_q v + L_v a + L_t along the curve is summed as well (paper, 4.2.3).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError, MethodWarning, warn
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.arguments import (
@@ -23,20 +23,17 @@ from scvi_codegen.methods.arguments import (
     resolve_quadrature,
     resolve_space,
 )
-from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.galerkin_stages import galerkin_system, nodal_quadrature_group, position_block
-from scvi_codegen.methods.method import Method, Specification, degree_count
-from scvi_codegen.methods.stage_system import (
-    Row,
-    StageSystem,
-    stationary_nodal,
-)
+from scvi_codegen.methods.method import Exactness, Method, Specification, degree_count
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.basis import next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.spaces import CurveSpace
+
+if TYPE_CHECKING:
+    from scvi_codegen.display.number_tables import Part
+    from scvi_codegen.methods.stage_system import StageSystem
 
 __all__ = ["SVI"]
 
@@ -183,6 +180,8 @@ class SVI(Method):
         return self._equations(system, rounded=True)
 
     def _equations(self, system: MechanicalSystem, *, rounded: bool) -> StageSystem:
+        from scvi_codegen.methods.galerkin_stages import galerkin_system
+
         rule, curves = self.rule, self.curves
         points = curves.points(self.degree, rule)
         return galerkin_system(
@@ -206,6 +205,9 @@ class SVI(Method):
         """
         if not self.curves.nodal or self.rule.derivative_weights:
             return self._equations(system, rounded=False)
+        from scvi_codegen.methods.galerkin_stages import nodal_quadrature_group, position_block
+        from scvi_codegen.methods.stage_system import Row, stationary_nodal
+
         s = self.degree
         blocks = tuple(position_block(v, self.node_set) for v in range(1, s + 1))
         return stationary_nodal(

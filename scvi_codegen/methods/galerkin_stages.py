@@ -10,30 +10,39 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
+from sympy import Expr
+
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.derived_expressions import curve_rates, forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.method import unit_sum
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import (
     Block,
     Gather,
     Row,
     ScalarStageGroup,
+    Scatter,
+    StageGroup,
     StageSystem,
     Table,
     dyadic,
     stationary_increments,
+    unit_sum,
 )
-from scvi_codegen.tables.basis import (
-    cardinal_derivatives,
-    cardinal_values,
-)
+from scvi_codegen.tables.basis import cardinal_derivatives, cardinal_values, identity_matrix, next_step
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Matrix, Vector, mp
 from scvi_codegen.tables.quadrature import Quadrature
+from scvi_codegen.tables.tableau import Tableau
 
-__all__ = ["action_groups", "galerkin_system", "nodal_quadrature_group", "position_block"]
+__all__ = [
+    "action_groups",
+    "galerkin_system",
+    "lagrangian_scatters",
+    "nodal_quadrature_group",
+    "phase_space_system",
+    "position_block",
+]
 
 
 def galerkin_system(
@@ -181,3 +190,88 @@ def nodal_quadrature_group(
 def position_block(v: int, nodes: Nodes) -> Block:
     """Return the block of the unknown Q^v, whose initial guess is on the straight line."""
     return Block(name=f"Q_{v}", power=0, straight=(mp.one, nodes.abscissae[v]))
+
+
+def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
+    """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
+    size = len(tableau.b)
+    group = StageGroup(
+        name="stage",
+        abscissae=tableau.c,
+        weights=(mp.one,) * size,
+        weight_names=("",) * size,
+        gathers=(
+            Gather(
+                arguments=system.coordinates,
+                table=Table.joined(Table.constant(size, 1, 1), Table.named("a", tableau.A)),
+                power=0,
+            ),
+            Gather(
+                arguments=system.velocities,
+                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
+                power=-1,
+            ),
+        ),
+        scatters=(),
+    )
+    b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
+    return StageSystem(
+        blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
+        rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
+        stage_groups=(
+            lagrangian_scatters(
+                group,
+                system,
+                Scatter(results=(), table=Table.joined(_transposed(tableau), b_column), power=1),
+                Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),
+            ),
+        ),
+        end_position=Table.joined(Table.constant(1, 1, 1), _transposed_row(b_column)),
+        end_momentum=mp.one,
+        end_numbers=("22", "22"),
+        extrapolation=next_step(tableau.c),
+        shape=Velocities(
+            abscissae=tableau.c,
+            blocks=tableau.c,
+            position=tableau.A,
+            velocity=identity_matrix(size),
+            end=tableau.b,
+            weights=tableau.b,
+            variational=False,
+        ),
+    )
+
+
+def _transposed(tableau: Tableau) -> Table:
+    size = len(tableau.b)
+    table = Table.named("a", tableau.A)
+    return Table(
+        entries=tuple(tuple(table.entries[i][j] for i in range(size)) for j in range(size)),
+        names=tuple(tuple(table.names[i][j] for i in range(size)) for j in range(size)),
+    )
+
+
+def _transposed_row(column: Table) -> Table:
+    return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
+
+
+def lagrangian_scatters(
+    group: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
+) -> StageGroup:
+    """Return ``group`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
+    filled = (
+        _with_results(force_scatter, forms_of(system).force),
+        _with_results(momentum_scatter, forms_of(system).momentum),
+    )
+    return StageGroup(
+        name=group.name,
+        abscissae=group.abscissae,
+        weights=group.weights,
+        weight_names=group.weight_names,
+        gathers=group.gathers,
+        scatters=filled,
+    )
+
+
+def _with_results(scatter: Scatter, results: tuple[Expr, ...]) -> Scatter:
+    return Scatter(results=results, table=scatter.table, power=scatter.power, scale=scatter.scale)

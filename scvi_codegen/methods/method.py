@@ -9,40 +9,67 @@ overridden. Code outside this package does not distinguish between kinds of meth
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-
-import sympy
+from typing import TYPE_CHECKING
 
 from scvi_codegen.display.cards import card, plain
-from scvi_codegen.display.number_tables import Part, number_table, numbers_html
 from scvi_codegen.errors import MethodError
 from scvi_codegen.formulas.subexpressions import key_of
-from scvi_codegen.mechanics.constraints import nonholonomic_expressions
-from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.stage_system import Scatter, StageGroup, StageSystem, dyadic
-from scvi_codegen.tables.precision import Number, Vector, mp
+from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.tableau import MAX_STAGES
 from scvi_codegen.validation.counts import checked_count
 
-__all__ = [
-    "Method",
-    "Specification",
-    "check_regular",
-    "degree_count",
-    "is_symplectic",
-    "lagrangian_scatters",
-    "unit_sum",
-]
+if TYPE_CHECKING:
+    from scvi_codegen.display.number_tables import Part
+    from scvi_codegen.mechanics.symmetry.symmetry import Symmetry
+    from scvi_codegen.methods.stage_system import StageSystem
+
+__all__ = ["Exactness", "Method", "Specification", "degree_count"]
 
 degree_count = partial(checked_count, least=1, most=MAX_STAGES, error=MethodError)
 """Validation of a degree or a number of stages."""
 
 Specification = Mapping[str, str | int | bool | Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exactness:
+    """Momentum maps that a method conserves to round-off at any step size; by default none is claimed.
+
+    A variational method of degree s conserves a momentum map if the symmetry maps its curves to each other (A constant,
+    b of degree s in t) and its quadrature is exact for df/dt along them (of degree d s + k - 1 for terms t^k q^d of f):
+    L_d then changes by the difference of f between the ends. Runge-Kutta methods in phase space conserve momentum maps
+    linear in (t, q, p), symplectic ones also quadratic ones. Other momentum maps may be conserved without being
+    claimed.
+
+    Attributes:
+        polynomials: degree of the polynomials in (t, q, p) that the method conserves whenever the flow does.
+        curve, quadrature: degree of the curves, and order of the quadrature along them, of a variational method.
+        gauge: highest degree of f in q, if bounded otherwise than by the quadrature.
+    """
+
+    polynomials: int = 0
+    curve: int = -1
+    quadrature: int = -1
+    gauge: float = math.inf
+
+    def conserves(self, symmetry: Symmetry) -> bool:
+        """Return whether the momentum map of a symmetry is conserved exactly."""
+        terms = symmetry.degrees()
+        if terms is None:
+            return False
+        return max(map(sum, terms)) <= self.polynomials or all(self._allows(*term) for term in terms)
+
+    def _allows(self, k: int, d: int, e: int) -> bool:
+        """Return whether a term t^k q^d p^e is admissible: in the direction (e = 1) or the gauge (e = 0)."""
+        if e == 0:
+            return d <= self.gauge and d * self.curve + k <= self.quadrature
+        return e == 1 and ((d == 0 and k <= self.curve) or (d == 1 and k == 0 <= self.curve))
 
 
 class Method(ABC):
@@ -119,6 +146,8 @@ class Method(ABC):
         return ()
 
     def _repr_html_(self) -> str:
+        from scvi_codegen.display.number_tables import number_table, numbers_html
+
         facts = (
             ("name", plain(self.name)),
             ("order", plain("none claimed" if self.order is None else self.order)),
@@ -142,58 +171,3 @@ class Method(ABC):
     @abstractmethod
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Return the equations in the paper's notation."""
-
-
-def check_regular(method: Method, system: MechanicalSystem) -> None:
-    """Raise :class:`MethodError` for a Hamiltonian with singular d2H/dp2 and a method that requires regularity."""
-    if method.needs_regular and isinstance(system, HamiltonianSystem) and not system.is_regular:
-        raise MethodError(
-            f"{method.name} requires a regular Hamiltonian, but d2H/dp2 of '{system.name}' is "
-            "singular: use an SVI with as many quadrature points as its degree, or a Runge-Kutta or "
-            "collocation method in phase-space form"
-        )
-
-
-def is_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Return whether the steps preserve dq ^ dp: not with forces, damping or nonholonomic constraints."""
-    return system.damping == 0 and is_conformally_symplectic(method, system)
-
-
-def is_conformally_symplectic(method: Method, system: MechanicalSystem) -> bool:
-    """Return whether the steps multiply dq ^ dp by exp(-gamma h), where gamma is the damping rate."""
-    return method.symplectic and not system.forces and not any(nonholonomic_expressions(system))
-
-
-def unit_sum(weights: Sequence[Number]) -> Vector:
-    """Round weights in [0, 1] to multiples of 2^-52 and adjust the largest so that they sum to exactly 1.
-
-    Weights whose sum is not 1 (of an unusual quadrature) are only rounded.
-    """
-    rounded = list(dyadic([weights])[0])
-    excess = mp.fsum(rounded) - 1
-    if abs(excess) < mp.mpf("1e-12"):
-        largest = max(range(len(rounded)), key=lambda n: abs(rounded[n]))
-        rounded[largest] -= excess
-    return tuple(rounded)
-
-
-def lagrangian_scatters(
-    group: StageGroup, system: MechanicalSystem, force_scatter: Scatter, momentum_scatter: Scatter
-) -> StageGroup:
-    """Return ``group`` with L_q and L_v as kernel results, which fill in the ``results`` of these scatters."""
-    filled = (
-        _with_results(force_scatter, forms_of(system).force),
-        _with_results(momentum_scatter, forms_of(system).momentum),
-    )
-    return StageGroup(
-        name=group.name,
-        abscissae=group.abscissae,
-        weights=group.weights,
-        weight_names=group.weight_names,
-        gathers=group.gathers,
-        scatters=filled,
-    )
-
-
-def _with_results(scatter: Scatter, results: tuple[sympy.Expr, ...]) -> Scatter:
-    return Scatter(results=results, table=scatter.table, power=scatter.power, scale=scatter.scale)

@@ -17,33 +17,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.acceleration_stages import position_system
-from scvi_codegen.methods.exactness import Exactness
-from scvi_codegen.methods.galerkin_stages import galerkin_system
-from scvi_codegen.methods.method import Method, Specification, lagrangian_scatters
-from scvi_codegen.methods.stage_structure import Velocities
-from scvi_codegen.methods.stage_system import (
-    Block,
-    Gather,
-    Row,
-    Scatter,
-    StageGroup,
-    StageSystem,
-    Table,
-)
+from scvi_codegen.methods.method import Exactness, Method, Specification
 from scvi_codegen.representation import summary
 from scvi_codegen.tables import tableau as tableaux
-from scvi_codegen.tables.basis import (
-    identity_matrix,
-    next_step,
-)
-from scvi_codegen.tables.precision import mp
+from scvi_codegen.tables.basis import identity_matrix, next_step
 from scvi_codegen.tables.tableau import Tableau
 from scvi_codegen.validation.argument_types import NUMBERS, check_kind, checks_arguments, of
+
+if TYPE_CHECKING:
+    from scvi_codegen.display.number_tables import Part
+    from scvi_codegen.methods.stage_system import StageSystem
 
 __all__ = [
     "TABLEAU_METHODS",
@@ -57,7 +44,6 @@ __all__ = [
     "RadauIIA",
     "RungeKutta",
     "check_form",
-    "phase_space_system",
 ]
 
 FORMS = ("phase-space", "position")
@@ -140,6 +126,9 @@ class RungeKutta(Method):
 
     def stage_system(self, system: MechanicalSystem) -> StageSystem:
         """Return stage equations: from a generating function for symplectic tableaux, otherwise (22)."""
+        from scvi_codegen.methods.acceleration_stages import position_system
+        from scvi_codegen.methods.galerkin_stages import galerkin_system, phase_space_system
+
         tableau = self.tableau
         if self.form == "position":
             return position_system(system, tableau)
@@ -158,70 +147,10 @@ class RungeKutta(Method):
 
     def paper_form(self, system: MechanicalSystem) -> StageSystem:
         """Return the stage equations (22)-(23)."""
+        from scvi_codegen.methods.acceleration_stages import position_system
+        from scvi_codegen.methods.galerkin_stages import phase_space_system
+
         return (position_system if self.form == "position" else phase_space_system)(system, self.tableau)
-
-
-def phase_space_system(system: MechanicalSystem, tableau: Tableau) -> StageSystem:
-    """Return (22) on Hamilton's equations, with momenta eliminated by p_i = L_v(q_i, V_i)."""
-    size = len(tableau.b)
-    group = StageGroup(
-        name="stage",
-        abscissae=tableau.c,
-        weights=(mp.one,) * size,
-        weight_names=("",) * size,
-        gathers=(
-            Gather(
-                arguments=system.coordinates,
-                table=Table.joined(Table.constant(size, 1, 1), Table.named("a", tableau.A)),
-                power=0,
-            ),
-            Gather(
-                arguments=system.velocities,
-                table=Table.joined(Table.constant(size, 1), Table.identity(size)),
-                power=-1,
-            ),
-        ),
-        scatters=(),
-    )
-    b_column = Table(entries=tuple((x,) for x in tableau.b), names=tuple((f"b_{n + 1}",) for n in range(size)))
-    return StageSystem(
-        blocks=tuple(Block(name=f"V_{i}", power=1, straight=(mp.zero, mp.one)) for i in range(1, size + 1)),
-        rows=tuple(Row(number="22", kind="stage", momentum=mp.one) for _ in range(size)),
-        stage_groups=(
-            lagrangian_scatters(
-                group,
-                system,
-                Scatter(results=(), table=Table.joined(_transposed(tableau), b_column), power=1),
-                Scatter(results=(), table=Table.joined(Table.identity(size, -1), Table.constant(size, 1)), power=0),
-            ),
-        ),
-        end_position=Table.joined(Table.constant(1, 1, 1), _transposed_row(b_column)),
-        end_momentum=mp.one,
-        end_numbers=("22", "22"),
-        extrapolation=next_step(tableau.c),
-        shape=Velocities(
-            abscissae=tableau.c,
-            blocks=tableau.c,
-            position=tableau.A,
-            velocity=identity_matrix(size),
-            end=tableau.b,
-            weights=tableau.b,
-            variational=False,
-        ),
-    )
-
-
-def _transposed(tableau: Tableau) -> Table:
-    size = len(tableau.b)
-    table = Table.named("a", tableau.A)
-    return Table(
-        entries=tuple(tuple(table.entries[i][j] for i in range(size)) for j in range(size)),
-        names=tuple(tuple(table.names[i][j] for i in range(size)) for j in range(size)),
-    )
-
-
-def _transposed_row(column: Table) -> Table:
-    return Table(entries=(tuple(x for (x,) in column.entries),), names=(tuple(name for (name,) in column.names),))
 
 
 def check_form(form: str) -> None:

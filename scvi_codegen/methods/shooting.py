@@ -17,25 +17,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from scvi_codegen.display.number_tables import Part
 from scvi_codegen.errors import MethodError
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.arguments import resolve_nodes, resolve_quadrature
-from scvi_codegen.methods.exactness import Exactness
 from scvi_codegen.methods.galerkin import SVI
-from scvi_codegen.methods.method import Method, Specification, degree_count
-from scvi_codegen.methods.shooting_stages import printed_increments, printed_nodal, shooting_increments, shooting_nodal
-from scvi_codegen.methods.stage_system import (
-    StageSystem,
-)
+from scvi_codegen.methods.method import Exactness, Method, Specification, degree_count
 from scvi_codegen.representation import summary
 from scvi_codegen.tables.nodes import Nodes
 from scvi_codegen.tables.precision import Vector
 from scvi_codegen.tables.quadrature import Quadrature
 from scvi_codegen.tables.tableau import Tableau, collocation_tableau, tableau_by_name
 from scvi_codegen.validation.argument_types import NUMBERS, check_kind
+
+if TYPE_CHECKING:
+    from scvi_codegen.display.number_tables import Part
+    from scvi_codegen.methods.stage_system import StageSystem
 
 __all__ = ["SCVI"]
 
@@ -193,6 +191,8 @@ class SCVI(Method):
         """Return equations with unknowns v0, h a_i and h^-2 lambda_i; degree 1 is the SVI with the same quadrature."""
         if self.degree == 1:
             return self._line.stage_system(system)
+        from scvi_codegen.methods.shooting_stages import printed_increments, shooting_increments
+
         if self.variational:
             return shooting_increments(system, self.tableau, self.rule)
         return printed_increments(system, self.tableau, self.rule, self.node_set)
@@ -203,6 +203,8 @@ class SCVI(Method):
         With abscissae, and for quadratures with derivatives, which the paper does not write out: the compiled equations
         with unknowns v0, h a_i and h^-2 lambda_i, with all digits.
         """
+        from scvi_codegen.methods.shooting_stages import printed_nodal, shooting_increments, shooting_nodal
+
         if self.abscissae is not None or self.rule.derivative_weights:
             if self.degree == 1:
                 return self._line.paper_form(system)

@@ -12,11 +12,11 @@ from scvi_codegen.methods.acceleration_stages import (
     acceleration_extrapolation,
     acceleration_gathers,
     acceleration_unknowns,
+    nodal_blocks,
+    nodal_gathers,
     residual_group,
 )
-from scvi_codegen.methods.collocation import nodal_blocks, nodal_gathers
-from scvi_codegen.methods.galerkin_stages import action_groups, nodal_quadrature_group
-from scvi_codegen.methods.method import lagrangian_scatters, unit_sum
+from scvi_codegen.methods.galerkin_stages import action_groups, lagrangian_scatters, nodal_quadrature_group
 from scvi_codegen.methods.stage_structure import PrintedCurve, ShotCurve
 from scvi_codegen.methods.stage_system import (
     Block,
@@ -30,6 +30,7 @@ from scvi_codegen.methods.stage_system import (
     dyadic,
     stationary_increments,
     stationary_nodal,
+    unit_sum,
 )
 from scvi_codegen.tables.basis import (
     cardinal_derivatives,

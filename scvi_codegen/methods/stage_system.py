@@ -44,6 +44,7 @@ __all__ = [
     "dyadic",
     "stationary_increments",
     "stationary_nodal",
+    "unit_sum",
 ]
 
 DYADIC_BITS = 52
@@ -354,3 +355,16 @@ def stationary_nodal(
         end_momentum=mp.zero,
         end_numbers=end_numbers,
     )
+
+
+def unit_sum(weights: Sequence[Number]) -> Vector:
+    """Round weights in [0, 1] to multiples of 2^-52 and adjust the largest so that they sum to exactly 1.
+
+    Weights whose sum is not 1 (of an unusual quadrature) are only rounded.
+    """
+    rounded = list(dyadic([weights])[0])
+    excess = mp.fsum(rounded) - 1
+    if abs(excess) < mp.mpf("1e-12"):
+        largest = max(range(len(rounded)), key=lambda n: abs(rounded[n]))
+        rounded[largest] -= excess
+    return tuple(rounded)

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from scvi_codegen.compiler import generate_array_source
 from scvi_codegen.models.array_document import model_texts
 from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.folders import INTERFACE_FILE, record_text, write_folder
 from scvi_codegen.models.generated_folders import prefix_of, source_in
+from scvi_codegen.pipeline.sources import generate_array_source
 from scvi_codegen.rendering.program_source import render_array_example
 from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
 from scvi_codegen.runtime.arrays.stepper import ArrayStepper

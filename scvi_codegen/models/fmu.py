@@ -21,7 +21,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
-from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
@@ -31,6 +30,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import MODEL, example_of, model_text
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.program_source import ExampleRun, with_fmu
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.validation.argument_types import PATH, SWITCH, TEXT, TEXTS, checks_arguments

@@ -65,7 +65,10 @@ def _read(file: Path) -> str:
 
 def prefix_of(folder: Path) -> str:
     """Return the name of the folder, validated as a prefix of C names and as a Python module."""
-    from scvi_codegen.compiler import LONGEST_PREFIX, c_identifier  # imported here: it imports SymPy
+    from scvi_codegen.pipeline.program import (
+        LONGEST_PREFIX,
+        c_identifier,  # imported here: it imports SymPy
+    )
 
     try:
         name = folder.resolve().name

@@ -70,9 +70,10 @@ from scvi_codegen.errors import ModelFileError, SystemDefinitionWarning
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.indices import Array
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, lagrangian_of
+from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.plausibility import warn_of_mistakes
+from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.reparametrisation import with_time_transformation
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.time_rescaling import time_rescaling_function

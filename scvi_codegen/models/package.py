@@ -124,7 +124,7 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 def _texts(model: Model, prefix: str, solver: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return texts by file name, ``interface.json`` last."""
-    from scvi_codegen.compiler import generate_source
+    from scvi_codegen.pipeline.sources import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
     source, interface = generate_source(
@@ -205,7 +205,7 @@ def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
     """Return the (m,) initial momenta from the velocities, in 60 digits, so that no C compiler is required."""
     from scvi_codegen.formulas.tape import evaluate
     from scvi_codegen.mechanics.derived_expressions import forms_of
-    from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
+    from scvi_codegen.mechanics.legendre import equivalent_lagrangian
     from scvi_codegen.tables.precision import mp
 
     system = equivalent_lagrangian(model.system)

@@ -12,8 +12,9 @@ from scvi_codegen.errors import StateError
 from scvi_codegen.exact.solution import exact_motion, numbers
 from scvi_codegen.exact.step import derived_step
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of, lagrangian_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of, lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import (
     SCVI,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.errors import StateError, StepFailedError
 from scvi_codegen.exact.solution import numbers
-from scvi_codegen.methods.method import is_conformally_symplectic, is_symplectic
+from scvi_codegen.methods.discretise import is_conformally_symplectic, is_symplectic
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked, information

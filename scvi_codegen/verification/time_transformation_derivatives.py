@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scvi_codegen.exact.solution import exact_motion
 from scvi_codegen.exact.step import compiled_equations
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 from scvi_codegen.verification.certificate import Check, Finding, checked

@@ -28,7 +28,6 @@ from summed_equations import Evaluation
 
 import scvi_codegen as sc
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import program_of
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.equations import derive
@@ -41,8 +40,8 @@ from scvi_codegen.display.page.blocks import Formula, Paragraph
 from scvi_codegen.display.page.typesetting import SPACE
 from scvi_codegen.ir import curve_iterations, iterations
 from scvi_codegen.ir.iteration import FixedPointIteration
-from scvi_codegen.methods.discretise import paper_equations
-from scvi_codegen.methods.phase_space import with_auxiliaries
+from scvi_codegen.methods.discretise import paper_equations, with_auxiliaries
+from scvi_codegen.pipeline.program import program_of
 from scvi_codegen.rendering.outline import functions_of, reached
 from scvi_codegen.rendering.program_source import render
 

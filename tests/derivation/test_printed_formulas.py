@@ -22,10 +22,10 @@ from oracle import points
 from printed_formulas import FUNCTIONS, mp, names, tree_of_latex, value
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import program_of
 from scvi_codegen.derivation import derivation_html
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.methods.discretise import discretise, paper_equations
+from scvi_codegen.pipeline.program import program_of
 
 T, H, TIME = mp.mpf("1e-40"), 0.125, 0.375
 Q, P = (0.625, -0.4375), (0.3125, 0.875)

@@ -18,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sympy import Symbol
 
-from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import (
     ExpressionError,
     MethodError,
@@ -38,6 +37,7 @@ from scvi_codegen.models.model import Model
 from scvi_codegen.models.model_file import dump_model, parse_model
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.models.problems import problem
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.tables.nodes import nodes_by_name
 from scvi_codegen.tables.quadrature import quadrature_by_name
 from scvi_codegen.tables.spaces import space_by_name

@@ -14,8 +14,8 @@ import sympy
 from samples import QUICK_FLAGS, pumped_cart_pole, tangle
 
 from scvi_codegen.compiler import compile_stepper
-from scvi_codegen.mechanics.hamiltonian import hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import SVI
 from scvi_codegen.models.problems import problem

@@ -9,10 +9,10 @@ import pytest
 from samples import QUICK_FLAGS
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import program_of
 from scvi_codegen.mechanics import term_groups as module
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
 from scvi_codegen.methods import as_method
+from scvi_codegen.pipeline.program import program_of
 
 FLAGS = {"flags": QUICK_FLAGS}
 

@@ -13,14 +13,9 @@ import sympy
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import MethodError, StateError, SystemDefinitionError
-from scvi_codegen.mechanics.hamiltonian import (
-    HamiltonianSystem,
-    equivalent_lagrangian,
-    hamiltonian_of,
-    lagrangian_of,
-)
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
-from scvi_codegen.mechanics.legendre import positive_parameters
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian, hamiltonian_of, lagrangian_of, positive_parameters
 from scvi_codegen.methods import (
     SCVI,
     SVI,

@@ -13,12 +13,13 @@ import sympy
 from counting import at_most
 from sympy import Symbol
 
-from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.derivation.equations import derive
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of
 from scvi_codegen.mechanics.symmetry import invariants
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry, all_symmetries, symmetries
@@ -37,6 +38,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.models.problems import PROBLEMS, problem
 from scvi_codegen.models.systems import point_vortices
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.tables.tableau import Tableau
 
 ROUNDOFF = 3e-14

@@ -18,7 +18,7 @@ from scvi_codegen import (
     derive,
     symmetries,
 )
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.discretise import is_symplectic
 
 START = np.array([0.3, -0.4, 0.5]), np.array([1.1 * np.cos(0.5), 1.1 * np.sin(0.5), 0.8])
 

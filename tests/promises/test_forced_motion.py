@@ -12,8 +12,8 @@ import pytest
 import sympy
 from scipy.integrate import solve_ivp
 
-from scvi_codegen.mechanics.hamiltonian import hamiltonian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of
 from scvi_codegen.methods import (
     SCVI,
     SVI,

@@ -27,6 +27,7 @@ FLOORS = """
     mechanics rendering
     methods native pictures
     lowering exact runtime
+    pipeline
     compiler frameworks results
     derivation models advice verification
     benchmark reproduce

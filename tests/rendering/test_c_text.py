@@ -16,7 +16,7 @@ from programs import needs
 from samples import QUICK_FLAGS, sample_named
 from style import check_style
 
-from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError
 from scvi_codegen.ir.program import LEAST_REUSED_UNKNOWNS
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
@@ -37,6 +37,7 @@ from scvi_codegen.methods import (
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.systems import fput_chain
 from scvi_codegen.native.building import TUNED_FLAGS, _mathematics
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.source import Interface, Source
 
 pytestmark = pytest.mark.long

@@ -8,9 +8,9 @@ from samples import damped_pendulum, linkage, pumped_cart_pole, pushed_pendulum,
 from style import check_style
 
 from scvi_codegen import SCVI, SVI, Gauss, hamiltonian_of, problem, reparametrise
-from scvi_codegen.compiler import program_of
 from scvi_codegen.lowering.derivatives import derivatives_of
 from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.pipeline.program import program_of
 from scvi_codegen.rendering.program_source import render_derivatives
 
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Wconversion", "-Werror"]

@@ -14,7 +14,6 @@ from programs import needs
 from samples import sample_named, stepper_for
 
 from scvi_codegen.cli import main
-from scvi_codegen.compiler import generate_source
 from scvi_codegen.errors import MethodError, PackageError
 from scvi_codegen.ir.arithmetic import FUNCTIONS
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -23,6 +22,7 @@ from scvi_codegen.methods.method import Method
 from scvi_codegen.models.model import Model
 from scvi_codegen.models.package import generate_package, load_package
 from scvi_codegen.models.problems import problem
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.rendering.program_source import EMBEDDED, Embedded
 from scvi_codegen.rendering.source import Interface, Source
 from scvi_codegen.rendering.target import SINGLE

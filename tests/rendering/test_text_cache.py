@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import os
 import pickle
+import subprocess
+import sys
 from dataclasses import fields, is_dataclass, replace
+from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +18,13 @@ import sympy
 
 import scvi_codegen as sc
 from scvi_codegen import compiler
+from scvi_codegen.files import source_cache
 from scvi_codegen.formulas.subexpressions import key_of
+from scvi_codegen.mechanics.deferred import _text_of
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building, fingerprint
-from scvi_codegen.rendering import source_cache
+from scvi_codegen.pipeline import sources
 
 
 @pytest.fixture
@@ -25,13 +32,13 @@ def made(tmp_path, monkeypatch) -> list[str]:
     """The methods derived from here on, with an empty cache."""
     monkeypatch.setenv(building.CACHE_VARIABLE, str(tmp_path))
     names: list[str] = []
-    derive = compiler.program_of
+    derive = sources.program_of
 
     def counted(system, method, **options):
         names.append(method.name)
         return derive(system, method, **options)
 
-    monkeypatch.setattr(compiler, "program_of", counted)
+    monkeypatch.setattr(sources, "program_of", counted)
     return names
 
 
@@ -49,14 +56,14 @@ def test_cached_derivations_are_not_repeated(made):
 
 def test_ensemble_source_is_generated_on_demand_and_cached(made, tmp_path, monkeypatch):
     written: list[str] = []
-    render = compiler.render_ensemble
-    monkeypatch.setattr(compiler, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
+    render = sources.render_ensemble
+    monkeypatch.setattr(sources, "render_ensemble", lambda program: written.append(program.prefix) or render(program))
     stepper = sc.compile_stepper(spring(), sc.SVI(2))
     stepper.integrate([1.0], [0.0], h=0.1, steps=3)
-    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 1)
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (0, 2)
     saved = pickle.loads(pickle.dumps(stepper))  # makes also those of controlled steps, fallback and derivatives
     assert saved.ensemble == stepper.ensemble == sc.compile_stepper(spring(), sc.SVI(2)).ensemble
-    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 5)
+    assert (len(written), len(list((tmp_path / "texts").iterdir()))) == (1, 6)
     assert len(made) == 2  # with the fallback and without
 
 
@@ -87,7 +94,7 @@ def keys(change: dict, **options) -> tuple[str, ...]:
         "inputs": ["u", "w"],
     }
     system = sc.LagrangianSystem.from_text(**{**given, **change})
-    found = compiler._Sources(
+    found = compiler.CachedSources(
         system,
         **{
             "method": sc.SVI(2),
@@ -134,6 +141,102 @@ def test_cache_key_contains_everything_the_source_depends_on():
     assert keys({}) == found[0]
 
 
+ARGUMENTS = {
+    "name": ["another", "pair "],
+    "coordinates": [["r", "q"], ["q", "r", "s"]],
+    "lagrangian": ["q_dot**2/2 + r_dot**2/2 - a*q**2/2 - b*r**2"],
+    "parameters": [
+        {"b": 2.0, "a": 1.0},
+        {"a": 1.0, "b": 2.0 + 2.0**-51},
+        {"a": -0.0, "b": 2.0},
+        {"a": 0.0, "b": 2.0},
+        {"a": 1.0, "b": 2.0, "c": 3.0},
+    ],
+    "forces": [{"r": "-a*q_dot"}, {"q": "-b*q_dot"}, {}],
+    "dissipation": ["q_dot**2", "r_dot**2"],
+    "damping": ["a", "1", 1.5],
+    "constraints": [["q - r"], ["q_dot - r"], ["q", "r"]],
+    "inputs": [["w", "u"], ["u"]],
+    "tables": [["bonds[B, 2]"], ["bonds[B, 3]"]],
+}
+TEXT = {
+    "name": "pair",
+    "coordinates": ["q", "r"],
+    "lagrangian": "q_dot**2/2 + r_dot**2/2 - a*q**2/2 - b*r**2*q",
+    "parameters": {"a": 1.0, "b": 2.0},
+    "forces": {"q": "-a*q_dot"},
+    "dissipation": None,
+    "damping": None,
+    "constraints": [],
+    "inputs": ["u", "w"],
+    "tables": [],
+}
+
+
+def test_every_argument_of_from_text_changes_the_key_of_the_text():
+    assert ARGUMENTS.keys() == TEXT.keys() == inspect.signature(sc.LagrangianSystem.from_text).parameters.keys()
+    changed = [TEXT | {name: value} for name, values in ARGUMENTS.items() for value in values]
+    texts = [_text_of(sc.LagrangianSystem, each) for each in (TEXT, *changed) if not each["tables"]]
+    assert None not in texts
+    assert len(set(texts)) == len(texts)
+    assert _text_of(sc.HamiltonianSystem, TEXT) not in texts
+    assert _text_of(type("Own", (sc.LagrangianSystem,), {"__module__": "own"}), TEXT) is None
+    assert _text_of(sc.LagrangianSystem, TEXT | {"coordinates": ["q[3]"]}) is None
+    assert _text_of(sc.LagrangianSystem, TEXT | {"parameters": {"a": Fraction(1, 3), "b": 2.0}}) is None
+
+
+def test_unread_system_equals_one_that_is_read(made):
+    first = spring()
+    sc.compile_stepper(first, sc.SVI(2))
+    unread, other = spring(), spring(2.0)
+    assert unread.key() == first.key() == (key_of(first),) != other.key()
+    assert hasattr(unread, "_key")
+    assert not hasattr(other, "_key")
+    for name in ("coordinates", "lagrangian", "defaults"):  # slots without a value
+        with pytest.raises(AttributeError):
+            object.__getattribute__(unread, name)
+    assert not unread.constrained
+    again = pickle.loads(pickle.dumps(unread))
+    assert unread == first == again == copy.copy(unread) == replace(unread)
+    assert hash(unread) == hash(first)
+    assert (key_of(unread), repr(unread), unread.to_text()) == (key_of(first), repr(first), first.to_text())
+    assert replace(unread, name="other").key() != first.key()
+    with pytest.raises(AttributeError, match="no attribute 'momenta'"):
+        _ = unread.momenta
+
+
+def test_text_with_warnings_is_always_read(made):
+    for _ in range(2):
+        with pytest.warns(sc.SystemDefinitionWarning, match="parameter 'c' is not used"):
+            system = sc.LagrangianSystem.from_text("spring", ["q"], "q_dot**2/2 - q**2/2", parameters={"c": 1.0})
+        sc.compile_stepper(system, "svi:2")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        "sc.LagrangianSystem.from_text('spring', ['q'], 'q_dot**2/2 - k*q**2/2', parameters={'k': 1.0})",
+        "sc.HamiltonianSystem.from_text('spring', ['q'], 'p_q**2/2 + k*q**2/2', parameters={'k': 1.0})",
+        "sc.LagrangianSystem.from_text('rod', ['x', 'y'], '(x_dot**2 + y_dot**2)/2', constraints=['x**2 + y**2 = 1'])",
+    ],
+    ids=["Lagrangian", "Hamiltonian", "constraints"],
+)
+def test_warm_start_imports_no_symbolic_library(make, tmp_path):
+    script = f"""
+import sys
+import scvi_codegen as sc
+system = {make}
+n = 2 if "rod" in {make!r} else 1
+run = sc.compile_stepper(system, "svi:4").integrate([1.0, 0.0][:n], [0.0, 0.1][:n], h=0.1, steps=10)
+print(run.q[-1].tobytes().hex(), *sorted({{"sympy", "scipy", "jinja2", "pycparser"}} & sys.modules.keys()))
+"""
+    environment = os.environ | {building.CACHE_VARIABLE: str(tmp_path)}
+    command = [sys.executable, "-c", script]
+    lines = [subprocess.run(command, env=environment, capture_output=True, check=True).stdout.split() for _ in range(2)]
+    assert b"sympy" in lines[0]
+    assert lines[1] == lines[0][:1]
+
+
 def test_cache_key_contains_every_generator_file(tmp_path, monkeypatch):
     package, templates = tmp_path / "package", tmp_path / "templates"
     files = [
@@ -152,7 +255,10 @@ def test_cache_key_contains_every_generator_file(tmp_path, monkeypatch):
         path.write_text("two")  # as long as before
         os.utime(path, ns=(k, 10**9 + k))
         found.append(source_cache._generator.__wrapped__())
-    monkeypatch.setattr(source_cache.sympy, "__version__", "0.0")
+    release = tmp_path / "sympy" / "release.py"
+    release.parent.mkdir()
+    release.write_text('__version__ = "0.0"')
+    monkeypatch.setattr(source_cache, "find_spec", lambda name: SimpleNamespace(origin=str(release)))
     found.append(source_cache._generator.__wrapped__())
     assert len(set(found)) == len(found)
 
@@ -167,11 +273,13 @@ def test_different_generator_regenerates_the_source(made, monkeypatch):
 @pytest.mark.parametrize("damage", [b"", b"{", b'{"source": {}}', b"\xff\xfe"])
 def test_damaged_entry_is_regenerated(made, tmp_path, damage):
     sc.compile_stepper(spring(), sc.SVI(2))
-    (entry,) = (tmp_path / "texts").glob("*.json")
-    entry.write_bytes(damage)
+    entries = [*(tmp_path / "texts").glob("*.json")]
+    for entry in entries:  # the source, and the key of the system
+        entry.write_bytes(damage)
     sc.compile_stepper(spring(), sc.SVI(2))
     assert len(made) == 2
-    assert len(entry.read_bytes()) > 1000
+    assert len(entries) == 2
+    assert all(len(entry.read_bytes()) > 500 for entry in entries)
 
 
 def test_unwritable_cache_is_not_an_error(made, tmp_path):

@@ -16,11 +16,11 @@ import pytest
 from programs import needs
 
 import scvi_codegen as sc
-from scvi_codegen.compiler import generate_array_source
 from scvi_codegen.errors import MethodError, StateError
 from scvi_codegen.lowering.arrays import lower_arrays, one_coordinate
 from scvi_codegen.methods import as_method
 from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.pipeline.sources import generate_array_source
 from scvi_codegen.rendering.loop_nests import Sharing, sharing_of
 
 RNG = np.random.default_rng(5)

@@ -10,8 +10,9 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, SystemDefinitionError
-from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem, hamiltonian_of
+from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import hamiltonian_of
 from scvi_codegen.methods import SCVI, SVI, Gauss, StoermerVerlet
 from scvi_codegen.models.problems import problem
 from scvi_codegen.results.recording import record_run, resume_run

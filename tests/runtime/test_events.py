@@ -15,7 +15,7 @@ from programs import needs
 from scipy.special import ellipk
 from sympy.physics.mechanics import dynamicsymbols
 
-from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import EventError, ExpressionError, StateError, StepFailedError
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -32,6 +32,7 @@ from scvi_codegen.methods import (
 )
 from scvi_codegen.methods.method import Method
 from scvi_codegen.models.problems import problem
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.runtime.core import compiled_method
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.events.event import Event

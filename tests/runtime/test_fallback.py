@@ -9,13 +9,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from scvi_codegen.compiler import compile_stepper, generate_source
+from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StepFailedError
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.methods import SCVI, SVI, Gauss, SpectralCollocation
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native import building
 from scvi_codegen.native.building import PORTABLE_FLAGS
+from scvi_codegen.pipeline.sources import generate_source
 from scvi_codegen.results.recording import record_run, resume_run
 from scvi_codegen.runtime.core.stepper import Stepper
 

@@ -11,8 +11,7 @@ from samples import QUICK_FLAGS
 
 from scvi_codegen import SVI, LagrangianSystem, StateError, compile_stepper, problem
 from scvi_codegen.exact.step import DerivedStep
-from scvi_codegen.methods.discretise import paper_equations
-from scvi_codegen.methods.method import is_symplectic
+from scvi_codegen.methods.discretise import is_symplectic, paper_equations
 from scvi_codegen.runtime.sensitivity.step_derivatives import Starts
 from scvi_codegen.tables.precision import mp
 

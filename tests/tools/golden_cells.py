@@ -18,8 +18,6 @@ from pathlib import Path
 import samples
 from golden_drivers import arrays_driver, ensemble_driver, run_driver, tangent_driver
 
-from scvi_codegen.compiler import _ArraySources, _Sources, generate_source
-from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
@@ -28,6 +26,7 @@ from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import as_method
 from scvi_codegen.models.problems import problem
 from scvi_codegen.native.compilers import find_compiler
+from scvi_codegen.pipeline.sources import ArraySources, Sources, generate_source
 from scvi_codegen.rendering.source import Source
 
 __all__ = ["CELLS", "FLAGS", "RECORDED", "TIMED", "Program", "build", "output", "program", "recorded"]
@@ -59,8 +58,8 @@ def of_source(source: Source | None, main: str) -> Program:
 
 def sources_of(
     system: MechanicalSystem, method: str, prefix: str, solver: str, time_transformation: str | None
-) -> _Sources:
-    return _Sources(system, as_method(method, system), solver, prefix, (), time_transformation)
+) -> Sources:
+    return Sources(system, as_method(method, system), solver, prefix, (), time_transformation)
 
 
 def single(
@@ -116,7 +115,7 @@ def arrays(
 ) -> Program:
     """A run of a system with array coordinates."""
     found = system()
-    sources = _ArraySources(found, as_method(method, one_coordinate(found)), solver, name)
+    sources = ArraySources(found, as_method(method), solver, name)
     main = arrays_driver(
         name,
         sizes,
@@ -130,7 +129,7 @@ def arrays(
         tolerance=tolerance,
         constrained=constrained,
     )
-    return of_source(sources.controlled if adaptive else sources.plain, main)
+    return of_source(sources.variant("controlled") if adaptive else sources.integrator()[0], main)
 
 
 def catalogue(name: str) -> Callable[[], MechanicalSystem]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from scvi_codegen.compiler import c_identifier, program_of
 from scvi_codegen.derivation.entries import table_entries
 from scvi_codegen.derivation.page.curve import curve_section, tables_section
 from scvi_codegen.derivation.page.equations_of_motion import motion_section, system_section
@@ -20,8 +19,9 @@ from scvi_codegen.derivation.page.stage_equations import (
 from scvi_codegen.display.page.blocks import Section
 from scvi_codegen.display.page.environment import page_template, style_sheet
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.discretise import paper_equations
-from scvi_codegen.methods.method import Method, check_regular
+from scvi_codegen.methods.discretise import check_regular, paper_equations
+from scvi_codegen.methods.method import Method
+from scvi_codegen.pipeline.program import c_identifier, program_of
 from scvi_codegen.rendering.outline import functions_of
 from scvi_codegen.rendering.program_source import render
 from scvi_codegen.version import __version__

@@ -20,9 +20,9 @@ from scvi_codegen.lowering.solvers.curves import position_iteration, printed_ite
 from scvi_codegen.lowering.solvers.points import coupled_iteration, hamiltonian_iteration, separable_iteration
 from scvi_codegen.lowering.solvers.tables import Solver, StepProblem
 from scvi_codegen.mechanics.derived_expressions import forms_of
-from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.methods.composition import kicks_and_drifts
+from scvi_codegen.methods.leapfrog_stages import kicks_and_drifts
 from scvi_codegen.methods.method import Method
 from scvi_codegen.methods.stage_system import StageSystem
 from scvi_codegen.tables.precision import mp

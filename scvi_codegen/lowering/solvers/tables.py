@@ -27,8 +27,8 @@ from typing import TypeAlias
 
 from scvi_codegen.ir.iteration import FixedPointIteration, PredictorTables
 from scvi_codegen.ir.numbers import Number, NumberTable, lower_matrix, lower_vector
-from scvi_codegen.mechanics.hamiltonian import equivalent_lagrangian
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods.stage_structure import Velocities
 from scvi_codegen.methods.stage_system import Shape

@@ -10,7 +10,7 @@ may differ between elements. With known sizes they are systems of named coordina
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, ClassVar
@@ -32,13 +32,13 @@ from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop, Size
 from scvi_codegen.mechanics.arrays.constraints import check_constraint, constraint_text
 from scvi_codegen.mechanics.arrays.masses import MassTerm, check_form, masses_of, terms_at_rest
-from scvi_codegen.mechanics.damping import check_damping, damping_rate
-from scvi_codegen.mechanics.plausibility import warn_of_negative, warn_of_unused
+from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
+from scvi_codegen.mechanics.forces import check_damping, damping_rate
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.representation import LONGEST, clipped
 from scvi_codegen.validation.argument_types import FORMULA, MAPPING, NAMES, TEXT, TEXTS, checks_arguments, of
 
-__all__ = ["ARRAYS", "SYSTEM_OR_ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem", "are_arrays"]
+__all__ = ["ARRAYS", "SYSTEM_OR_ARRAYS", "ArrayHamiltonian", "ArrayLagrangian", "ArraySystem"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -392,17 +392,14 @@ class ArrayLagrangian(ArraySystem):
     """Lagrangian of arrays whose sizes are known at run time."""
 
     __slots__ = ()
+    ACTS_AS: ClassVar[str] = "LagrangianSystem"
 
 
 class ArrayHamiltonian(ArraySystem):
     """Hamiltonian of arrays whose sizes are known at run time."""
 
     __slots__ = ()
-
-
-def are_arrays(*declarations: Iterable[str]) -> bool:
-    """Return whether one of the coordinates, parameters or tables is an array."""
-    return any("[" in str(each) for group in declarations for each in group)
+    ACTS_AS: ClassVar[str] = "HamiltonianSystem"
 
 
 def _with_formulas(term: ArrayTerm, rule: Mapping[Any, Expr]) -> ArrayTerm:

@@ -16,7 +16,7 @@ as numbers. With more than ``MAX_SEARCHED_COORDINATES`` coordinates only cyclic 
 all coordinates together, are tried. Any other direction or generator is verified by
 :func:`~scvi_codegen.mechanics.symmetry.checking.check_symmetry`.
 
-Whether a method conserves a momentum map to round-off: :func:`~scvi_codegen.methods.exactness.Exactness.conserves`.
+Whether a method conserves a momentum map to round-off: :func:`~scvi_codegen.methods.method.Exactness.conserves`.
 """
 
 from __future__ import annotations

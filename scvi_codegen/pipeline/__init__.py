@@ -1,0 +1,1 @@
+"""Derivation of C sources: from a mechanical system and a method to the texts that are compiled."""

@@ -1,0 +1,265 @@
+"""C sources of one integrator and its variants.
+
+    MechanicalSystem, Method
+      -> discretise  StageSystem   points, kernel and tables: the equations of one step
+                                   (:mod:`scvi_codegen.methods.discretise`)
+      -> iteration   Iteration     fixed-point iteration, if the system admits one; splitting_of: explicit splitting
+                                   (:mod:`scvi_codegen.lowering.solvers.selection`)
+      -> symmetries  Symmetry      conserved quantities (:mod:`scvi_codegen.mechanics.symmetry.symmetry`)
+      -> lower       Program       kernels, tables, loops: intermediate form (:mod:`scvi_codegen.lowering.program`)
+      -> render      Source        header, source: from ``templates/`` (:mod:`scvi_codegen.rendering.program_source`);
+                                   plus event detection, if requested (:mod:`scvi_codegen.rendering.events`)
+
+Two other consumers read a ``StageSystem``: :func:`scvi_codegen.derivation.equations.derive` prints the equations in the
+paper's notation, and :func:`scvi_codegen.exact.step.derived_step` solves them in 60-digit arithmetic.
+:mod:`scvi_codegen.frameworks` extends the C source of one step and its derivatives to many steps for JAX, PyTorch and
+CasADi; :func:`scvi_codegen.frameworks.casadi_step.casadi_step` exports the stage equations as CasADi expressions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+
+from sympy import Expr
+
+from scvi_codegen.errors import MethodError
+from scvi_codegen.indices import SIZES_REQUIRED
+from scvi_codegen.ir.iteration import Control
+from scvi_codegen.ir.program import Program
+from scvi_codegen.lowering.arrays import check_solver as check_solver_of_arrays
+from scvi_codegen.lowering.arrays import lower_arrays
+from scvi_codegen.lowering.control import control_of, density_of
+from scvi_codegen.lowering.derivatives import derivatives_of
+from scvi_codegen.lowering.program import lower
+from scvi_codegen.lowering.solvers.selection import iteration_of
+from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
+from scvi_codegen.mechanics.symmetry.symmetry import SYMMETRIES, Symmetry
+from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.mechanics.variational import with_tangent_vectors
+from scvi_codegen.methods import as_method
+from scvi_codegen.methods.discretise import discretise
+from scvi_codegen.methods.method import Method
+from scvi_codegen.native.announcements import announced
+from scvi_codegen.pipeline.interface import describe, describe_arrays
+from scvi_codegen.pipeline.program import c_identifier, program_of
+from scvi_codegen.rendering.events import with_events
+from scvi_codegen.rendering.program_source import (
+    EMBEDDED,
+    Embedded,
+    render,
+    render_derivatives,
+    render_embedded,
+    render_ensemble,
+)
+from scvi_codegen.rendering.source import Interface, Source
+from scvi_codegen.runtime.events.event import EventLike, as_events
+from scvi_codegen.validation.argument_types import SWITCH, TEXT, checks_arguments
+
+__all__ = ["ArraySources", "Sources", "generate_array_source", "generate_source", "sources_of"]
+
+
+class Sources:
+    """C sources of one integrator and its variants; the equations are derived on first use."""
+
+    def __init__(
+        self,
+        system: MechanicalSystem,
+        method: Method,
+        solver: str,
+        prefix: str | None,
+        symmetries: Sequence[Symmetry],
+        g: str | Expr | None,
+    ) -> None:
+        self.system, self.method, self.solver, self.g = system, method, solver, g
+        self._derived = partial(program_of, system, method, prefix=prefix, symmetries=symmetries)
+        self._programs: dict[bool, Program] = {}
+
+    def program(self, *, fallback: bool = False) -> Program:
+        """Return the lowered program; with ``fallback`` it also contains Newton's iteration as a fallback."""
+        if fallback not in self._programs:
+            with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
+                self._programs[fallback] = self._derived(solver=self.solver, fallback=fallback)
+        return self._programs[fallback]
+
+    @property
+    def uses_fallback_library(self) -> bool:
+        """Return whether Newton's iteration comes from a separate fallback library."""
+        return self.solver == "auto" and self.program().fixed_point is not None and not self.program().newton
+
+    @property
+    def interface(self) -> Interface:
+        """Interface of the generated library."""
+        return describe(
+            self.program(),
+            self.system,
+            self.method,
+            uses_fallback_library=self.uses_fallback_library,
+            g=self.g,
+        )
+
+    def integrator(self) -> tuple[Source, Interface]:
+        """Return the C source and its interface."""
+        return self._rendered(), self.interface
+
+    def controlled(self) -> Source | None:
+        """Return the source with adaptive steps, or with the step-density controller; else ``None``."""
+        control = control_of(self.program()) if self.g is None else density_of(self.system, self.g)
+        return self._rendered(control) if control else None
+
+    def fallback(self) -> Source | None:
+        """Return the source with Newton's iteration if the integrator itself contains none."""
+        return render(self.program(fallback=True), fallback="provided") if self.uses_fallback_library else None
+
+    def tangent(self, *, second: bool = False) -> Source | None:
+        """Return the source with first, or also second, derivatives of steps with respect to all their arguments.
+
+        Second derivatives are unavailable in transformed time and for damped systems.
+        """
+        if second and (self.system.integrands or self.system.damping):
+            return None
+        program = self.program(fallback=True)
+        if not program.newton:  # explicit steps
+            program = self._derived(solver="newton")
+        stages = discretise(self.system, self.method)
+        with announced(f"deriving the {'second ' * second}derivatives of {self.system.name} by {self.method.name}"):
+            return render_derivatives(derivatives_of(self.system, stages, program, second=second))
+
+    def changes(self, count: int) -> Source | None:
+        """Return the ensemble source with tangent vectors; ``None`` unless it is a fixed point with constant mass."""
+        twin, fixed_point = equivalent_lagrangian(self.system), self.program().fixed_point
+        varied = (
+            with_tangent_vectors(twin, count)
+            if twin and fixed_point and fixed_point.serves_many and fixed_point.constant_mass
+            else None
+        )
+        if varied is None:
+            return None
+        stages, prefix = discretise(varied, self.method), self.program().prefix
+        program = lower(
+            varied, self.method, stages, prefix=prefix, fixed_point=iteration_of(varied, stages), newton=False
+        )
+        return render_ensemble(program)
+
+    def _rendered(self, control: Control | None = None) -> Source:
+        return render(self.program(), control, fallback="external" if self.uses_fallback_library else None)
+
+    def variant(self, name: str) -> Source | None:
+        """Return the source of a variant, named as in :class:`~scvi_codegen.runtime.core.compiled_method.Variants`."""
+        kind, _, count = name.partition(" ")
+        made: dict[str, Callable[[], Source | None]] = {
+            "ensemble": lambda: render_ensemble(self.program()),
+            "controlled": self.controlled,
+            "fallback": self.fallback,
+            "derivatives": self.tangent,
+            "second_derivatives": lambda: self.tangent(second=True),
+            "changes": lambda: self.changes(int(count)),
+        }
+        return made[kind]()
+
+
+class ArraySources:
+    """C sources of one integrator of arrays whose sizes are known at run time, derived on first use.
+
+    ArraySystem, Method -> lower -> Program (kernels of terms, tables of one coordinate) -> render -> Source.
+    """
+
+    def __init__(self, system: ArraySystem, method: Method, solver: str, prefix: str | None) -> None:
+        self.solver = "fixed-point" if solver == "auto" else solver
+        check_solver_of_arrays(self.solver)
+        system.check_run_time_sizes()
+        self.system, self.method = system, method
+        self.prefix = c_identifier(prefix or f"{system.name}_{method.name}")
+
+    @cached_property
+    def program(self) -> Program:
+        """Lowered program with fixed step size."""
+        with announced(f"deriving the equations of {self.system.name} by {self.method.name}"):
+            try:
+                return lower_arrays(self.system, self.method, self.prefix, newton=self.solver == "newton")
+            except MethodError as error:
+                raise MethodError(f"{error}. This concerns '{self.system.name}': {SIZES_REQUIRED}") from error
+
+    @property
+    def interface(self) -> Interface:
+        """Interface of the generated library."""
+        return describe_arrays(self.system, self.method, prefix=self.prefix, solver=self.solver)
+
+    def integrator(self) -> tuple[Source, Interface]:
+        """Return the C source with fixed step size and its interface."""
+        return render(self.program), self.interface
+
+    def variant(self, name: str) -> Source | None:
+        """Return the source with adaptive steps, ``"controlled"``, the only variant; ``None`` without one."""
+        control = control_of(self.program) if name == "controlled" else None
+        return render(self.program, control) if control else None
+
+
+def sources_of(
+    system: MechanicalSystem | ArraySystem,
+    method: Method,
+    solver: str,
+    prefix: str | None,
+    symmetries: Sequence[Symmetry],
+    g: str | Expr | None,
+) -> Sources | ArraySources:
+    """Return the sources of an integrator; arguments as of :func:`~scvi_codegen.compile_stepper`."""
+    if isinstance(system, ArraySystem):
+        return ArraySources(system, method, solver, prefix)
+    return Sources(system, method, solver, prefix, symmetries, g)
+
+
+def generate_array_source(
+    system: ArraySystem, method: Method | str, *, solver: str = "auto", prefix: str | None = None
+) -> tuple[Source, Interface]:
+    """Return the C source and interface for arrays of run-time sizes; arguments as of :func:`compile_stepper`."""
+    return ArraySources(system, as_method(method), solver, prefix).integrator()
+
+
+@checks_arguments(system=SYSTEM, solver=TEXT, prefix=TEXT, symmetries=SYMMETRIES, amalgamate=SWITCH)
+def generate_source(
+    system: MechanicalSystem,
+    method: Method | str,
+    *,
+    solver: str = "auto",
+    prefix: str | None = None,
+    symmetries: Sequence[Symmetry] = (),
+    events: EventLike | Sequence[EventLike] | None = None,
+    embedded: Embedded | None = None,
+    amalgamate: bool = False,
+    controlled: bool = False,
+    time_transformation: str | Expr | None = None,
+) -> tuple[Source, Interface]:
+    """Return the C source of an integrator and its interface; other arguments as of :func:`compile_stepper`.
+
+    Args:
+        embedded: precision, ``"double"`` or ``"single"``, of source for a microcontroller. Its solver is explicit or
+            Newton, which needs half the stack of the SIMD fixed-point iteration without vector registers.
+        amalgamate: include the support headers in the source; always done for a microcontroller.
+        controlled: use adaptive steps, if the method has an error estimate.
+        time_transformation: use constant steps in tau instead, dt = g dtau, by the reversible controller.
+
+    Raises:
+        MethodError: if the solver is not available for the method, if a constant exceeds single precision, and if
+            events are combined with ``embedded``.
+    """
+    method = as_method(method, system)
+    functions = tuple(event.function for event in as_events(events))
+    _check_embedded(embedded, solver, functions)
+    program = program_of(system, method, solver=solver, prefix=prefix, symmetries=symmetries, lanes=embedded is None)
+    g = time_transformation
+    control = density_of(system, g) if g is not None else control_of(program) if controlled else None
+    source = render_embedded(program, embedded, control) if embedded else render(program, control)
+    interface = describe(program, system, method, g=g)
+    complete = with_events(source, interface, functions) if functions else source
+    return (complete.amalgamated() if amalgamate else complete), interface
+
+
+def _check_embedded(embedded: Embedded | None, solver: str, functions: Sequence[str]) -> None:
+    if embedded not in (None, *EMBEDDED):
+        raise MethodError(f"embedded must be {' or '.join(EMBEDDED)}, not {embedded!r}")
+    if embedded and solver == "fixed-point":
+        raise MethodError("solver='fixed-point' is unavailable with embedded: use 'newton' or 'explicit'")
+    if embedded and functions:
+        raise MethodError("source for a microcontroller does not support events: omit events or embedded")
