@@ -7,15 +7,14 @@ from collections.abc import Iterator, Sequence
 from sympy import Expr, latex
 
 from scvi_codegen.formulas.array_latex import latex_entry, latex_sums
-from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.ir.equations import ConstrainedSteps
 from scvi_codegen.ir.iterations import HamiltonianIteration, SeparableIteration, Splitting
 from scvi_codegen.ir.numbers import Number
 from scvi_codegen.ir.program import Program
 from scvi_codegen.lowering.arrays import lower_arrays
-from scvi_codegen.mechanics.arrays.constraints import constraint_force_terms, constraint_text
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.terms import constraint_text, force_of
 from scvi_codegen.methods.method import Method
 
 __all__ = ["derive_sums"]
@@ -39,12 +38,16 @@ def _text(system: ArraySystem) -> Iterator[str]:
     yield str(system)
     yield ""
     yield "Terms of -H, and their derivatives:" if system.momenta else "Terms of -V, and what each adds to the forces:"
-    for term, partials in system.kernels:
+    for term in system.potentials:
         yield f"  {term}"
-        yield from (f"    by {name}: {derivative}" for name, derivative in partials.items())
+        yield from (f"    by {access}: {derivative}" for access, derivative in force_of(term, system.state).targets)
     if not system.momenta:
         yield "Masses:"
-        yield from (f"  {_loops_text(mass.loops, mass.formula)} at {mass.access}" for mass in system.masses)
+        yield from (
+            f"  {_loops_text(mass.loops, formula)} at {access}"
+            for mass in system.masses
+            for access, formula in mass.targets
+        )
     if system.forces:
         yield "Forces beside:"
         yield from (f"  {force}" for force in system.forces)
@@ -52,7 +55,7 @@ def _text(system: ArraySystem) -> Iterator[str]:
         yield "Constraints, each with what it adds to the forces:"
     for term in system.constraints:
         yield f"  {constraint_text(term)}"
-        pushed = constraint_force_terms(term, system.coordinates, system.time)
+        pushed = force_of(term, system.coordinates).targets
         yield from (f"    on {access}: lambda*({derivative})" for access, derivative in pushed)
     energy = () if system.changes_energy else ("energy",)
     conserved = (*energy, *(each.name for each in momentum_maps(system)))
@@ -66,10 +69,10 @@ def _loops_text(loops: Sequence[object], formula: Expr) -> str:
 def _latex(system: ArraySystem) -> Iterator[str]:
     """Yield one line each, in display mode."""
     yield rf"\[ {system.latex} \]"
-    for term, partials in system.kernels:
+    for term in system.potentials:
         entries = {slot: latex_entry(access) for slot, access in term.slots}
-        for name, derivative in partials.items():
-            by = rf"\frac{{\partial}}{{\partial {entries[symbol(name)]}}}"
+        for access, derivative in force_of(term, system.state).targets:
+            by = rf"\frac{{\partial}}{{\partial {latex_entry(access)}}}"
             yield rf"\[ {latex_sums(term)} \; {by}: \quad {latex(derivative, symbol_names=entries)} \]"
 
 

@@ -35,6 +35,11 @@ def array_text(expression: Expr) -> str:
 
 
 class _Printer(StrPrinter):  # type: ignore[misc]  # SymPy has no types
+    def _as_ordered_terms(self, expression: Expr, order: object = None) -> list[Expr]:
+        """Return the terms in the order of their texts: results depend on it, and SymPy's order on its version."""
+        texts = {term: self._print(term) for term in expression.args}
+        return sorted(texts, key=lambda term: (bool(term.is_Number), texts[term].lstrip("-"), texts[term]))
+
     def _print_Sum(self, expression: Sum) -> str:
         wrapped = dict(map(_wrapped, expression.function.atoms(Mod)))
         for index in (each for entry in expression.function.atoms(Indexed) for each in entry.indices):

@@ -38,13 +38,13 @@ from scvi_codegen.ir.kernel import LoopedKernel
 from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import looped_kernel, system_kernel
 from scvi_codegen.lowering.solvers.tables import velocity_tables
-from scvi_codegen.mechanics.arrays.constraints import (
+from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.terms import (
     constraint_gradient,
     constraint_second_rate,
     constraint_text,
-    coordinate_accesses,
+    entries_of,
 )
-from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.constraints import (
     constraint_jacobian,
     constraint_rates,
@@ -120,7 +120,7 @@ def _parts(stages: StageSystem, method: Method) -> Vector:
 def _kernels(system: ArraySystem) -> Iterator[tuple[LoopedKernel, LoopedKernel]]:
     """Yield the condition of each constraint, and its second derivative in time at constant velocity."""
     for number, term in enumerate(system.constraints):
-        u = coordinate_accesses(term, system.coordinates)
+        u = entries_of(term, system.coordinates)
         v = [Symbol(f"{slot.name} along", real=True) for slot, _ in u]
         *partials, rate = constraint_gradient(term, system.coordinates, system.time)
         second = constraint_second_rate(term, system.coordinates, system.time, v)

@@ -12,7 +12,6 @@ from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.indices import Access
 from scvi_codegen.ir.arithmetic import lower_kernel
 from scvi_codegen.ir.kernel import Kernel, LoopedKernel
-from scvi_codegen.mechanics.arrays.masses import MassTerm
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 
@@ -68,7 +67,7 @@ def looped_kernel(
     system: ArraySystem,
     name: str,
     values: Iterable[Expr],
-    of: ArrayTerm | ArrayForce | MassTerm,
+    of: ArrayTerm | ArrayForce,
     u: Sequence[tuple[Symbol, Access]] = (),
     *,
     along: Sequence[Symbol] = (),

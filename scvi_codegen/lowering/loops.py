@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from sympy import Add, Expr, S, Symbol
+from sympy import Add, Expr, Symbol
 
 from scvi_codegen.formulas.array_forces import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
@@ -19,6 +19,7 @@ from scvi_codegen.ir.numbers import exact_number
 from scvi_codegen.ir.program import LoopedTerms, Program
 from scvi_codegen.lowering.kernels import looped_kernel
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.terms import entries_of, force_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.mechanics.term_groups import SplitSystem, TermGroup
 
@@ -27,37 +28,20 @@ __all__ = ["looped_terms", "reach_of", "with_sums"]
 
 def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, newton: bool) -> LoopedTerms:
     """Return the kernels of the terms of a system of arrays; ``newton``: with the Jacobian of the forces."""
-    potentials = [_force(system, term, number) for number, term in enumerate(system.potentials)]
+    potentials, arguments = system.potentials, (*system.state, *system.velocities)
     products, diagonals = _jacobian(system) if newton else ((), ())
+    masses = [
+        (f"mass of {access}", mass, number) for number, mass in enumerate(system.masses) for access, _ in mass.targets
+    ]
     return LoopedTerms(
         forces=(
-            *potentials,
+            *(_potential(system, term, number) for number, term in enumerate(potentials)),
             *(
-                looped_kernel(
-                    system,
-                    f"force_{number}",
-                    [formula for _, formula in force.targets],
-                    force,
-                    [pair for pair in force.slots if pair[1].array in (*system.state, *system.velocities)],
-                    targets=[access for access, _ in force.targets],
-                    text=f"forces {force}",
-                    purpose="Forces.",
-                )
+                _added(system, f"force_{number}", force, arguments, f"forces {force}", "Forces.")
                 for number, force in enumerate(system.forces, len(potentials))
             ),
         ),
-        masses=tuple(
-            looped_kernel(
-                system,
-                f"mass_{number}",
-                [term.formula],
-                term,
-                targets=[term.access],
-                text=f"mass of {term.access}",
-                purpose="A mass.",
-            )
-            for number, term in enumerate(system.masses)
-        ),
+        masses=tuple(_added(system, f"mass_{number}", mass, (), text, "A mass.") for text, mass, number in masses),
         constants=tuple(
             looped_kernel(system, f"constant_{number}", [term.formula], term, text=str(term), purpose="The term.")
             for number, term in enumerate(system.energy_offsets)
@@ -69,38 +53,38 @@ def looped_terms(system: ArraySystem, constrained: ConstrainedSteps | None, *, n
     )
 
 
-def _force(system: ArraySystem, term: ArrayTerm, number: int) -> LoopedKernel:
+def _added(
+    system: ArraySystem, name: str, of: ArrayForce, arguments: Sequence[Array], text: str, purpose: str
+) -> LoopedKernel:
+    """Return the kernel of formulas that are added to entries, as functions of entries of certain arrays."""
+    targets, formulas = zip(*of.targets, strict=True)
+    u = entries_of(of, arguments)
+    return looped_kernel(system, name, formulas, of, u, targets=targets, text=text, purpose=purpose)
+
+
+def _potential(system: ArraySystem, term: ArrayTerm, number: int) -> LoopedKernel:
     """Return the derivatives of a term with respect to its coordinates and momenta, and the term itself."""
-    moving = [pair for pair in term.slots if pair[1].array in system.state]
-    partials = gradient(term.formula, [slot for slot, _ in moving])
-    signs = [-1 if access.array in system.momenta else 1 for _, access in moving]  # of -H: -H_q and H_p
-    values = [sign * partials.get(place, S.Zero) for place, sign in enumerate(signs)]
+    force = force_of(term, system.state)
+    signs = [-1 if access.array in system.momenta else 1 for access, _ in force.targets]  # of -H: -H_q and H_p
+    targets = tuple((access, sign * value) for sign, (access, value) in zip(signs, force.targets, strict=True))
     purpose = "Derivatives with respect to its coordinates."
-    looped = looped_kernel(system, f"force_{number}", values, term, moving, text=str(term), purpose=purpose)
-    scalar = looped_kernel(system, f"term_{number}", [term.formula], term, moving, text="", purpose="The term.")
+    looped = _added(system, f"force_{number}", replace(force, targets=targets), system.state, str(term), purpose)
+    u = entries_of(term, system.state)
+    scalar = looped_kernel(system, f"term_{number}", [term.formula], term, u, text="", purpose="The term.")
     return replace(looped, scalar=scalar.kernel)
 
 
 def _jacobian(system: ArraySystem) -> tuple[tuple[LoopedKernel, ...], tuple[LoopedKernel, ...]]:
     """Return the Jacobian of the forces times a direction, and its diagonal, by term groups."""
-    found = [_derived(system, term, number) for number, term in enumerate(_all_forces(system))]
-    pairs = [pair for pair in found if pair]
+    derived = [_derived(system, force, number) for number, force in enumerate(system.all_forces)]
+    pairs = [pair for pair in derived if pair]
     return tuple(product for product, _ in pairs), tuple(diagonal for _, diagonal in pairs)
-
-
-def _all_forces(system: ArraySystem) -> Iterator[ArrayForce]:
-    """Yield all forces, those of the potentials by their slots."""
-    for term in system.potentials:
-        moving = [(slot, access) for slot, access in term.slots if access.array in system.state]
-        partials = gradient(term.formula, [slot for slot, _ in moving])
-        targets = tuple((access, partials[k]) for k, (_, access) in enumerate(moving) if k in partials)
-        yield ArrayForce(loops=term.loops, slots=term.slots, targets=targets)
-    yield from system.forces
 
 
 def _derived(system: ArraySystem, force: ArrayForce, number: int) -> tuple[LoopedKernel, LoopedKernel] | None:
     """Return the kernels of a force for :func:`_jacobian`; ``None`` if it does not depend on positions."""
-    moving = [pair for pair in force.slots if pair[1].array in system.state]
+    force = replace(force, targets=tuple(pair for pair in force.targets if pair[1] != 0))
+    moving = entries_of(force, system.state)
     u, w = [slot for slot, _ in moving], [Symbol(f"{slot.name} along", real=True) for slot, _ in moving]
     rows = [gradient(formula, u) for _, formula in force.targets]
     if not any(rows):

@@ -95,7 +95,7 @@ class HamiltonianSystem(MechanicalSystem):
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
         tables: Sequence[str] = (),
-    ) -> HamiltonianSystem:
+    ) -> HamiltonianSystem | Any:
         """Read H from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         Arrays are declared and treated as in :meth:`LagrangianSystem.from_text`.

@@ -95,12 +95,13 @@ class LagrangianSystem(MechanicalSystem):
         constraints: Sequence[str] = (),
         inputs: Sequence[str] = (),
         tables: Sequence[str] = (),
-    ) -> LagrangianSystem:
+    ) -> LagrangianSystem | Any:
         """Read L from text of the grammar in :mod:`scvi_codegen.formulas.grammar`.
 
         With arrays the grammar is that of :mod:`scvi_codegen.formulas.arrays`. If all their sizes are numbers, their
         entries are coordinates q_0, q_1, .. like all others. Otherwise the sizes follow from the arrays of a run, or
-        from ``sizes`` of :func:`~scvi_codegen.compile_stepper`.
+        from ``sizes`` of :func:`~scvi_codegen.compile_stepper`, and the result is an
+        :class:`~scvi_codegen.mechanics.arrays.system.ArrayLagrangian`.
 
         Args:
             name: name of the system.
@@ -160,7 +161,7 @@ class LagrangianSystem(MechanicalSystem):
         constraints: Sequence[Expr] = (),
         inputs: Sequence[Any] = (),
         tables: Sequence[str] = (),
-    ) -> LagrangianSystem:
+    ) -> LagrangianSystem | Any:
         """Create the system from a SymPy expression in plain symbols or in functions of time.
 
         Floating-point numbers become the rationals of their shortest decimal form (``0.1`` is 1/10); symbols become

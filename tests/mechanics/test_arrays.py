@@ -8,6 +8,7 @@ from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.symmetry import momentum_maps
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.terms import force_of
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 
@@ -125,9 +126,10 @@ def test_derived_terms_are_displayed() -> None:
         parameters={"mass[N]": 1},
         tables=["ends_of[B, 2]"],
     )
-    partials = {str(term): found for term, found in net.kernels}
+    forces = {str(term): force_of(term, net.state).targets for term in net.potentials}
     a, b = (sympy.Symbol(f"q[ends_of[b, {k}]]", real=True) for k in (0, 1))
-    assert partials["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"] == {
+    pair = forces["sum(b in B, -cos(q[ends_of[b, 0]] - q[ends_of[b, 1]]))"]
+    assert {str(access): derivative for access, derivative in pair} == {
         a.name: sympy.sin(a - b),
         b.name: -sympy.sin(a - b),
     }

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.formulas.derivatives import gradient
+from scvi_codegen.formulas.array_forces import ArrayForce
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size
-from scvi_codegen.mechanics.arrays.constraints import constraint_force_terms
 from scvi_codegen.mechanics.arrays.system import ArraySystem
+from scvi_codegen.mechanics.arrays.terms import force_of
 from scvi_codegen.tables.precision import mp
 
 __all__ = ["momentum_maps"]
@@ -37,39 +36,24 @@ def momentum_maps(system: ArraySystem) -> tuple[ArrayMap, ...]:
     return tuple(each for array in system.coordinates for each in _maps(system, array))
 
 
-@dataclass(frozen=True, slots=True)
-class _ForceTerms:
-    """Contributions of one element of a sum, or of forces, to the rates of momenta (-H_p: to those of positions)."""
-
-    entries: tuple[tuple[Access, Expr], ...]
-    slots: tuple[Symbol, ...]
-
-
-def _force_terms(system: ArraySystem) -> Iterator[_ForceTerms]:
-    for term in system.potentials:
-        moved = [(slot, access) for slot, access in term.slots if access.array in system.state]
-        partials = gradient(term.formula, [slot for slot, _ in moved])
-        entries = tuple((access, partials.get(k, S.Zero)) for k, (_, access) in enumerate(moved))
-        yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
-    for force in system.forces:
-        yield _ForceTerms(force.targets, tuple(slot for slot, _ in force.slots))
-    for term in system.constraints:  # G^T lambda, for any lambda
-        entries = constraint_force_terms(term, system.coordinates, system.time)
-        yield _ForceTerms(entries, tuple(slot for slot, _ in term.slots))
+def _forces(system: ArraySystem) -> Iterator[ArrayForce]:
+    """Yield what one element of each sum adds to the rates of momenta (-H_p: to those of positions)."""
+    yield from system.all_forces
+    yield from (force_of(term, system.coordinates) for term in system.constraints)  # G^T lambda, for any lambda
 
 
 def _maps(system: ArraySystem, array: Array) -> Iterator[ArrayMap]:
-    last, force_terms = array.axes[-1] if array.axes else Size("", 0), list(_force_terms(system))
+    last, forces = array.axes[-1] if array.axes else Size("", 0), list(_forces(system))
     components: Sequence[int | None] = range(last.number) if array.axes and not last.name else [None]
     for component in components:
-        if all(_is_zero(*_shift(system, each, array, component)) for each in force_terms):
+        if all(_is_zero(*_shift(system, each, array, component)) for each in forces):
             yield ArrayMap(array.name, component)
-    if system.momenta and all(_is_zero(*_phase(system, each, array)) for each in force_terms):
+    if system.momenta and all(_is_zero(*_phase(system, each, array)) for each in forces):
         yield ArrayMap(array.name, None, phase=True)
     if not last.name and last.number <= MAX_ROTATED_COMPONENTS:
         for a in range(last.number):
             for b in range(a + 1, last.number):
-                turned = all(_is_zero(*_turn(system, each, array, (a, b))) for each in force_terms)
+                turned = all(_is_zero(*_turn(system, each, array, (a, b))) for each in forces)
                 if turned and _same_masses(system, array, a, b):
                     yield ArrayMap(array.name, a, b)
 
@@ -86,29 +70,27 @@ def _whole(component: int) -> Place:
 
 
 def _shift(
-    system: ArraySystem, force_terms: _ForceTerms, array: Array, component: int | None
+    system: ArraySystem, force: ArrayForce, array: Array, component: int | None
 ) -> tuple[list[Expr], list[Symbol]]:
-    parts = [derivative for access, derivative in force_terms.entries if _component(access, array, component)]
-    return parts, _symbols(system, force_terms)
+    parts = [derivative for access, derivative in force.targets if _component(access, array, component)]
+    return parts, _symbols(system, force)
 
 
 def _turn(
-    system: ArraySystem, force_terms: _ForceTerms, array: Array, plane: tuple[int, int]
+    system: ArraySystem, force: ArrayForce, array: Array, plane: tuple[int, int]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum x_a dl/dx_b - x_b dl/dx_a, for the array and its momenta."""
     (a, b), arrays = plane, [array, *_conjugate(system, array)]
     pairs = [
         ((each, _whole(to)), (each, _whole(by)), sign) for each in arrays for to, by, sign in ((b, a, 1), (a, b, -1))
     ]
-    return _rotated_terms(system, force_terms, pairs)
+    return _rotated_terms(system, force, pairs)
 
 
-def _phase(system: ArraySystem, force_terms: _ForceTerms, array: Array) -> tuple[list[Expr], list[Symbol]]:
+def _phase(system: ArraySystem, force: ArrayForce, array: Array) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of sum p dl/dq - q dl/dp."""
     (momenta,) = _conjugate(system, array)
-    return _rotated_terms(
-        system, force_terms, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)]
-    )
+    return _rotated_terms(system, force, [((array, None), (momenta, None), 1), ((momenta, None), (array, None), -1)])
 
 
 def _conjugate(system: ArraySystem, array: Array) -> tuple[Array, ...]:
@@ -120,13 +102,13 @@ Entry: TypeAlias = tuple[Array, Place | None]
 
 
 def _rotated_terms(
-    system: ArraySystem, force_terms: _ForceTerms, pairs: Sequence[tuple[Entry, Entry, int]]
+    system: ArraySystem, force: ArrayForce, pairs: Sequence[tuple[Entry, Entry, int]]
 ) -> tuple[list[Expr], list[Symbol]]:
     """Return the terms of the derivative along the motion of entries of the first kind by those of the second."""
     parts: list[Expr] = []
-    known = _symbols(system, force_terms)
+    known = _symbols(system, force)
     for (array, last), (other, by), sign in pairs:
-        for access, derivative in force_terms.entries:
+        for access, derivative in force.targets:
             if access.array != array or (last is not None and access.places[-1] != last):
                 continue
             indices = access.places if by is None else (*access.places[:-1], by)
@@ -136,8 +118,8 @@ def _rotated_terms(
     return parts, known
 
 
-def _symbols(system: ArraySystem, force_terms: _ForceTerms) -> list[Symbol]:
-    return [*force_terms.slots, *system.parameters, system.time]
+def _symbols(system: ArraySystem, force: ArrayForce) -> list[Symbol]:
+    return [*(slot for slot, _ in force.slots), *system.parameters, system.time]
 
 
 def _is_zero(parts: Sequence[Expr], symbols: Sequence[Symbol]) -> bool:
@@ -161,7 +143,8 @@ def _same_masses(system: ArraySystem, array: Array, a: int, b: int) -> bool:
     masses: tuple[dict[object, Expr], ...] = ({}, {})
     for mass in system.masses:
         for by_term, component in zip(masses, (a, b), strict=True):
-            if _component(mass.access, array, component):
-                key = (mass.loops, mass.access.places[:-1])
-                by_term[key] = by_term.get(key, S.Zero) + mass.formula
+            ((access, formula),) = mass.targets
+            if _component(access, array, component):
+                key = (mass.loops, access.places[:-1])
+                by_term[key] = by_term.get(key, S.Zero) + formula
     return masses[0] == masses[1]

@@ -24,14 +24,20 @@ from scvi_codegen.formulas.array_latex import latex_sum
 from scvi_codegen.formulas.array_sympy import array_text
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.canonical import unsupported_part
-from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.formulas.grammar import parse_expression
 from scvi_codegen.formulas.inputs import input_formulas, with_inputs
 from scvi_codegen.formulas.subexpressions import key_of
 from scvi_codegen.formulas.symbols import DOT, TIME, check_names, number, symbol
 from scvi_codegen.indices import SIZES_REQUIRED, Access, Array, Loop, Size
-from scvi_codegen.mechanics.arrays.constraints import check_constraint, constraint_text
-from scvi_codegen.mechanics.arrays.masses import MassTerm, check_form, masses_of, terms_at_rest
+from scvi_codegen.mechanics.arrays.terms import (
+    check_constraint,
+    check_form,
+    constraint_text,
+    force_of,
+    friction,
+    masses_of,
+    terms_at_rest,
+)
 from scvi_codegen.mechanics.definition_checks import warn_of_negative, warn_of_unused
 from scvi_codegen.mechanics.forces import check_damping, damping_rate
 from scvi_codegen.mechanics.system import MechanicalSystem
@@ -58,7 +64,7 @@ class ArraySystem:
         terms: of the Lagrangian or the Hamiltonian.
         forces: generalised forces of coordinates, velocities (momenta of a Hamiltonian) and time.
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
-        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.constraints`).
+        constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.terms`).
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
     """
 
@@ -197,7 +203,8 @@ class ArraySystem:
         everything = (*arrays, *conjugate, *velocities, *fields.values())
         applied = [parse_force(*pair, arrays, everything, known, index_tables) for pair in (forces or {}).items()]
         if dissipation is not None:
-            applied.append(_friction(parse_sums(dissipation, everything, known, index_tables), velocities, arrays))
+            dissipated = parse_sums(dissipation, everything, known, index_tables)
+            applied.append(friction(dissipated, dict(zip(velocities, arrays, strict=False))))
         kind = ArrayHamiltonian if conjugate else ArrayLagrangian
         system = kind(
             name=name,
@@ -290,7 +297,7 @@ class ArraySystem:
         return f"the {self.function} depends on time" if self.depends_on_time else ""
 
     @property
-    def masses(self) -> tuple[MassTerm, ...]:
+    def masses(self) -> tuple[ArrayForce, ...]:
         """Masses (second derivatives of L with respect to velocities); empty for a Hamiltonian."""
         return tuple(chain(*(masses_of(term, self._velocities) for term in self.terms)))
 
@@ -305,14 +312,9 @@ class ArraySystem:
         return terms_at_rest(self.terms, self._velocities, self.state, negative=bool(self.momenta), moving=False)
 
     @property
-    def kernels(self) -> tuple[tuple[ArrayTerm, dict[str, Expr]], ...]:
-        """Terms of -V or -H, each with its derivatives by the symbols of its accesses of the state."""
-        results = []
-        for term in self.potentials:
-            slots = [slot for slot, access in term.slots if access.array in self.state]
-            derivatives = gradient(term.formula, slots)
-            results.append((term, {slot.name: derivatives.get(k, S.Zero) for k, slot in enumerate(slots)}))
-        return tuple(results)
+    def all_forces(self) -> tuple[ArrayForce, ...]:
+        """Derivatives of the terms of -V or -H with respect to the state, then the other forces."""
+        return (*(force_of(term, self.state) for term in self.potentials), *self.forces)
 
     def _repr_latex_(self) -> str:
         return rf"$\displaystyle {self.latex}$"
@@ -371,7 +373,7 @@ class ArraySystem:
             if len(kinetic) == 1:  # masses of several loops are added where these meet
                 uniform = {slot: symbol(access.array.name) for slot, access in kinetic[0].slots}
                 warn_of_negative(
-                    self.name, {f"d2{self.function[0]}/d{name}2": kinetic[0].formula.xreplace(uniform)}, values
+                    self.name, {f"d2{self.function[0]}/d{name}2": kinetic[0].targets[0][1].xreplace(uniform)}, values
                 )
 
     def _check_names(self) -> None:
@@ -440,29 +442,6 @@ def _momenta(
             f"momenta must be arrays with the axes of the coordinates, {shown}, not {', '.join(names)}"
         )
     return arrays
-
-
-def _friction(
-    terms: Sequence[ArrayTerm], velocities: Sequence[Array], coordinates: Sequence[Array]
-) -> tuple[ArrayForce, ...]:
-    """Return the forces -dD/dv of Rayleigh's dissipation function."""
-    arrays = dict(zip(velocities, coordinates, strict=False))
-    forces = []
-    for term in terms:
-        moving = [(slot, access) for slot, access in term.slots if access.array in arrays]
-        derivatives = gradient(term.formula, [slot for slot, _ in moving])
-        targets = tuple(
-            (replace(access, array=arrays[access.array]), -derivatives[k])
-            for k, (_, access) in enumerate(moving)
-            if k in derivatives
-        )
-        if not targets:
-            raise SystemDefinitionError(
-                f"the dissipation {term} contains no velocity: Rayleigh's function defines the forces "
-                "-dD/dq_dot. Add velocities, or remove it"
-            )
-        forces.append(ArrayForce(loops=term.loops, slots=term.slots, targets=targets))
-    return tuple(forces)
 
 
 ARRAYS = of("a system with arrays whose sizes are known at run time, as coordinates=['q[N]']", ArraySystem)

@@ -121,12 +121,7 @@ def _numpy_rates(start: WholeStart) -> tuple[dict[str, Numbers], dict[str, Numbe
     """Return dq/dt and dp/dt of every coordinate, computed with NumPy."""
     system = start.system
     result = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in system.state}
-    for term, derivatives in system.kernels:
-        at = start.elements(term.loops)
-        for slot, access in term.slots:
-            if slot.name in derivatives:
-                _add(result[access.array.name], at.of(access), _values(start, at, derivatives[slot.name], term.slots))
-    for force in system.forces:
+    for force in system.all_forces:
         at = start.elements(force.loops)
         for access, formula in force.targets:
             _add(result[access.array.name], at.of(access), _values(start, at, formula, force.slots))
@@ -149,7 +144,8 @@ def _masses(start: WholeStart) -> dict[str, Numbers]:
     masses = {array.name: np.zeros(array.shape(start.arrays.sizes)) for array in start.system.coordinates}
     for mass in start.system.masses:
         at = start.elements(mass.loops)
-        _add(masses[mass.access.array.name], at.of(mass.access), _values(start, at, mass.formula, mass.slots))
+        for access, formula in mass.targets:
+            _add(masses[access.array.name], at.of(access), _values(start, at, formula, mass.slots))
     return masses
 
 
