@@ -92,7 +92,6 @@ _HOMES = {
     "mechanics.arrays.rolling": ("RolledSums", "roll_sums", "unroll_sums"),
     "models.fmu": ("generate_fmu",),
     "models.model": ("Model",),
-    "models.array_model": ("ArrayModel",),
     "models.model_file": ("load_model", "save_model"),
     "advice.solve_ivp": ("OdeResult", "solve_ivp"),
     "tables.nodes": ("Nodes", "chebyshev_lobatto", "equispaced", "legendre_lobatto"),

@@ -74,7 +74,6 @@ from scvi_codegen.methods import RungeKutta as RungeKutta
 from scvi_codegen.methods import SpectralCollocation as SpectralCollocation
 from scvi_codegen.methods import StoermerVerlet as StoermerVerlet
 from scvi_codegen.methods import as_method as as_method
-from scvi_codegen.models.array_model import ArrayModel as ArrayModel
 from scvi_codegen.models.fmu import generate_fmu as generate_fmu
 from scvi_codegen.models.model import Model as Model
 from scvi_codegen.models.model_file import load_model as load_model

@@ -50,9 +50,7 @@ class _Stop(Exception):  # noqa: N818  (no error)
     """Raised from the progress callback to end the run after a signal."""
 
 
-def integrate_states(
-    states: EnsembleStates, *, solver: str = "auto", options: SolverOptions | None = None
-) -> EnsembleOutcome:
+def integrate_states(states: EnsembleStates, *, options: SolverOptions | None = None) -> EnsembleOutcome:
     """Integrate the model from each initial state, with a progress bar, until all end or a signal arrives.
 
     Raises:
@@ -62,7 +60,7 @@ def integrate_states(
     """
     model, began = states.model, time.perf_counter()
     check_memory(model, len(states))
-    stepper = model.stepper(solver=solver)
+    stepper = model.stepper()
     work = _work(model, stepper, states, options)
     started, interrupted = time.perf_counter(), False
     length = work.length

@@ -36,7 +36,7 @@ def check_run_memory(model: Model, steps: int, trajectories: int = 1) -> None:
     """
     folder = "record the run in a folder (-o NAME.run)"
     check_state_memory(
-        len(model.q), steps, model.save_every, trajectories, remedies=[folder] if trajectories == 1 else []
+        model.dimension, steps, model.save_every, trajectories, remedies=[folder] if trajectories == 1 else []
     )
 
 

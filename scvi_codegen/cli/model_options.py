@@ -16,12 +16,19 @@ from click.shell_completion import CompletionItem
 from scvi_codegen.errors import SystemDefinitionError
 from scvi_codegen.mechanics.reparametrisation import CONTROLLERS
 from scvi_codegen.methods import ARGUMENTS, METHODS, size_of, specification_of
-from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import catalogue_model, read_model_file
+from scvi_codegen.models.model_file import catalogue_model, load_model
 from scvi_codegen.models.problems import PROBLEMS, problem
 
-__all__ = ["METHOD_CHOICES", "SOLVER_OPTION", "ModelOptions", "complete_model", "model_arguments", "read_model"]
+__all__ = [
+    "METHOD_CHOICES",
+    "SOLVER_OPTION",
+    "ModelOptions",
+    "complete_model",
+    "model_arguments",
+    "read_model",
+    "with_known_sizes",
+]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -29,6 +36,8 @@ METHOD_CHOICES = (
     *("method", "degree", "stages", "order", "nodes", "quadrature", "space", "form", "variational", "abscissae"),
 )
 """Options that specify the method."""
+MOST_COORDINATES = 2000
+"""Largest number of coordinates of an array model that is compiled with its sizes: its equations are unrolled."""
 OFFERED_SIZES = range(1, 17)
 """Numbers that shell completion offers after ``svi:``."""
 
@@ -60,13 +69,17 @@ class ModelOptions:
     controller: str | None = None
     inputs: tuple[tuple[str, dict[str, str]], ...] | None = None
     size: tuple[tuple[str, int], ...] | None = None
+    solver: str = "auto"
 
     def sections(self) -> dict[str, dict[str, Any]]:
         """Return the options as sections of a model file."""
         named: dict[str, dict[str, Any]] = {
             "system": {"time_transformation": self.time_transformation},
             "initial": {"q": self.q, "p": self.p, "q_dot": self.velocity, "t": self.time},
-            "method": {name: getattr(self, name) for name in METHOD_CHOICES},
+            "method": {
+                **{name: getattr(self, name) for name in METHOD_CHOICES},
+                "solver": None if self.solver == "auto" else self.solver,
+            },
             "run": {name: getattr(self, name) for name in ("step", "span", "steps", "save_every", "controller")},
             "parameters": dict(self.parameter),
             "inputs": dict(self.inputs or ()),
@@ -245,7 +258,7 @@ SOLVER_OPTION = _option(
     default="auto",
     show_default=True,
     help="Solver of the stage equations; auto: explicit or fixed-point iteration if possible, Newton as fallback; "
-    "for array models that of the model.",
+    "by default that of the model file.",
 )
 
 
@@ -278,7 +291,7 @@ def _check_method(choices: ModelOptions) -> None:
             )
 
 
-def read_model(name: str, choices: ModelOptions) -> Model | ArrayModel:
+def read_model(name: str, choices: ModelOptions) -> Model:
     """Return the model of a file or of the catalogue, overridden by the options of the command line.
 
     Raises:
@@ -292,10 +305,24 @@ def read_model(name: str, choices: ModelOptions) -> Model | ArrayModel:
     _check_method(choices)
     path = Path(name)
     if path.suffix.lower() == ".toml" or os.sep in name or path.is_file():
-        return read_model_file(path, choices.sections())
+        return load_model(path, choices.sections())
     if name.partition(":")[0] not in PROBLEMS:
         try:
             problem(name)
         except SystemDefinitionError as error:
             raise SystemDefinitionError(f"{error} (There is no model file '{name}' either.)") from error
     return catalogue_model(name, choices.sections())
+
+
+def with_known_sizes(model: Model, option: str) -> Model:
+    """Return the model of named coordinates that an option requires.
+
+    Raises:
+        click.UsageError: if there are too many of them.
+    """
+    if model.array_system is not None and model.dimension > MOST_COORDINATES:
+        raise click.UsageError(
+            f"{option} compiles an array model with its sizes, which is limited to {MOST_COORDINATES} coordinates: "
+            f"omit {option}, or reduce the sizes ({model.dimension} coordinates here)"
+        )
+    return model.with_known_sizes()

@@ -137,7 +137,7 @@ class Recording:
             if value is not None and not recorded:
                 raise click.UsageError(f"{name} requires a run recorded in a folder (-o NAME{SUFFIX})")
 
-    def record(self, model: Model, folder: str, *, solver: str, options: SolverOptions | None) -> RecordedOutcome:
+    def record(self, model: Model, folder: str, *, options: SolverOptions | None) -> RecordedOutcome:
         """Integrate a model into a folder until its end, a failure or a signal; raises as :func:`record_run`."""
         text = None
         with suppress(ModelFileError):
@@ -146,7 +146,7 @@ class Recording:
             raise click.UsageError(
                 "a recorded run in transformed time needs a number of steps: give --step and --steps"
             )
-        run = model.start(model.stepper(solver=solver), options=options)
+        run = model.start(options=options)
         return self._with_progress(
             record_run,
             run,

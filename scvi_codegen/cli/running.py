@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from scvi_codegen.advice.significant_digits import SECOND_RUN, Known, known_digits
-from scvi_codegen.cli.conservation import Balance, energy_report, momentum_report
+from scvi_codegen.cli.conservation import Balance, conserved_by_arrays, energy_report, momentum_report
 from scvi_codegen.cli.formatting import counted, duration, in_known_digits
 from scvi_codegen.cli.memory import check_memory, check_run_memory
 from scvi_codegen.cli.progress import BAR_LENGTH, interruptions, progress_bar
@@ -18,7 +19,7 @@ from scvi_codegen.errors import AccuracyWarning, StateError, StepFailedError, wa
 from scvi_codegen.methods.discretise import is_symplectic
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
-from scvi_codegen.runtime.arrays.trajectory import ArrayTrajectory
+from scvi_codegen.runtime.arrays.trajectory import ArrayRecord
 from scvi_codegen.runtime.core.validation import Array
 from scvi_codegen.runtime.inputs.segments import with_final_state
 from scvi_codegen.runtime.inputs.trajectory_with_inputs import DrivenTrajectory
@@ -41,6 +42,10 @@ __all__ = [
 
 SHOWN_COORDINATES = 6
 """Largest number of coordinates that the final state lists."""
+
+
+SHOWN_ENTRIES = 4
+"""Largest number of entries of an array that the final state lists."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,12 +77,12 @@ class RunOutcome:
         In transformed time the last saved state lies inside the last step, before the state of the run.
         """
         run, saved = self.run, self.trajectory
-        inside = run.stepper.interface.energy_parameter and (saved.t[-1] - run.t) * run.h > 0.0
+        inside = saved.t[-1] != run.t and (saved.t[-1] - run.t) * run.h > 0.0
         return (float(saved.t[-1]), saved.q[-1], saved.p[-1]) if inside else (run.t, run.q, run.p)
 
 
 @without_accuracy_warnings()
-def integrate_model(model: Model, *, solver: str = "auto", options: SolverOptions | None = None) -> RunOutcome:
+def integrate_model(model: Model, *, options: SolverOptions | None = None, threads: int | None = None) -> RunOutcome:
     """Integrate a model with a progress bar until its end, a failed step or a signal.
 
     Raises:
@@ -87,11 +92,11 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
     """
     check_memory(model)
     began = time.perf_counter()
-    run = model.start(model.stepper(solver=solver), options=options)
-    if model.system.clock is not None and model.ends_at_time:
+    run = model.start(options=options, threads=threads)
+    if model.in_transformed_time and model.ends_at_time:
         return _in_transformed_time(model, run, time.perf_counter() - began)
     preparation = time.perf_counter() - began
-    began, stopped, failure, pieces = time.perf_counter(), False, None, list[Trajectory]()
+    began, stopped, failure, recorder = time.perf_counter(), False, None, _recorder(model, run)
     with interruptions() as caught, progress_bar(_length(model)) as show_progress:
 
         def look(_: int) -> None:
@@ -103,28 +108,76 @@ def integrate_model(model: Model, *, solver: str = "auto", options: SolverOption
             stopped = bool(caught)
             return stopped
 
-        def add(piece: Trajectory) -> None:
-            pieces.append(with_final_state(piece, run) if _in_segments(model) else piece)
-
         try:
             for steps in model.segments(run):
-                add(record(run, steps, save_every=model.save_every, progress=look, stop=stop))
+                recorder.record(steps, look, stop)
                 if stopped:
                     break
         except StepFailedError as error:
             failure = error
-            add(Trajectory.before(error))
-    seconds, pieces = time.perf_counter() - began, pieces or [record(run, 0)]
-    trajectory = DrivenTrajectory(tuple(pieces)) if _in_segments(model) else pieces[0]
+    trajectory = recorder.trajectory()
     return RunOutcome(
         trajectory=trajectory,
         run=run,
         preparation=preparation,
-        seconds=seconds,
+        seconds=time.perf_counter() - began,
         failure=failure,
         interrupted=stopped,
         missed=_missed(model, trajectory),
     )
+
+
+class _Recorder(Protocol):
+    """Recorder of the segments of a run."""
+
+    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
+        """Advance by a segment and save its states; a StepFailedError leaves the states before."""
+
+    def trajectory(self) -> Any:
+        """Return the states saved."""
+
+
+def _recorder(model: Model, run: Any) -> _Recorder:
+    return _Pieces(model, run) if model.array_system is None else _Arrays(model, run)
+
+
+class _Pieces:
+    """Recorder of named coordinates: a trajectory of each segment."""
+
+    def __init__(self, model: Model, run: Run) -> None:
+        self.model, self.run, self.pieces = model, run, list[Trajectory]()
+
+    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
+        try:
+            piece = record(self.run, steps, save_every=self.model.save_every, progress=look, stop=stop)
+        except StepFailedError as error:
+            self._add(Trajectory.before(error))
+            raise
+        self._add(piece)
+
+    def _add(self, piece: Trajectory) -> None:
+        self.pieces.append(with_final_state(piece, self.run) if self.model.has_segments else piece)
+
+    def trajectory(self) -> Trajectory | DrivenTrajectory:
+        pieces = self.pieces or [record(self.run, 0)]
+        return DrivenTrajectory(tuple(pieces)) if self.model.has_segments else pieces[0]
+
+
+class _Arrays:
+    """Recorder of arrays whose sizes are known at run time."""
+
+    def __init__(self, model: Model, run: Any) -> None:
+        self.model, self.run, self.states = model, run, ArrayRecord(run)
+        self.states.take(keep=True)
+
+    def record(self, steps: int | None, look: Callable[[int], None], stop: Callable[[], bool]) -> None:
+        until = math.inf if steps is None else self.run.steps + steps
+        self.states.continue_recording(
+            until, self.model.save_every, progress=look, stop=stop, to_end=self.model.has_segments
+        )
+
+    def trajectory(self) -> Any:
+        return self.states.trajectory()
 
 
 def _in_transformed_time(model: Model, run: Run, preparation: float) -> RunOutcome:
@@ -170,11 +223,6 @@ def _reached(model: Model, run: Run) -> int:
     return int(BAR_LENGTH * (run.t - model.t) / model.covered) if _by_time(model) else run.steps
 
 
-def _in_segments(model: Model) -> bool:
-    """Return True if a run consists of segments, at whose ends states are saved whatever the output stride."""
-    return bool(model.system.inputs) or model.has_shorter_last_step
-
-
 def _by_time(model: Model) -> bool:
     """Return True if the number of steps is not known in advance."""
     return model.ends_at_time or bool(model.system.inputs)
@@ -182,20 +230,23 @@ def _by_time(model: Model) -> bool:
 
 def summary(model: Model, outcome: RunOutcome, known: Known | None, balance: Balance | None = None) -> str:
     """Return a summary of a run in a few lines; shorter if no step was completed."""
-    run, trajectory, method = outcome.run, outcome.trajectory, model.method
+    run, trajectory, method, arrays = outcome.run, outcome.trajectory, model.method, model.array_system
     order = "no order claimed" if method.order is None else f"order {method.order}"
+    sizes = [counted(model.dimension, "coordinate"), *(f"{name} = {size}" for name, size in model.sizes.items())]
     lines = [
-        model.system.name,
+        f"{model.system.name}: {', '.join(sizes)}" if arrays else model.system.name,
         f"{method.title}; {order}, {_geometry(model, run)}, {'' if method.symmetric else 'not '}symmetric",
-        f"{counted(trajectory.steps, 'step')} {describe_step_size(model.h, run)} "
+        f"{counted(trajectory.steps, 'step')} {describe_step_size(model, run)} "
         f"from t = {model.t:g} to t = {outcome.end[0]:g}; "
         f"{counted(len(trajectory), 'state')} saved",
     ]
     if run.steps:
-        lines.append(f"{_speed(outcome, model.save_every)}; prepared in {outcome.preparation:.2f} s")
+        lines.append(f"{_speed(outcome, model)}; prepared in {outcome.preparation:.2f} s")
         with np.errstate(all="ignore"):
-            lines += conserved(model, trajectory, balance)
+            lines += conserved_by_arrays(model, trajectory, run) if arrays else conserved(model, trajectory, balance)
         lines += worst_step(trajectory)
+    if arrays:
+        return "\n".join([*lines, *_final_arrays(outcome.end[1])])
     return "\n".join([*lines, *final_state(run.stepper.coordinates, *outcome.end[1:], known)])
 
 
@@ -209,27 +260,34 @@ def _geometry(model: Model, run: Run) -> str:
 def known_at_end(model: Model, outcome: RunOutcome) -> Known | None:
     """Return the digits of the final state that a second run confirms; ``None`` if the run is incomplete."""
     run, trajectory = outcome.run, outcome.trajectory
-    if not run.steps or outcome.failure is not None or outcome.interrupted or trajectory.t[-1] != run.t:
+    if (
+        model.array_system is not None
+        or not run.steps
+        or outcome.failure is not None
+        or outcome.interrupted
+        or trajectory.t[-1] != run.t
+    ):
         return None
     return known_digits(model.system, trajectory, most=SECOND_RUN + 4 * run.steps, inputs=model.inputs)
 
 
-def describe_step_size(h: float | None, run: Run) -> str:
+def describe_step_size(model: Model, run: Run) -> str:
     """Return a description of the step sizes of a run."""
-    if run.stepper.interface.energy_parameter:
+    if model.in_transformed_time:
         return f"of {run.h:g} in tau"
     if run.plan and run.plan.tau:
         return f"of {run.plan.tau:g} in tau by the reversible controller"
-    return f"of adaptive size ({run.rejected_steps} rejected)" if run.plan or h is None else f"of {h:g}"
+    return f"of adaptive size ({run.rejected_steps} rejected)" if run.plan or model.h is None else f"of {model.h:g}"
 
 
-def _speed(outcome: RunOutcome, save_every: int) -> str:
-    text = f"{outcome.seconds:.3g} s, {duration(outcome.seconds / outcome.trajectory.steps)} a step"
-    saved = outcome.trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
-    watched = outcome.run.steps if saved else (len(outcome.trajectory) - 1) * save_every
-    if not watched:
-        return text
-    return f"{text}, {int(outcome.trajectory.iterations.sum()) / watched:.2f} iterations a step"
+def _speed(outcome: RunOutcome, model: Model) -> str:
+    each, trajectory = outcome.seconds / outcome.trajectory.steps, outcome.trajectory
+    text = f"{outcome.seconds:.3g} s, {duration(each)} a step"
+    if model.array_system is not None:
+        text += f", {duration(each / model.dimension)} a step and coordinate"
+    saved = trajectory.t[-1] == outcome.end[0]  # else iterations are known up to the last saved state
+    watched = outcome.run.steps if saved or model.array_system else (len(trajectory) - 1) * model.save_every
+    return f"{text}, {int(np.sum(trajectory.iterations)) / watched:.2f} iterations a step" if watched else text
 
 
 def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: Balance | None = None) -> Iterator[str]:
@@ -241,7 +299,7 @@ def conserved(model: Model, trajectory: Trajectory | DrivenTrajectory, balance: 
     yield from momentum_report(trajectory)
 
 
-def worst_step(trajectory: Trajectory | DrivenTrajectory | ArrayTrajectory) -> Iterator[str]:
+def worst_step(trajectory: Trajectory | DrivenTrajectory) -> Iterator[str]:
     """Yield a line with the largest error estimate of a step; warn if that step is too large.
 
     The warning does not depend on options such as ``--quiet``.
@@ -270,6 +328,14 @@ def final_state(names: Sequence[str], positions: Array, momenta: Array, known: K
         yield f"  {name:{width}} = {in_known_digits(q, known_q):24} p_{name:{width}} = {in_known_digits(p, known_p)}"
     if len(names) > SHOWN_COORDINATES:
         yield f"  and {len(names) - SHOWN_COORDINATES} more coordinates"
+
+
+def _final_arrays(arrays: Any) -> Iterator[str]:
+    """Yield lines with the first entries of each array at the end."""
+    yield "final state"
+    for name, values in arrays.items():
+        shown = ", ".join(f"{x:.9g}" for x in values.reshape(-1)[:SHOWN_ENTRIES])
+        yield f"  {name} = {shown}{', ..' if values.size > SHOWN_ENTRIES else ''}"
 
 
 def _how_known(known: Known | None) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from typing import TypeVar
 
 import click
 
@@ -13,7 +12,6 @@ from scvi_codegen.advice.advice import Advice, Evidence, advise
 from scvi_codegen.cli.command_group import tell
 from scvi_codegen.cli.formatting import duration
 from scvi_codegen.errors import AccuracyWarning, StateError
-from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
 from scvi_codegen.runtime.run.global_error import GlobalError
@@ -21,14 +19,13 @@ from scvi_codegen.validation.counts import check_tolerance
 
 __all__ = ["model_with_adaptive_steps", "model_with_advised_step", "model_with_global_error"]
 
-AnyModel = TypeVar("AnyModel", Model, ArrayModel)
 ROUND_OFF = 2.0**-52
 """Unit in the last place of 1 in double precision; smaller tolerances mean "as accurate as doubles allow"."""
 MAX_STEPS = 10**9
 """Largest number of steps that is started without ``--step``: a quarter of an hour at one microsecond each."""
 
 
-def model_with_adaptive_steps(model: AnyModel, tolerance: float) -> AnyModel:
+def model_with_adaptive_steps(model: Model, tolerance: float) -> Model:
     """Return the model with adaptive steps whose local error is bounded by the tolerance, or by round-off.
 
     Raises:
@@ -42,8 +39,8 @@ def model_with_adaptive_steps(model: AnyModel, tolerance: float) -> AnyModel:
 
 
 def model_with_global_error(
-    model: AnyModel, error: float, *, solver: str = "", options: SolverOptions | None, threads: int | None = None
-) -> tuple[AnyModel, GlobalError]:
+    model: Model, error: float, *, options: SolverOptions | None, threads: int | None = None
+) -> tuple[Model, GlobalError]:
     """Return the model with a local tolerance that meets a global error bound, and the estimate of that error.
 
     The estimate compares runs with different steps and is printed. Adaptive steps of one tolerance are reproducible to
@@ -55,10 +52,7 @@ def model_with_global_error(
     wanted = replace(model, h=None, tolerance=None, error=error, steps=None, span=model.covered)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AccuracyWarning)  # reported in the line printed below
-        if isinstance(wanted, ArrayModel):
-            result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
-        else:
-            result = wanted.confirmed(wanted.stepper(solver=solver), options=options)
+        result = wanted.confirmed(wanted.stepper(), options=options, threads=threads)
     local = f"{result.tolerance:.1e}" if result.tolerance else "round-off"
     numbers = {
         "requested": error,
@@ -77,7 +71,7 @@ def model_with_global_error(
     return replace(wanted, tolerance=result.local_tolerance, error=None), result
 
 
-def model_with_advised_step(model: Model, tolerance: float, *, solver: str, options: SolverOptions | None) -> Model:
+def model_with_advised_step(model: Model, tolerance: float, *, options: SolverOptions | None) -> Model:
     """Return the model with the fixed step size that pilot runs recommend for an error at the end of the span.
 
     Prints the recommendation and its pilot runs to stdout, warnings to stderr.
@@ -92,11 +86,11 @@ def model_with_advised_step(model: Model, tolerance: float, *, solver: str, opti
         model.system,
         model.method,
         model.q,
-        model.momenta(model.stepper(solver=solver)),
+        model.momenta(model.stepper()),
         model.covered,
         tolerance,
         t=model.t,
-        solver=solver,
+        solver=model.solver,
         options=options,
     )
     numbers = {"h": advice.h, "steps": advice.steps, "message": advice.message, "warnings": list(advice.warnings)}

@@ -19,9 +19,9 @@ one is known (:func:`~scvi_codegen.mechanics.legendre.equivalent_lagrangian`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from scvi_codegen.display.cards import Html, card, listed, plain
 from scvi_codegen.errors import SystemDefinitionError, closest
@@ -82,6 +82,7 @@ class MechanicalSystem(Deferred, ABC):
         constraints: expressions in (q, t), or linear in v, that are 0 along trajectories of a Lagrangian
             (:mod:`scvi_codegen.mechanics.constraints`).
         arrays: declarations of the arrays of known sizes whose entries are coordinates and parameters.
+        definition: the text with arrays that the system was read from, for model files; empty without arrays.
     """
 
     name: str
@@ -95,6 +96,7 @@ class MechanicalSystem(Deferred, ABC):
     inputs: tuple[str, ...] = ()
     damping: Expr = field(default_factory=_zero)
     arrays: tuple[Array, ...] = field(default=(), compare=False)
+    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     @abstractmethod

@@ -24,10 +24,11 @@ from typing import IO
 from scvi_codegen.errors import ModelFileError, PackageError
 from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.formulas.inputs import PARTS
+from scvi_codegen.models.example import example_of
 from scvi_codegen.models.fmu_description import build_description, model_description
 from scvi_codegen.models.generated_folders import prefix_of
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.package import MODEL, example_of, model_text
+from scvi_codegen.models.package import MODEL, model_text
 from scvi_codegen.native.building import PORTABLE_FLAGS, load
 from scvi_codegen.native.cross import TARGETS, library_for
 from scvi_codegen.pipeline.sources import generate_source
@@ -64,9 +65,9 @@ def generate_fmu(
     communication step, else the largest smaller one that does.
 
     Args:
-        model: system, method, initial state, and the step size.
+        model: system, method, initial state, and the step size. Arrays have the sizes of the model.
         path: target file, ``<name>.fmu``; the name is the prefix of the C names.
-        solver: of the stage equations, as for ``compile_stepper``.
+        solver: of the stage equations, as for ``compile_stepper``; by default that of the model.
         flags: for the C compiler; by default those with bitwise equal results on all processors of a kind.
         platforms: further platforms of libraries, as FMI names them: ``x86_64-windows``, ``aarch64-darwin``, ..
         force: overwrite a file that is not an FMU.
@@ -87,7 +88,8 @@ def generate_fmu(
     _check(platforms)
     if not force:
         _refuse_to_lose(target)
-    source, texts = _texts(model, prefix, solver)
+    model = (model if solver == "auto" else replace(model, solver=solver)).with_known_sizes()
+    source, texts = _texts(model, prefix)
     libraries = {_library_path(_this_platform(), prefix): load(source, flags=flags).path.read_bytes()}
     for name in sorted({*platforms} - {_this_platform()}):
         libraries[_library_path(name, prefix)] = library_for(name, source, flags=flags)
@@ -104,9 +106,9 @@ def _check(platforms: tuple[str, ...]) -> None:
             raise PackageError(f"{name!r} is not a platform of FMUs; use one of {', '.join(TARGETS)}")
 
 
-def _texts(model: Model, prefix: str, solver: str) -> tuple[Source, dict[str, bytes]]:
+def _texts(model: Model, prefix: str) -> tuple[Source, dict[str, bytes]]:
     """Return the source to compile, and the archive's text files by name."""
-    source, interface = generate_source(model.system, model.method, solver=solver, prefix=prefix)
+    source, interface = generate_source(model.system, model.method, solver=model.solver, prefix=prefix)
     by_velocity = model.velocity is not None
     start = _start(model)
     indices = tuple(interface.parameters.index(f"{name}_{PARTS[0]}") for name in interface.inputs)

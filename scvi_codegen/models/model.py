@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from dataclasses import fields as fields_of
+from functools import partial
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
-from scvi_codegen.mechanics.system import SYSTEM, MechanicalSystem
+from scvi_codegen.lowering.arrays import check_solver, one_coordinate
+from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
+from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import Problem
@@ -19,26 +25,31 @@ from scvi_codegen.validation.argument_types import check_kind
 if TYPE_CHECKING:
     from scvi_codegen.models.input_tables import InputTable
     from scvi_codegen.native.options import SolverOptions
-    from scvi_codegen.runtime.core.integrator import Integrator
     from scvi_codegen.runtime.core.stepper import Stepper
     from scvi_codegen.runtime.core.validation import Array
     from scvi_codegen.runtime.inputs.segments import Input
     from scvi_codegen.runtime.run.global_error import GlobalError
     from scvi_codegen.runtime.run.run import Run
+    from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 
 __all__ = ["DEFAULT_METHOD", "Model"]
 
 DEFAULT_METHOD = SVI(8)
 """Default method for the problems of the catalogue."""
+STATE = ("q", "p", "velocity")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Model(TimeSpan):
     """System, method, initial state and time span; equality is structural.
+
+    For a system of arrays whose sizes are known at run time, q, p and velocity are arrays by the name of their
+    coordinate array, the shapes of q determine the sizes, and p or velocity may be omitted: the default is 0.
 
     Attributes:
         system: the mechanical system, with the parameter values of the run as its defaults.
         method: its discretisation; a name, ``"svi:8"``, is converted to the method.
+        solver: of the stage equations, as of :func:`~scvi_codegen.compile_stepper`.
         q: (m,) initial coordinates.
         p: (m,) initial momenta, or ``None`` if ``velocity`` is given.
         velocity: (m,) initial velocities, or ``None`` if ``p`` is given.
@@ -47,29 +58,39 @@ class Model(TimeSpan):
             :func:`~scvi_codegen.compile_stepper`; requires a span. A system in transformed time has its own.
         inputs: by name a table of values, ``(t, values)`` or ``(t, values, kind)`` as :meth:`Stepper.integrate` accepts
             it; a run requires all inputs of the system.
+        fields: arrays of parameters by name, for array sizes known at run time; others keep their default value.
+        tables: index tables of shape (rows, columns) by name, for array sizes known at run time.
 
     Raises:
         ModelFileError: naming the field, unless exactly one of p and velocity, at most one of h, tolerance and error,
             and exactly one of span and steps is given, each vector has m entries, and every number is finite and valid.
+            Arrays of run-time sizes are validated when a run begins.
     """
 
     system: MechanicalSystem
     method: Method
-    q: tuple[float, ...]
-    p: tuple[float, ...] | None = None
-    velocity: tuple[float, ...] | None = None
+    q: Any
+    p: Any = None
+    velocity: Any = None
+    solver: str = "auto"
     time_transformation: str | None = None
-    inputs: Mapping[str, InputTable] = field(default_factory=dict, hash=False)
+    inputs: Mapping[str, InputTable] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    tables: Mapping[str, Any] = field(default_factory=dict)
 
     __repr__ = summary("system", "method", "h", "span", "steps")
 
     def __post_init__(self) -> None:
-        check_kind(SYSTEM, self.system, "system", ModelFileError)
-        object.__setattr__(self, "method", as_method(self.method, self.system))
-        check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
-        for name in ("q", "p", "velocity"):
-            if (vector := getattr(self, name)) is not None:
-                object.__setattr__(self, name, self._vector(name, vector))
+        check_kind(SYSTEM_OR_ARRAYS, self.system, "system", ModelFileError)
+        arrays = self.array_system
+        object.__setattr__(self, "method", as_method(self.method, one_coordinate(arrays) if arrays else self.system))
+        if arrays is None:
+            check_one_of("p", self.p, "velocity (q_dot)", self.velocity)
+            for name in STATE:
+                if (vector := getattr(self, name)) is not None:
+                    object.__setattr__(self, name, self._vector(name, vector))
+        else:
+            self._check_arrays()
         if self._varies_steps and (self.system.clock is not None or self.span is None):
             raise ModelFileError(
                 f"the reversible controller of the time transformation {self.time_transformation} requires a time "
@@ -80,6 +101,24 @@ class Model(TimeSpan):
             from scvi_codegen.models.input_tables import checked_tables  # not needed for reading a model
 
             object.__setattr__(self, "inputs", checked_tables(self.system, self.inputs))
+
+    def _check_arrays(self) -> None:
+        if self.solver != "auto":
+            check_solver(self.solver, ModelFileError)
+        if self.p is not None and self.velocity is not None:
+            raise ModelFileError("give p or velocity (q_dot), not both")
+        if self.time_transformation is not None:
+            raise ModelFileError(
+                "a time transformation requires known array sizes: use that of the model with_known_sizes()"
+            )
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Model):
+            return NotImplemented
+        return all(_equal(getattr(self, each.name), getattr(other, each.name)) for each in fields_of(self))
+
+    def __hash__(self) -> int:
+        return hash((self.system, self.method, self.h, self.tolerance, self.span, self.steps, self.t))
 
     @classmethod
     def from_problem(cls, entry: Problem, method: Method = DEFAULT_METHOD) -> Model:
@@ -95,6 +134,47 @@ class Model(TimeSpan):
         )
 
     @property
+    def array_system(self) -> ArraySystem | None:
+        """The system if it has arrays whose sizes are known at run time only, else ``None``."""
+        return self.arrays_of(self.system)
+
+    @staticmethod
+    def arrays_of(system: Any) -> ArraySystem | None:
+        """Return a system if it has arrays whose sizes are known at run time only, else ``None``."""
+        return system if isinstance(system, ArraySystem) else None
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Array sizes known at run time, by name; empty for a system of named coordinates."""
+        if (system := self.array_system) is None:
+            return {}
+        known = {**self.q, **self.fields, **self.tables}
+        arrays = [array for array in system.arrays if array.name in known]
+        axes = [(array, np.shape(known[array.name])) for array in arrays]
+        return {size.name: length for array, shape in axes for size, length in zip(array.axes, shape) if size.name}  # noqa: B905
+
+    @property
+    def dimension(self) -> int:
+        """Number m of coordinates."""
+        return len(self.q) if self.array_system is None else sum(map(np.size, self.q.values()))
+
+    def with_known_sizes(self) -> Model:
+        """Return the model of the same motion with all array entries as named coordinates, which has every feature.
+
+        Compiling it takes time that grows with the number of coordinates.
+        """
+        if (system := self.array_system) is None:
+            return self
+        from scvi_codegen.mechanics.arrays.unrolling import unroll_sums  # imported here
+
+        known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
+        vectors = {name: _flat(system, getattr(self, name)) for name in STATE if getattr(self, name) is not None}
+        if len(vectors) == 1:
+            vectors["p" if system.momenta else "velocity"] = (0.0,) * len(vectors["q"])
+        changed: dict[str, Any] = {"fields": {}, "tables": {}, **vectors}
+        return replace(self, system=known, **changed)
+
+    @property
     def ends_at_time(self) -> bool:
         """True if the run ends at a time, after a number of steps that is not known in advance."""
         return self.h is None or (self.has_time_transformation and self.span is not None)
@@ -107,42 +187,55 @@ class Model(TimeSpan):
     @property
     def has_time_transformation(self) -> bool:
         """True if there is a time transformation, so that a step size is one in tau."""
-        return self.time_transformation is not None or self.system.clock is not None
+        return self.time_transformation is not None or self.in_transformed_time
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """Parameters by name: the system's defaults, without the energy of a transformation and inputs."""
-        others = {self.system.clock.energy.name if self.system.clock else "", *input_parameters(self.system.inputs)}
-        return {symbol.name: value for symbol, value in self.system.constants.items() if symbol.name not in others}
+    def in_transformed_time(self) -> bool:
+        """True if the system moves in fictitious time tau."""
+        return self.array_system is None and self.system.clock is not None
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Parameters by name: the system's defaults, without the energy of a transformation and inputs; and fields."""
+        clock = None if self.array_system else self.system.clock
+        others = {clock.energy.name if clock else "", *input_parameters(self.system.inputs)}
+        constants = zip(self.system.parameters, self.system.defaults, strict=True)
+        return {**{symbol.name: value for symbol, value in constants if symbol.name not in others}, **self.fields}
 
     def first_step(self, stepper: Stepper) -> float:
         """Return h, or the size of the first adaptive step; with a time transformation, the step size in tau."""
         if self.h is not None and self.time_transformation is None:
             return self.h
         run = self.start(stepper)
-        if self.system.clock is not None:
+        if self.in_transformed_time:
             return run.h
         run.advance(1)
         return run.t - self.t
 
-    def stepper(self, *, solver: str = "auto") -> Stepper:
+    def stepper(self) -> Stepper:
         """Compile a stepper for runs of this model; raises as :func:`~scvi_codegen.compile_stepper`."""
         from scvi_codegen.compiler import compile_stepper  # imported here: not needed for reading a model
 
-        return compile_stepper(self.system, self.method, solver=solver, time_transformation=self.time_transformation)
+        return compile_stepper(
+            self.system, self.method, solver=self.solver, time_transformation=self.time_transformation
+        )
 
     def momenta(self, stepper: Stepper) -> Array:
         """Return the (m,) initial momenta: ``p``, or the Legendre transform of the velocities."""
-        import numpy as np  # imported here: not needed for reading a model
-
         if self.p is not None:
             return np.array(self.p)
         assert self.velocity is not None  # by construction
         return stepper.momentum(self.q, self.velocity, self.t, self.parameters_at_start(stepper))
 
-    def parameters_at_start(self, stepper: Stepper) -> Mapping[str, float] | Array:
+    def initial_state(self, stepper: Stepper) -> dict[str, Any]:
+        """Return the arguments of :meth:`Stepper.start` for the initial state: q, p or velocity, t, and tables."""
+        if self.array_system is None:
+            return {"q": self.q, "p": self.momenta(stepper), "t": self.t}
+        return {"t": self.t, "tables": self.tables, **{name: getattr(self, name) for name in STATE}}
+
+    def parameters_at_start(self, stepper: Stepper) -> Mapping[str, Any] | Array:
         """Return the initial parameters, including components of inputs if these are given."""
-        if not self.inputs:
+        if not self.inputs or self.array_system is not None:
             return self.parameters
         from scvi_codegen.runtime.inputs.segments import first_inner_time
 
@@ -157,13 +250,18 @@ class Model(TimeSpan):
         Raises:
             ModelFileError, StateError: for inputs that are missing, or do not cover the whole run.
         """
-        if not (self.system.inputs or self.has_shorter_last_step):
+        if not self.has_segments:
             yield None if run.plan else self.step_count
             return
-        from scvi_codegen.runtime.inputs.segments import prepared_segments  # imported here, as NumPy above
+        from scvi_codegen.runtime.inputs.segments import prepared_segments
 
-        inputs, values = self._inputs_and_parameters(run.stepper)
+        inputs, values = self._inputs_and_parameters(run)
         yield from prepared_segments(run, inputs, self.end, values)
+
+    @property
+    def has_segments(self) -> bool:
+        """True if a run consists of segments, at whose ends states are saved whatever the output stride."""
+        return bool(self.system.inputs) or self.has_shorter_last_step
 
     @property
     def end(self) -> float:
@@ -180,16 +278,28 @@ class Model(TimeSpan):
                 raise ModelFileError(f"the input {name} is not set: give {way}")
         return self.inputs
 
-    def _inputs_and_parameters(self, stepper: Integrator) -> tuple[dict[str, Input], Callable[[float], Array]]:
-        """Return the inputs, and the parameters as a function of time."""
-        from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_of
+    def _inputs_and_parameters(self, of: Stepper | Run) -> tuple[dict[str, Input], Callable[[float], Array]]:
+        """Return the inputs, and the scalar parameters as a function of time."""
+        from scvi_codegen.runtime.inputs.segments import checked_inputs, parameters_at
 
-        inputs = checked_inputs(stepper.interface, self.all_inputs())
-        return inputs, parameters_of(stepper, self.parameters, inputs)
+        interface = of.interface if hasattr(of, "interface") else of.stepper.interface
+        inputs = checked_inputs(interface, self.all_inputs())
+        values = {**dict(zip(interface.parameters, interface.defaults, strict=True)), **self.parameters}
+        numbers = np.array([values[name] for name in interface.parameters])
+        return inputs, partial(parameters_at, interface.parameters, numbers, inputs)
 
-    def start(self, stepper: Stepper, *, options: SolverOptions | None = None) -> Run:
-        """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end."""
-        p, h = self.momenta(stepper), self.h
+    def start(
+        self, stepper: Stepper | None = None, *, options: SolverOptions | None = None, threads: int | None = None
+    ) -> Run:
+        """Start the run of this model at its initial state, to be advanced by its :meth:`segments` or to its end.
+
+        Args:
+            stepper: that of :meth:`stepper`, which is compiled by default.
+            options: convergence criterion of the solver.
+            threads: number of threads per step, for array sizes known at run time.
+        """
+        stepper = stepper or self.stepper()
+        state, h, common = self.initial_state(stepper), self.h, self._common(options, threads)
         if h is None and self.has_time_transformation:
             from scvi_codegen.runtime.run.largest_step import largest_step  # imported here: not needed for reading
 
@@ -198,33 +308,53 @@ class Model(TimeSpan):
                     "with inputs, a step size in tau cannot be found by a pilot run: give one (--step, [run] step)"
                 )
             arguments: dict[str, Any] = {"t": self.t, "parameters": self.parameters, "options": options}
-            h = largest_step(stepper, self.q, p, self.covered, self.tolerance or 0.0, **arguments)
+            h = largest_step(stepper, self.q, state["p"], self.covered, self.tolerance or 0.0, **arguments)
         to_end = h is None or self.time_transformation is not None
-        tolerance = self.tolerance if self.error is None else self.confirmed(stepper, options=options).local_tolerance
+        tolerance = self.tolerance
+        if self.error is not None:
+            tolerance = self.confirmed(stepper, options=options, threads=threads).local_tolerance
         return stepper.start(
-            self.q,
-            p,
+            **state,
             h=abs(h) if h is not None and to_end else h,
-            t=self.t,
             t_end=self.t + self.covered if to_end else None,
             tolerance=tolerance if h is None else None,
             parameters=self.parameters_at_start(stepper),
-            options=options,
+            **common,
         )
 
-    def confirmed(self, stepper: Stepper, *, options: SolverOptions | None = None) -> GlobalError:
+    def confirmed(
+        self, stepper: Stepper, *, options: SolverOptions | None = None, threads: int | None = None
+    ) -> GlobalError:
         """Return the local tolerance for :attr:`error`, confirmed by runs with other tolerances.
 
         Steps with that tolerance are bitwise equal to those that were confirmed.
         """
-        p = self.momenta(stepper)
-        common: dict[str, Any] = {"t": self.t, "t_end": self.t + self.covered, "error": self.error}
-        common |= {"parameters": self.parameters, "options": options}
+        arguments = {**self.initial_state(stepper), **self._common(options, threads), "parameters": self.parameters}
         if self.system.inputs:
-            common["inputs"] = self.all_inputs()
-        confirmation: GlobalError | None = stepper.integrate(self.q, p, **common).confirmation
-        assert confirmation is not None  # by construction
-        return confirmation
+            arguments["inputs"] = self.all_inputs()
+        trajectory: Trajectory = stepper.integrate(**arguments, t_end=self.t + self.covered, error=self.error)
+        assert trajectory.confirmation is not None  # by construction
+        return trajectory.confirmation
+
+    def integrate(self, *, progress: Callable[[int], None] | None = None, threads: int | None = None) -> Trajectory:
+        """Integrate over the whole span; raises as :meth:`Stepper.integrate`."""
+        stepper, h = self.stepper(), self.h
+        if h is None and self.has_time_transformation:
+            h = self.start(stepper).h
+        arguments = {**self.initial_state(stepper), **self._common(None, threads), "parameters": self.parameters}
+        if self.system.inputs:
+            arguments["inputs"] = self.all_inputs()
+        if h is None:
+            arguments |= {"tolerance": self.tolerance} if self.error is None else {"error": self.error}
+        to_end = self.ends_at_time or self.has_shorter_last_step
+        arguments |= {"t_end": self.t + self.covered} if to_end else {"steps": self.step_count}
+        trajectory: Trajectory = stepper.integrate(**arguments, h=h, save_every=self.save_every, progress=progress)
+        return trajectory
+
+    def _common(self, options: SolverOptions | None, threads: int | None) -> dict[str, Any]:
+        if threads is not None and self.array_system is None:
+            raise ModelFileError("threads require arrays whose sizes are names, coordinates = ['q[N]']: omit threads")
+        return {"options": options} if threads is None else {"options": options, "threads": threads}
 
     def _vector(self, name: str, values: Sequence[float]) -> tuple[float, ...]:
         names = [coordinate.name for coordinate in self.system.coordinates]
@@ -233,3 +363,17 @@ class Model(TimeSpan):
         values = tuple(values)
         check_length(values, names, name)
         return tuple(real(value, f"{name}[{i}] ({names[i]})") for i, value in enumerate(values))
+
+
+def _flat(system: ArraySystem, state: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the entries of all coordinate arrays in order."""
+    return tuple(float(x) for array in system.coordinates for x in np.ravel(state[array.name]))
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Return whether two values are equal, arrays and mappings of arrays by their entries."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_equal(each, other[name]) for name, each in one.items())
+    if hasattr(one, "shape") or hasattr(other, "shape"):
+        return np.array_equal(one, other)
+    return bool(one == other)

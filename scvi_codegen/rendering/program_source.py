@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
+from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
 from scvi_codegen.ir.derivatives import Derivatives
 from scvi_codegen.ir.iteration import Control, FixedPointIteration, StoredValues
@@ -29,9 +29,9 @@ __all__ = [
     "EMBEDDED",
     "Embedded",
     "EventSearch",
+    "ExampleArrays",
     "ExampleRun",
     "render",
-    "render_array_example",
     "render_derivatives",
     "render_embedded",
     "render_events",
@@ -72,6 +72,25 @@ class ExampleInput(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ExampleArrays:
+    """Arrays of an example run whose sizes are known at run time, which ``main.c`` reads from text files.
+
+    Attributes:
+        count: number of coordinates.
+        sizes: by name.
+        fields: number of entries by file.
+        tables: number of entries, and limits of the indices in each column, by file.
+        moving: file of the initial momenta or velocities, "p" or "velocity", or nothing for a start from rest.
+    """
+
+    count: int
+    sizes: dict[str, int]
+    fields: dict[str, int]
+    tables: dict[str, tuple[int, list[int]]]
+    moving: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ExampleRun:
     """Run of the generated ``main.c``: initial state, step, and output interval.
 
@@ -83,6 +102,7 @@ class ExampleRun:
         to_end: whether it continues to the end of the span, in a number of steps of tau that is not known before.
         inputs: of a system that has any, if they are set; ``parameters`` has their values at the start.
         end: of a run with inputs.
+        arrays: of a system whose array sizes are known at run time; ``outputs`` is then the number of steps.
     """
 
     q: tuple[float, ...]
@@ -98,6 +118,7 @@ class ExampleRun:
     to_end: bool = False
     inputs: tuple[ExampleInput, ...] = ()
     end: float = 0.0
+    arrays: ExampleArrays | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,23 +243,10 @@ def render_example(interface: Interface, start: ExampleRun, precision: Embedded 
         "distances": (ROUNDING_UNITS, INPUT_PRECISION, LARGEST_VIOLATION),
         "target": target,
         "real": target.scalar,
-        "threads": False,
+        "threads": start.arrays is not None,
     }
     environment = template_environment()
     return {name: environment.get_template(f"{name}.jinja").render(context) for name in ("main.c", "Makefile")}
-
-
-def render_array_example(prefix: str, **start: Any) -> dict[str, str]:
-    """Return ``main.c`` and ``Makefile`` that run the integrator from arrays in files of the same folder.
-
-    Args:
-        prefix: of the C names.
-        start: title, momenta (whether the system is Hamiltonian), numbers, sizes, fields and tables with their lengths,
-            moving ("p", "velocity" or nothing), constraints (whether there are any), run (t, h, steps, save_every).
-    """
-    environment, context = template_environment(), {"prefix": prefix, "target": DOUBLE, "threads": True, **start}
-    templates = {"main.c": "arrays_main.c.jinja", "Makefile": "Makefile.jinja"}
-    return {name: environment.get_template(template).render(context) for name, template in templates.items()}
 
 
 def workspace_size(program: Program) -> int:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from scvi_codegen.models.package import load_package
+from scvi_codegen import load_package
 
 __all__ = ["stepper"]
 

@@ -53,8 +53,10 @@ each_cell = pytest.mark.parametrize(("command", "kind", "served"), CELLS, ids=la
 def tried(command: str, kind: str) -> Result:
     """The command on a model of that kind, in the present folder."""
     Path("model.toml").write_text(MODELS[kind] + REST)
-    Path("many.csv").write_text("q,y\n0.6,-0.8\n0.8,-0.6\n" if kind == "constraints" else "q\n0.1\n0.2\n")
+    q = "q_0" if kind == "array systems" else "q"
+    Path("many.csv").write_text("q,y\n0.6,-0.8\n0.8,-0.6\n" if kind == "constraints" else f"{q}\n0.1\n0.2\n")
     name, *options = [re.sub(r"^[A-Z]+", lambda found: WORDS[found[0]], word) for word in command.split()]
+    options = [option.replace("(q)", f"({q})") for option in options]
     lengths = [] if {"--step", "--tolerance", "--advise"} & {*options} or name == "derive" else ["--step", "0.1"]
     return CliRunner().invoke(main, [name, "model.toml", *options, *lengths])
 

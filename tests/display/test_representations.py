@@ -53,7 +53,7 @@ def runs(folder: Path) -> Iterator[Any]:
     ring = sc.LagrangianSystem.from_text(NAME, ["q[N]"], "sum(i in N, q_dot[i]**2/2 - q[i]**2/2)")
     many = sc.compile_stepper(ring, "svi:2", flags=QUICK_FLAGS)
     yield from (ring, many, many.start(np.ones(5), h=0.1), many.integrate(np.ones(5), h=0.1, steps=3))
-    yield sc.ArrayModel(system=ring, method=sc.SVI(2), q={"q": np.ones(5)}, h=0.1, steps=3)
+    yield sc.Model(system=ring, method=sc.SVI(2), q={"q": np.ones(5)}, h=0.1, steps=3)
 
 
 @pytest.mark.filterwarnings("ignore")

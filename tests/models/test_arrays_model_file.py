@@ -13,8 +13,8 @@ from click.testing import CliRunner
 import scvi_codegen as sc
 from scvi_codegen.cli import main
 from scvi_codegen.formulas.arrays import parse_array
-from scvi_codegen.models.array_values import read_array
-from scvi_codegen.models.model_file import read_model_file
+from scvi_codegen.models.model_file import load_model
+from scvi_codegen.models.values import read_array
 from scvi_codegen.native.compilers import find_compiler
 
 NET = """
@@ -152,11 +152,11 @@ def test_index_has_one_meaning() -> None:
         ('file = "bonds.csv"', "file = 3", "must be a file, .* with text between quotes"),
         ('{ file = "bonds.csv" }', "[[0.5, 1], [1, 2]]", "must be whole numbers"),
         ("steps = 4", "steps = 4\ntolerance = 1e-9", "step.*tolerance"),
-        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller is not supported for array systems"),
+        ("steps = 4", 'steps = 4\ncontroller = "reversible"', "controller requires a time transformation"),
         ("steps = 4", "", "span"),
         ("step = 0.1", "", "has steps but no step"),
         ("step = 0.1\nsteps = 4", "tolerance = 2.0\nspan = 1.0", "must be positive and below 1"),
-        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] is not supported for array systems"),
+        ("[sizes]", "[inputs]\nu = 1\n\n[sizes]", r"\[inputs\] u must be a table"),
     ],
 )
 def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str) -> None:
@@ -165,14 +165,70 @@ def test_invalid_files_are_rejected(net: Path, old: str, new: str, message: str)
     assert old in text
     net.write_text(text.replace(old, new, 1))
     with pytest.raises(sc.ModelFileError, match=message) as caught:
-        read_model_file(net)
+        load_model(net)
     assert str(caught.value).startswith(str(net))
 
 
 def test_one_loader_reads_both_kinds_of_files(net: Path, tmp_path: Path) -> None:
-    assert isinstance(sc.load_model(net), sc.ArrayModel)
+    """Array sizes known at run time, named coordinates; saved models are read again."""
+    model = sc.load_model(net)
+    assert isinstance(model, sc.Model)
+    assert (model.sizes, model.dimension) == ({"N": 3, "B": 2}, 6)
+    sc.save_model(model, tmp_path / "again.toml")
+    assert "sum(b in B" in (tmp_path / "again.toml").read_text()
+    again = sc.load_model(tmp_path / "again.toml")
+    assert again == model
+    assert sc.load_model(net, {"parameters": {"m": 1.0}}) != model
     sc.save_model(sc.Model.from_problem(sc.problem("kepler")), tmp_path / "kepler.toml")
     assert isinstance(sc.load_model(tmp_path / "kepler.toml"), sc.Model)
+
+
+def test_model_with_known_sizes_has_the_same_motion(net: Path) -> None:
+    """Entries become named coordinates; trajectories agree to round-off."""
+    model = sc.load_model(net)
+    known = model.with_known_sizes()
+    assert [each.name for each in known.system.coordinates] == ["r_0_0", "r_0_1", "r_1_0", "r_1_1", "r_2_0", "r_2_1"]
+    assert known.velocity == (0.0,) * 6
+    assert known.integrate().q[-1] == pytest.approx(model.integrate().q["r"][-1].ravel(), abs=1e-14)
+
+
+DRIVEN = """
+[system]
+name = "driven ring"
+coordinates = ["q[N]"]
+lagrangian = "sum(i in N, q_dot[i]**2/2) - sum(i in N periodic, (q[i+1] - q[i])**2/2)"
+inputs = ["u"]
+[forces]
+"q[i]" = "u"
+[sizes]
+N = 4
+[inputs]
+u = { t = [0.0, 0.55, 1.0], values = [0.0, 1.0, -1.0] }
+[initial]
+q = "i/10"
+[method]
+method = "svi:4"
+[run]
+step = 0.1
+span = 1.0
+"""
+
+
+def test_models_of_arrays_have_inputs(tmp_path: Path) -> None:
+    """The mean moves as the exact integral of the force; known sizes give the same states."""
+    path = tmp_path / "driven.toml"
+    path.write_text(DRIVEN)
+    model = sc.load_model(path)
+    run = model.integrate()
+    assert run.t[-1] == 1.0
+    # x'' = u: after the ramp to 1 at a = 0.55, x = a**2/6, v = a/2; then b = 0.45 with u = 1 - 2 s/b
+    a, b = 0.55, 0.45
+    mean = a**2 / 6 + a / 2 * b + b**2 / 2 - b**2 / 3
+    assert run.q["q"][-1].mean() == pytest.approx(0.15 + mean, abs=1e-13)
+    known = model.with_known_sizes().integrate()
+    assert known.q[-1] == pytest.approx(run.q["q"][-1], abs=1e-14)
+    sc.save_model(model, tmp_path / "again.toml")
+    assert sc.load_model(tmp_path / "again.toml") == model
 
 
 RING = """
@@ -199,7 +255,11 @@ def test_model_files_with_arrays_of_known_sizes(tmp_path: Path) -> None:
     assert (model.q, model.velocity) == ((0.5, 0.0, 1.0, 2.0), (0.0, 0.0, 0.0, 0.0))
     assert model.parameters == {"M": 2.0, "m_0": 1.0, "m_1": 2.0, "m_2": 3.0}
     sc.save_model(model, tmp_path / "again.toml")
+    assert 'coordinates = [\n    "x",\n    "q[3]",\n]' in (tmp_path / "again.toml").read_text()
+    assert "sum(i in 3, m[i]*q_dot[i]**2/2)" in (tmp_path / "again.toml").read_text()
     assert sc.load_model(tmp_path / "again.toml") == model
+    path.write_text(RING.replace("q = [0, 1, 2]", 'q = "i"'))
+    assert sc.load_model(path) == model
     path.write_text(RING.replace("[0, 1, 2]", "[0, 1]"))
     with pytest.raises(sc.ModelFileError, match="q"):
         sc.load_model(path)

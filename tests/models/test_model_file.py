@@ -165,7 +165,7 @@ def test_a_catalogue_reference_may_be_changed():
             "[[events]]\nfunction = 'q'\n[system]",
             "section 'events' in the file; events are supported in Python only",
         ),
-        ("[method]", "[zzz]", "Known: system, forces, inputs, parameters, initial, method, run"),
+        ("[method]", "[zzz]", "Known: system, forces, inputs, sizes, parameters, tables, initial, method, run"),
         ("lagrangian", "lagrangain", "unknown key 'lagrangain' in [system]; did you mean 'lagrangian'?"),
         ("degree", "degre", "unknown key 'degre' in [method] for svi; did you mean 'degree'?"),
         ("save_every", "save_evry", "unknown key 'save_evry' in [run]; did you mean 'save_every'?"),
@@ -227,7 +227,7 @@ def test_a_catalogue_reference_may_be_changed():
         ("[system]", "system = 3\n[zzz]", "unknown section 'zzz'"),
         ("[system]", '[system]\ncatalogue = "kepler"', "unknown key 'name' in [system] beside catalogue"),
         ("[run]", "[run", "this is not TOML"),
-        ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to arrays whose sizes are names"),
+        ("[run]", '[tables]\n"b[N]" = [1]\n[run]', "[tables] belongs to coordinates that are arrays"),
         ('"svi"', '"svi:4"', "[method] method = 'svi:4' and degree = 3 contradict each other"),
         ('["q"]', '["q"]\nmomenta = ["p"]', "[system] has momenta and a lagrangian"),
         (

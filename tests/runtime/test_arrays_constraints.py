@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 import scvi_codegen as sc
 from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.errors import AccuracyWarning, MethodError, StateError, SystemDefinitionError
-from scvi_codegen.models.array_package import generate_sums
+from scvi_codegen.models.package import generate_package
 
 RATTLE = sc.SVI(1, "gauss-lobatto:2")
 ROUNDING = 2.0**-52
@@ -235,7 +235,7 @@ def test_model_files_and_generated_programs_have_constraints(tmp_path):
     (tmp_path / "chain.toml").write_text(MODEL)
     model = sc.load_model(tmp_path / "chain.toml")
     run = model.integrate()
-    folder = generate_sums(model, tmp_path / "chain_c")
+    folder = generate_package(model, tmp_path / "chain_c")
     made = subprocess.run(["make", "run"], cwd=folder, capture_output=True, text=True, check=True)
     assert "warning" not in made.stderr
     end = np.loadtxt(folder / "end.txt")

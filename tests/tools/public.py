@@ -20,7 +20,7 @@ import click
 import scvi_codegen
 from scvi_codegen.cli import main
 from scvi_codegen.methods import ARGUMENTS
-from scvi_codegen.models import array_file, model_file
+from scvi_codegen.models import model_file
 from scvi_codegen.runtime import distributed
 
 __all__ = ["RECORDED", "public"]
@@ -104,9 +104,8 @@ def _command_line(command: click.Command, words: str) -> Iterator[str]:
 
 def _model_files() -> Iterator[str]:
     """Sections and their keys; in brackets of a method those that it takes."""
-    for of, file in (("", model_file), (" of sums", array_file)):
-        for section in file.SECTIONS:
-            yield from (f"[{section}]{of} {key}".rstrip() for key in ("", *file.KEYS.get(section, ())))
+    for section in model_file.SECTIONS:
+        yield from (f"[{section}] {key}".rstrip() for key in ("", *model_file.KEYS.get(section, ())))
     for method, keys in ARGUMENTS.items():
         yield f"[method] {method} {' '.join(keys)}".rstrip()
 

@@ -8,13 +8,11 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import check_writable, emit, reporting
-from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model
-from scvi_codegen.cli.sums import reject_options
+from scvi_codegen.cli.model_options import ModelOptions, model_arguments, read_model, with_known_sizes
 from scvi_codegen.derivation import Start, derivation_html
 from scvi_codegen.derivation.arrays import derive_sums
 from scvi_codegen.derivation.equations import StepEquations
 from scvi_codegen.derivation.equations import derive as derive_equations
-from scvi_codegen.models.array_model import ArrayModel
 
 __all__ = ["derive"]
 
@@ -34,7 +32,8 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
     --html writes a self-contained page with the whole derivation: equations of motion, trial curve, tables, equations
     with the paper's numbers, Jacobian, operation counts, and the C code next to its formulas.
 
-    For an array model: each term group with its derivatives with respect to its entries, masses, and the step.
+    For an array model: each term group with its derivatives with respect to its entries, masses, and the step; with
+    --html and --radicals the equations for its sizes.
 
     \b
     Examples:
@@ -47,9 +46,10 @@ def derive(model_name: str, latex: bool, radicals: bool, output: str | None, htm
         check_writable(Path(html), "'--html'")
     model = read_model(model_name, ModelOptions(**choices))
     about = {"system": model.system.name, "method": model.method.name}
-    if isinstance(model, ArrayModel):
-        reject_options({"html": html, "radicals": radicals})
-        text = derive_sums(model.system, model.method, as_latex=latex)
+    if html is not None or radicals:
+        model = with_known_sizes(model, "--html" if html is not None else "--radicals")
+    if model.array_system is not None:
+        text = derive_sums(model.array_system, model.method, as_latex=latex)
         emit(text, output, **about, text=text)
         return
     if html is not None:

@@ -7,9 +7,13 @@ from typing import Any
 import click
 
 from scvi_codegen.cli.command_group import reporting, tell
-from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
-from scvi_codegen.cli.sums import reject_options
-from scvi_codegen.models.array_model import ArrayModel
+from scvi_codegen.cli.model_options import (
+    SOLVER_OPTION,
+    ModelOptions,
+    model_arguments,
+    read_model,
+    with_known_sizes,
+)
 from scvi_codegen.models.fmu import generate_fmu
 from scvi_codegen.models.package import generate_package
 from scvi_codegen.native.cross import TARGETS
@@ -48,7 +52,6 @@ __all__ = ["generate"]
 def generate(
     model_name: str,
     output: str,
-    solver: str,
     force: bool,
     embedded: Embedded | None,
     single_file: bool,
@@ -60,8 +63,8 @@ def generate(
 
     With --embedded the C code is small: Newton's method alone, or an explicit method; a macro bounds the iterations.
 
-    For an array model the folder has C code for any array sizes and the initial state as a text file, but no Python
-    package.
+    For an array model the folder has C code for any array sizes and the initial state as text files; with --embedded
+    and --fmu the C code is for the sizes of the model.
 
     With --fmu the output is one file for Modelica tools, Simulink and FMPy: the compiled library, the C code, and the
     description of its variables.
@@ -77,13 +80,12 @@ def generate(
         raise click.UsageError("--fmu excludes --embedded and --single-file")
     if platforms and not fmu:
         raise click.UsageError("--platform requires --fmu: C code in a folder is for any platform")
-    if isinstance(model, ArrayModel):
-        reject_options({"embedded": embedded, "single_file": single_file, "fmu": fmu})
-        folder, python = generate_package(model, output, solver=solver, force=force), ""
-    elif fmu:
-        folder, python = generate_fmu(model, output, solver=solver, platforms=platforms, force=force), ""
+    if fmu or embedded:
+        model = with_known_sizes(model, "--fmu" if fmu else "--embedded")
+    if fmu:
+        folder, python = generate_fmu(model, output, platforms=platforms, force=force), ""
     else:
-        folder = generate_package(model, output, solver=solver, force=force, embedded=embedded, single_file=single_file)
+        folder = generate_package(model, output, force=force, embedded=embedded, single_file=single_file)
         python = "" if embedded else f", or 'import {folder.resolve().name}'"
     tell(f"{model.system.name}: {model.method.title}", system=model.system.name, method=model.method.name)
     use = "" if fmu else f"; run the C example with 'make -C {folder} run'{python}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,20 @@ from scvi_codegen.cli.command_group import FAILURE, INTERRUPTED, CommandFailure,
 from scvi_codegen.cli.conservation import energy_balance
 from scvi_codegen.cli.ensembles import ensemble_summary, integrate_states
 from scvi_codegen.cli.json_documents import ensemble_numbers, failure_text, recorded_numbers, run_numbers
-from scvi_codegen.cli.model_options import SOLVER_OPTION, ModelOptions, model_arguments, read_model
+from scvi_codegen.cli.model_options import (
+    SOLVER_OPTION,
+    ModelOptions,
+    model_arguments,
+    read_model,
+    with_known_sizes,
+)
 from scvi_codegen.cli.recording import RecordedOutcome, Recording, check_format, check_resumed, is_run_folder
 from scvi_codegen.cli.running import RunOutcome, integrate_model, known_at_end, summary
 from scvi_codegen.cli.step_selection import model_with_adaptive_steps, model_with_advised_step, model_with_global_error
-from scvi_codegen.cli.sums import reject_options, run_arrays, with_solver
-from scvi_codegen.models.array_model import ArrayModel
 from scvi_codegen.models.ensemble_file import load_ensemble
 from scvi_codegen.models.model import Model
 from scvi_codegen.native.options import SolverOptions
+from scvi_codegen.pictures.arrays import plot_arrays
 from scvi_codegen.pictures.canvas import check_plot_path
 from scvi_codegen.pictures.overview import plot_trajectory
 from scvi_codegen.runtime.run.global_error import GlobalError
@@ -45,8 +51,9 @@ fast); the map remains symplectic. --step is then the step of tau; without it on
 round-off. --span and all times are of t. For systems with explicit time or forces use --controller reversible, a
 time-reversible step-size controller.
 
-An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its trajectory is an .npz
-file, its plot an image over index and time.
+An array model (array coordinates, q[N]) takes sizes from its arrays, [sizes] or --size; its plot is an image over
+index and time. With --ensemble, --advise, --time-transformation, and an output other than an .npz file, it is compiled
+for its sizes.
 
 A system with inputs (measured or commanded signals) takes their values from the section [inputs] of its file or from
 --input: a table with columns t and value. Steps end at breakpoints of the inputs.
@@ -144,7 +151,6 @@ def run(
     tolerance: float | None,
     error: float | None,
     advise: float | None,
-    solver: str,
     solver_tolerance: float | None,
     max_iterations: int | None,
     threads: int | None,
@@ -167,24 +173,24 @@ def run(
     arguments = {"tolerance": solver_tolerance, "max_iterations": max_iterations}
     chosen: dict[str, Any] = {key: value for key, value in arguments.items() if value is not None}
     options = SolverOptions(**chosen) if chosen else None
-    if isinstance(model, ArrayModel):
-        reject_options({"ensemble": ensemble, "advise": advise})
-        arrays, confirmed = _arrays_with_steps(with_solver(solver, model), wanted, options, threads)
-        run_arrays(arrays, output, plot, options, threads)
-        _check_confirmed(confirmed)
-        return
-    if threads is not None:
+    for option, needed in (
+        ("--ensemble", ensemble is not None),
+        ("--advise", advise is not None),
+        (f"-o {output}", output is not None and Path(output).suffix.lower() != ".npz"),
+    ):
+        model = with_known_sizes(model, option) if needed else model
+    if threads is not None and model.array_system is None:
         raise click.UsageError("--threads requires an array model (array coordinates)")
     if model.system.inputs:
         _check_driven(advise, recorded=recorded)
     if ensemble is not None:
-        _run_ensemble(model, ensemble, output, solver, options)
+        _run_ensemble(model, ensemble, output, options)
         return
-    model, confirmation = _with_steps(model, wanted, solver, options)
+    model, confirmation = _with_steps(model, wanted, options, threads)
     if output is not None and recorded:
-        _finish_recording(recording.record(model, output, solver=solver, options=options))
+        _finish_recording(recording.record(model, output, options=options))
     else:
-        _run_one(model, output, plot, solver, options, advised=advise)
+        _run_one(model, output, plot, options, threads, advised=advise)
     _check_confirmed(confirmation)
 
 
@@ -198,29 +204,17 @@ def _check_confirmed(confirmation: GlobalError | None) -> None:
 
 
 def _with_steps(
-    model: Model, wanted: dict[str, float | None], solver: str, options: SolverOptions | None
+    model: Model, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
 ) -> tuple[Model, GlobalError | None]:
     """Return the model with the steps that one of the requested errors determines, and the estimated global error."""
     tolerance, error, advise = wanted["tolerance"], wanted["error"], wanted["advise"]
     if tolerance is not None:
         return model_with_adaptive_steps(model, tolerance), None
     if advise is not None:
-        return model_with_advised_step(model, advise, solver=solver, options=options), None
+        return model_with_advised_step(model, advise, options=options), None
     if (wanted_error := model.error if error is None else error) is not None:
-        return model_with_global_error(model, wanted_error, solver=solver, options=options)
+        return model_with_global_error(model, wanted_error, options=options, threads=threads)
     return model, None
-
-
-def _arrays_with_steps(
-    model: ArrayModel, wanted: dict[str, float | None], options: SolverOptions | None, threads: int | None
-) -> tuple[ArrayModel, GlobalError | None]:
-    """Return the same as :func:`_with_steps` for array systems."""
-    if wanted["tolerance"] is not None:
-        return model_with_adaptive_steps(model, wanted["tolerance"]), None
-    wanted_error = model.error if wanted["error"] is None else wanted["error"]
-    if wanted_error is None:
-        return model, None
-    return model_with_global_error(model, wanted_error, options=options, threads=threads)
 
 
 def _check_outputs(output: str | None, plot: str | None, ensemble: str | None) -> None:
@@ -268,14 +262,14 @@ def _run_one(
     model: Model,
     output: str | None,
     plot: str | None,
-    solver: str,
     options: SolverOptions | None,
+    threads: int | None,
     *,
     advised: float | None,
 ) -> None:
-    outcome = integrate_model(model, solver=solver, options=options)
+    outcome = integrate_model(model, options=options, threads=threads)
     known = known_at_end(model, outcome)
-    balance = energy_balance(model.system, outcome.trajectory, outcome.run.steps)
+    balance = None if model.array_system else energy_balance(model.system, outcome.trajectory, outcome.run.steps)
     tell(summary(model, outcome, known, balance), **run_numbers(model, outcome, known, balance))
     written = _write_outputs(outcome, output, plot)
     tell(written=written)
@@ -304,14 +298,14 @@ def _finish_recording(outcome: RecordedOutcome) -> None:
     tell(f"wrote {outcome.recorded.folder}", written=[outcome.recorded.folder])
 
 
-def _run_ensemble(model: Model, path: str, output: str | None, solver: str, options: SolverOptions | None) -> None:
+def _run_ensemble(model: Model, path: str, output: str | None, options: SolverOptions | None) -> None:
     if model.error is not None:
         raise click.UsageError(f"[run] error = {model.error:g} is not available with --ensemble: set tolerance instead")
     if model.has_time_transformation:
         raise click.UsageError(
             "--ensemble is not available with a time transformation: each trajectory has its own times"
         )
-    outcome = integrate_states(load_ensemble(path, model), solver=solver, options=options)
+    outcome = integrate_states(load_ensemble(path, model), options=options)
     tell(ensemble_summary(model, outcome), **ensemble_numbers(model, outcome))
     continuation = "the computed states were not written to a file (-o)"
     if output is not None:
@@ -331,7 +325,8 @@ def _write_outputs(outcome: RunOutcome, output: str | None, plot: str | None) ->
     if output is not None:
         outcome.trajectory.save(output)
     if plot is not None:
-        plot_trajectory(outcome.trajectory, plot)
+        draw: Any = plot_arrays if isinstance(outcome.trajectory.q, Mapping) else plot_trajectory
+        draw(outcome.trajectory, plot)
     return [path for path in (output, plot) if path is not None]
 
 

@@ -11,20 +11,14 @@ import click
 from scvi_codegen import verification
 from scvi_codegen.cli.command_group import FAILURE, CommandFailure, check_writable, note, reporting, tell
 from scvi_codegen.cli.model_options import METHOD_CHOICES, SOLVER_OPTION, ModelOptions, model_arguments, read_model
-from scvi_codegen.cli.sums import with_solver
 from scvi_codegen.errors import PackageError
-from scvi_codegen.models.array_model import ArrayModel
-from scvi_codegen.models.array_package import load_sums
 from scvi_codegen.models.model import Model
-from scvi_codegen.models.model_file import read_model_file
-from scvi_codegen.models.package import CERTIFICATE_FILE, load_package
-from scvi_codegen.runtime.arrays.stepper import ArrayStepper
+from scvi_codegen.models.model_file import load_model
+from scvi_codegen.models.package import CERTIFICATE_FILE, MODEL_FILE, load_package
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.verification import Certificate
 
 __all__ = ["verify"]
-
-MODEL_FILE = "model.toml"
 
 
 @click.command()
@@ -32,7 +26,7 @@ MODEL_FILE = "model.toml"
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="Write the certificate as JSON.")
 @SOLVER_OPTION
 @reporting
-def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> None:
+def verify(model_name: str, output: str | None, **choices: Any) -> None:
     """Measure the guaranteed properties of the integrator of MODEL; exit status 1 if one is violated.
 
     MODEL may also be a folder written by 'generate': then its C code is measured. A step is compared with the paper's
@@ -52,7 +46,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
     path = _certificate_path(model_name) if output is None else Path(output)
     if path is not None:
         check_writable(path, "'-o'")
-    certificate = _verified(model_name, ModelOptions(**choices), solver=solver)
+    certificate = _verified(model_name, ModelOptions(**choices))
     tell(certificate.to_text(), nl=False, **json.loads(certificate.to_json()))
     if path is not None:
         certificate.save(path)
@@ -61,7 +55,7 @@ def verify(model_name: str, output: str | None, solver: str, **choices: Any) -> 
         raise CommandFailure(f"violated: {', '.join(check.name for check in certificate.violated)}", FAILURE)
 
 
-def _verified(name: str, choices: ModelOptions, *, solver: str) -> Certificate:
+def _verified(name: str, choices: ModelOptions) -> Certificate:
     """Return the certificate of a model file, a system of the catalogue or a generated folder.
 
     Raises:
@@ -71,50 +65,23 @@ def _verified(name: str, choices: ModelOptions, *, solver: str) -> Certificate:
     folder = Path(name)
     if not folder.is_dir():
         model = read_model(name, choices)
-        if isinstance(model, ArrayModel):
-            model = with_solver(solver, model)
-            return _array_certificate(model, model.stepper())
-        return _certificate(model, model.stepper(solver=solver), solver)
-    if solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
+        return _certificate(model, model.stepper())
+    if choices.solver != "auto" or any(getattr(choices, choice) is not None for choice in METHOD_CHOICES):
         raise click.UsageError(f"'{name}' is a generated folder: its method and solver are those it was generated with")
     if not (folder / MODEL_FILE).is_file():
         raise PackageError(
             f"{folder} has no {MODEL_FILE}, which defines its guaranteed properties: generate it from a model"
         )
-    model = read_model_file(folder / MODEL_FILE, choices.sections())
-    if isinstance(model, ArrayModel):
-        return _array_certificate(model, load_sums(folder, model))
-    return _certificate(model, load_package(folder), "auto")
+    return _certificate(load_model(folder / MODEL_FILE, choices.sections()), load_package(folder))
 
 
-def _certificate(model: Model, stepper: Stepper, solver: str) -> Certificate:
-    p = model.momenta(stepper)
-    return verification.verify(
-        model.system,
-        model.method,
-        model.q,
-        p,
-        h=model.first_step(stepper),
-        t=model.t,
-        stepper=stepper,
-        tolerance=model.allowed_error,
-        solver=solver,
-    )
-
-
-def _array_certificate(model: ArrayModel, stepper: ArrayStepper) -> Certificate:
-    return verification.verify(
-        model.system,
-        model.method,
-        model.q,
-        model.p,
-        velocity=model.velocity,
-        h=model.step,
-        t=model.t,
-        parameters=model.parameters,
-        tables=model.tables,
-        stepper=stepper,
-    )
+def _certificate(model: Model, stepper: Stepper) -> Certificate:
+    state = model.initial_state(stepper)
+    if model.array_system is not None:
+        arguments: dict[str, Any] = {"h": model.step, "parameters": model.fields}
+    else:
+        arguments = {"h": model.first_step(stepper), "tolerance": model.allowed_error, "solver": model.solver}
+    return verification.verify(model.system, model.method, **state, **arguments, stepper=stepper)
 
 
 def _certificate_path(name: str) -> Path | None:

@@ -73,6 +73,7 @@ def unrolled_fields(
         "inputs": system.inputs,
         "damping": system.damping,
         "arrays": tuple(known_array(array, sizes) for array in (*system.coordinates, *system.fields)),
+        "definition": {} if system.sizes else system.definition,
     }
     if momenta:
         return together | {"momenta": momenta, "hamiltonian": Add(*summands)}

@@ -11,7 +11,7 @@ may differ between elements. With known sizes they are systems of named coordina
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, ClassVar
 
@@ -66,6 +66,7 @@ class ArraySystem:
         inputs: names of functions of time passed to each run, each represented by five of the parameters.
         constraints: g = 0 at every element of loops (:mod:`scvi_codegen.mechanics.arrays.terms`).
         damping: damping rate of all momenta, see :class:`~scvi_codegen.mechanics.system.MechanicalSystem`.
+        definition: the arguments of :meth:`from_text` other than name and parameters, for model files.
     """
 
     name: str
@@ -82,6 +83,7 @@ class ArraySystem:
     inputs: tuple[str, ...] = ()
     constraints: tuple[ArrayTerm, ...] = ()
     damping: Expr = S.Zero
+    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
     REQUIRES_SIZES: ClassVar[str] = SIZES_REQUIRED
 
     def __repr__(self) -> str:
@@ -189,6 +191,18 @@ class ArraySystem:
         >>> print(chain)
         chain: L(q[N]) = sum(i in N, q_dot[i]**2/2) + sum(i in N periodic, -k*(q[i+1] - q[i])**2/2)
         """
+        definition = {
+            "coordinates": list(coordinates),
+            "momenta": None if momenta is None else list(momenta),
+            "lagrangian": lagrangian,
+            "hamiltonian": hamiltonian,
+            "tables": list(tables),
+            "forces": dict(forces or {}),
+            "dissipation": dissipation,
+            "damping": damping,
+            "inputs": list(inputs),
+            "constraints": list(constraints),
+        }
         arrays = tuple(map(parse_coordinate, coordinates))
         conjugate = _momenta(arrays, momenta, lagrangian, hamiltonian)
         index_tables = tuple(map(_table, tables))
@@ -221,8 +235,9 @@ class ArraySystem:
             inputs=tuple(inputs),
             constraints=tuple(parse_constraint(each, everything, known, index_tables) for each in constraints),
             damping=damping_rate(damping, lambda formula: parse_expression(str(formula), known)),
+            definition={key: value for key, value in definition.items() if value not in (None, [], {})},
         )
-        system._warn_of_mistakes()
+        system.warn_of_mistakes()
         return system
 
     @classmethod
@@ -359,7 +374,7 @@ class ArraySystem:
         """Arrays of coordinates by the names of their velocities."""
         return {} if self.momenta else {array.name + DOT: array for array in self.coordinates}
 
-    def _warn_of_mistakes(self) -> None:
+    def warn_of_mistakes(self) -> None:
         """Warn of parameters and inputs that occur in no formula, and of negative masses."""
         terms = [*self.terms, *self.constraints]
         formulas = [term.formula for term in terms] + [f for force in self.forces for _, f in force.targets]

@@ -1,0 +1,148 @@
+"""Conversion of models to the sections of a model file."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scvi_codegen.errors import ModelFileError
+from scvi_codegen.indices import Array
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.models.model import Model
+
+if TYPE_CHECKING:
+    from scvi_codegen.models.input_tables import InputTable
+
+__all__ = ["document_of", "motion_of"]
+
+SHORT_VECTOR = 4
+TEXT_WIDTH = 100
+STATE = {"q": "q", "p": "p", "q_dot": "velocity"}
+"""Field of a model by key of ``[initial]``."""
+
+
+def document_of(model: Model, *, as_arrays: bool = True) -> dict[str, Any]:
+    """Return all sections, in the order of a file; ``as_arrays``: with the arrays that the system was read with."""
+    clock = None if model.array_system else model.system.clock
+    system = clock.plain if clock and clock.plain else model.system
+    names = [] if model.array_system else [coordinate.name for coordinate in system.coordinates]
+    if model.array_system and not system.definition:
+        raise ModelFileError(f"'{system.name}' was not read from text: give its formula to from_text to write a file")
+    if as_arrays and system.definition:
+        document, parameters = _definition(system), _declared_parameters(model)
+        motion = motion_of(model, names) | {"initial": {"t": model.t, **_state_by_array(model, names)}}
+    else:
+        document, parameters, motion = _formulas(system, names), model.parameters, motion_of(model, names)
+    if g := clock.time_transformation if clock else model.time_transformation:
+        document["system"]["time_transformation"] = g
+    if model.inputs:
+        document["inputs"] = {name: _as_lists(table) for name, table in model.inputs.items()}
+    if sizes := {name: size for name, size in model.sizes.items() if size}:
+        document["sizes"] = sizes
+    if parameters:
+        document["parameters"] = parameters
+    if model.tables:
+        declared = {each.partition("[")[0]: each for each in system.definition.get("tables", ())}
+        document["tables"] = {declared[name]: np.asarray(rows).tolist() for name, rows in model.tables.items()}
+    return {**document, **motion}
+
+
+def _definition(system: MechanicalSystem) -> dict[str, Any]:
+    """Return the sections of a system that was read from text with arrays."""
+    texts = {key: value for key, value in system.definition.items() if key not in ("forces", "tables")}
+    for key in ("lagrangian", "hamiltonian"):
+        if key in texts:
+            texts[key] = _wrapped(texts[key])
+    forces = system.definition.get("forces")
+    return {"system": {"name": system.name, **texts}, **({"forces": dict(forces)} if forces else {})}
+
+
+def _formulas(system: MechanicalSystem, names: Sequence[str]) -> dict[str, Any]:
+    """Return the sections of a system of named coordinates."""
+    kind = "hamiltonian" if system.auxiliaries else "lagrangian"
+    momenta = {"momenta": [p.name for p in system.auxiliaries]} if system.auxiliaries else {}
+    document: dict[str, Any] = {
+        "system": {"name": system.name, "coordinates": list(names), **momenta, kind: _wrapped(system.to_text())}
+    }
+    forces = zip(names, system.forces, strict=False)
+    if applied := {name: _wrapped(system.text_of(force)) for name, force in forces if force != 0}:
+        document["forces"] = applied
+    if system.damping != 0:
+        document["system"]["damping"] = system.text_of(system.damping)
+    if system.constraints:
+        document["system"]["constraints"] = [system.text_of(g) for g in system.constraints]
+    if system.inputs:
+        document["system"]["inputs"] = list(system.inputs)
+    return document
+
+
+def _declared_parameters(model: Model) -> dict[str, Any]:
+    """Return the values of parameters, those of arrays by declaration."""
+    values = dict(model.parameters)
+    if arrays := model.array_system:
+        defaults = zip(arrays.fields, arrays.field_defaults, strict=True)
+        return {**_without(values, model.fields), **{str(f): _list(values.get(f.name, x)) for f, x in defaults}}
+    declared = {}
+    for array in model.system.arrays:
+        if array.axes and set(array.elements) <= set(values):
+            declared[str(array)] = _entries(array, values)
+            values = _without(values, array.elements)
+    return values | declared
+
+
+def _state_by_array(model: Model, names: Sequence[str]) -> dict[str, Any]:
+    """Return positions, and velocities or momenta, by the name of their array."""
+    state = {key: getattr(model, name) for key, name in STATE.items() if getattr(model, name) is not None}
+    if model.array_system is not None:
+        return {key: {name: _list(values) for name, values in arrays.items()} for key, arrays in state.items()}
+    arrays = [array for array in model.system.arrays if set(array.elements) <= set(names)]
+    by_name = {key: dict(zip(names, values, strict=True)) for key, values in state.items()}
+    return {key: {array.name: _entries(array, values) for array in arrays} for key, values in by_name.items()}
+
+
+def _entries(array: Array, values: Mapping[str, float]) -> Any:
+    """Return the entries of an array of known sizes."""
+    return _list(np.reshape([values[name] for name in array.elements], array.shape({})))
+
+
+def _list(values: Any) -> Any:
+    """Return the entries of an array as lists, or as one number if they are equal."""
+    entries = np.asarray(values, dtype=float)
+    return float(entries.flat[0]) if entries.size and np.all(entries == entries.flat[0]) else entries.tolist()
+
+
+def _without(values: Mapping[str, Any], names: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in names}
+
+
+def _as_lists(table: InputTable) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in table._asdict().items()}
+
+
+def motion_of(model: Model, names: Sequence[str]) -> dict[str, Any]:
+    """Return the sections other than the system."""
+    vectors = {key: getattr(model, name) for key, name in STATE.items()}
+    initial = {key: _named(names, vector) for key, vector in vectors.items() if vector is not None}
+    length = {"steps": model.steps} if model.span is None else {"span": model.span}
+    fields = {"step": model.h, "tolerance": model.tolerance, "error": model.error}
+    step = {key: value for key, value in fields.items() if value is not None}
+    controller = {"controller": "reversible"} if model.time_transformation else {}
+    run = {**step, **controller, **length, "save_every": model.save_every}
+    specification = model.method.specification().items()
+    method = {key: list(value) if isinstance(value, tuple) else value for key, value in specification}
+    solver = {} if model.solver == "auto" else {"solver": model.solver}
+    return {"initial": {"t": model.t, **initial}, "method": {**method, **solver}, "run": run}
+
+
+def _wrapped(formula: str) -> str:
+    """Return a formula, wrapped to several lines if it is long."""
+    lines = textwrap.wrap(formula, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return lines[0] if len(lines) == 1 else "\n".join(["", *lines, ""])
+
+
+def _named(names: Sequence[str], vector: Sequence[float]) -> list[float] | dict[str, float]:
+    """Return a short vector as a list, a long one by name."""
+    return list(vector) if len(vector) <= SHORT_VECTOR else dict(zip(names, vector, strict=True))

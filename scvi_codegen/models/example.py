@@ -1,0 +1,141 @@
+"""Example runs of generated folders and FMUs: the run of the model, with its initial state and output interval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from scvi_codegen.errors import MethodError, ModelFileError, StateError
+from scvi_codegen.formulas.tape import evaluate
+from scvi_codegen.mechanics.derived_expressions import forms_of
+from scvi_codegen.mechanics.legendre import equivalent_lagrangian
+from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.models.input_tables import tables_of_example
+from scvi_codegen.models.model import Model
+from scvi_codegen.rendering.program_source import ExampleArrays, ExampleRun
+from scvi_codegen.rendering.source import Interface
+from scvi_codegen.runtime.arrays.interface import read_arrays, read_state, table_limits
+from scvi_codegen.tables.precision import mp
+
+__all__ = ["array_example_of", "example_of"]
+
+OUTPUTS = 20
+COMPARED = 1e-9
+"""Tolerance of adaptive steps shown next to an example with a fixed step size."""
+
+
+def example_of(model: Model, *, controlled: bool) -> ExampleRun:
+    """Return the example run: the whole run of the model with about twenty lines of output at most."""
+    clock = model.system.clock
+    if model.h is None and (clock or model.time_transformation is not None):
+        raise ModelFileError(
+            "a step size in tau cannot be found for a tolerance without compiling: give one (--step, [run] step)"
+        )
+    if model.h is None and not controlled:
+        raise MethodError(
+            f"adaptive steps are unavailable for {model.method.name} and this system: give a step h "
+            "(--step, [run] step)"
+        )
+    inputs_by_name = model.all_inputs() if model.inputs else {}
+    inputs, parameters = tables_of_example(
+        model.system, inputs_by_name, (model.t, model.end if inputs_by_name else model.t)
+    )
+    momenta = model.p if model.p is not None else _momenta(model, parameters)
+    if clock and model.ends_at_time:
+        steps = max(1, round(model.covered / (model.step * float(_rate(model.system, model.q, momenta)))))
+    else:
+        count = OUTPUTS if model.h is None or model.time_transformation is not None else None
+        steps = count or max(1, model.step_count if model.system.inputs else model.whole_step_count())
+    save_every = max(1, steps // OUTPUTS)
+    return ExampleRun(
+        q=model.q,
+        p=momenta,
+        parameters=parameters,
+        t=model.t,
+        h=model.h if model.time_transformation is None else None,
+        span=model.covered,
+        tolerance=_chosen_by(model),
+        controlled=controlled,
+        save_every=save_every,
+        outputs=steps // save_every,
+        to_end=bool(clock) and model.ends_at_time,
+        inputs=inputs,
+        end=model.end if inputs else 0.0,
+    )
+
+
+def _chosen_by(model: Model) -> float:
+    """Return the tolerance of adaptive steps, or the step size in tau."""
+    if model.time_transformation is not None and model.h is not None:
+        return abs(model.h)
+    return COMPARED if model.h is not None else model.tolerance or 0.0
+
+
+def _momenta(model: Model, parameters: Sequence[float]) -> tuple[float, ...]:
+    """Return the (m,) initial momenta from the velocities, in 60 digits, so that no C compiler is required."""
+    system = equivalent_lagrangian(model.system)
+    if system is None:
+        raise StateError("velocities do not determine the momenta of this Hamiltonian: give p, not q_dot")
+    rate = _rate(system, model.q, ()) if system.clock else 1.0
+    symbols = (*system.coordinates, *system.velocities, system.time, *system.parameters)
+    numbers = (*model.q, *(rate * mp.mpf(v) for v in model.velocity or ()), model.t, *parameters)
+    point = dict(zip(symbols, map(mp.mpf, numbers), strict=True))
+    try:
+        return tuple(float(evaluate(expression, point)) for expression in forms_of(system).momentum)
+    except ArithmeticError as error:
+        raise StateError(f"the initial velocities have no momenta: {error}") from error
+
+
+def _rate(system: MechanicalSystem, q: Sequence[float], p: Sequence[float]) -> Any:
+    """Return dt/dtau at a state, in 60 digits."""
+    assert system.clock is not None
+    symbols = (*system.coordinates, *system.auxiliaries, *system.parameters)
+    numbers = (*q, *(p if system.auxiliaries else ()), *system.defaults)
+    try:
+        rate = evaluate(system.clock.rate, dict(zip(symbols, map(mp.mpf, numbers), strict=True)))
+    except ArithmeticError as error:
+        raise StateError(f"the time transformation has no value at the initial state: {error}") from error
+    if not rate > 0:
+        raise StateError(f"the time transformation is {float(rate):g} at the initial state: it must be positive")
+    return rate
+
+
+def array_example_of(model: Model, interface: Interface) -> tuple[ExampleRun, dict[str, Any]]:
+    """Return the run of a model with array sizes known at run time, and its arrays by the name of their text file."""
+    problem = read_arrays(interface, model.q, model.fields, model.tables)
+    files = {"q": _joined(problem.state)}
+    moving = "p" if model.velocity is None else "velocity"
+    if (state := getattr(model, moving)) is not None:
+        files[moving] = _joined(read_state(interface, state, moving))
+    fields = {f"field_{name}": values for name, values in problem.fields.items()}
+    arrays = ExampleArrays(
+        count=files["q"].size,
+        sizes={name: problem.sizes[name] for name in interface.layout.sizes},
+        fields={name: values.size for name, values in fields.items()},
+        tables={
+            f"table_{name}": (problem.places[name].size, limits)
+            for name, limits in table_limits(interface, problem.sizes)
+        },
+        moving=moving if moving in files else "",
+    )
+    steps = model.whole_step_count()
+    run = ExampleRun(
+        q=(),
+        p=(),
+        parameters=tuple(problem.numbers),
+        t=model.t,
+        h=model.step,
+        span=model.covered,
+        tolerance=0.0,
+        controlled=False,
+        save_every=model.save_every,
+        outputs=steps,
+        arrays=arrays,
+    )
+    return run, {**files, **fields, **{f"table_{name}": values for name, values in problem.places.items()}}
+
+
+def _joined(state: dict[str, Any]) -> Any:
+    return np.concatenate([values.reshape(-1) for values in state.values()])
