@@ -13,6 +13,7 @@ import numpy as np
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.formulas.inputs import input_parameters
 from scvi_codegen.lowering.arrays import check_solver, one_coordinate
+from scvi_codegen.mechanics.arrays.rolling import unroll_sums
 from scvi_codegen.mechanics.arrays.system import SYSTEM_OR_ARRAYS, ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.methods import Method, as_method
@@ -165,8 +166,6 @@ class Model(TimeSpan):
         """
         if (system := self.array_system) is None:
             return self
-        from scvi_codegen.mechanics.arrays.unrolling import unroll_sums  # imported here
-
         known = unroll_sums(system, self.sizes, tables=self.tables, parameters=self.fields)
         vectors = {name: _flat(system, getattr(self, name)) for name in STATE if getattr(self, name) is not None}
         if len(vectors) == 1:
