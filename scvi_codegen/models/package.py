@@ -114,8 +114,8 @@ def load_package(folder: str | os.PathLike[str]) -> Stepper:
 
 def _stepper_of_arrays(folder: Path) -> Stepper:
     """Return the stepper of a folder with arrays whose sizes are known at run time; its model has their layout."""
-    from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.models.model_file import load_model
+    from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.runtime.arrays.stepper import ArrayStepper
 
     model, prefix = load_model(folder / MODEL_FILE), prefix_of(folder)
@@ -127,9 +127,9 @@ def _stepper_of_arrays(folder: Path) -> Stepper:
 
 def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return texts by file name, ``interface.json`` last."""
-    from scvi_codegen.pipeline.sources import generate_source
     from scvi_codegen.models.example import example_of
     from scvi_codegen.models.readme import package_template, readme_text
+    from scvi_codegen.pipeline.sources import generate_source
     from scvi_codegen.rendering.program_source import render_example
 
     model = model.with_known_sizes()
@@ -159,9 +159,9 @@ def _texts(model: Model, prefix: str, embedded: Embedded | None, *, single_file:
 
 def _texts_of_arrays(model: Model, prefix: str, embedded: Embedded | None, *, single_file: bool) -> dict[str, str]:
     """Return the texts of a model whose array sizes are known at run time."""
-    from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.models.example import array_example_of
     from scvi_codegen.models.readme import package_template
+    from scvi_codegen.pipeline.sources import generate_array_source
     from scvi_codegen.rendering.program_source import render_example
 
     assert model.array_system is not None  # by the caller

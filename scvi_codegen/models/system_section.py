@@ -7,8 +7,8 @@ from typing import Any
 
 from scvi_codegen.errors import ModelFileError
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
-from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
+from scvi_codegen.mechanics.legendre import lagrangian_of
 from scvi_codegen.mechanics.system import MechanicalSystem
 from scvi_codegen.models.problems import Problem, problem
 from scvi_codegen.models.sections import (
