@@ -388,6 +388,7 @@ static inline void action_lanes(const lanes *u, lanes t, const double *parameter
 }
 
 #include "support/iteration/convergence.h"
+#include "support/core/progress.h"
 #include "support/iteration/one_trajectory.h"
 #include "support/iteration/mass_matrix.h"
 #include "support/iteration/curve.h"

@@ -185,6 +185,7 @@ static void mass(const double *u, double t, const double *parameters, double *va
 }
 
 #include "support/iteration/convergence.h"
+#include "support/core/progress.h"
 #include "support/iteration/one_trajectory.h"
 #include "support/iteration/separable_iteration.h"
 #include "support/iteration/fallback.h"

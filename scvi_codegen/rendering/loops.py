@@ -41,8 +41,8 @@ NEWTON_VECTORS = 4 + 17
 """Further vectors: residual, correction, products, and the basis of GMRES (templates/support/arrays/newton_gmres.h)."""
 FOURIER_VECTORS = 2
 """Further vectors: scratch of Fourier transforms (templates/support/arrays/preconditioner.h)."""
-HALVES_VECTORS = 7
-"""Further vectors: the state at the start of a step and three increments (templates/support/arrays/array_step.h)."""
+SCRATCH_VECTORS = 14
+"""Further vectors: inverse sizes, half steps (templates/support/step_size/observed_error.h), increments of a step."""
 
 
 def loop_context(program: Program) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def loop_context(program: Program) -> dict[str, Any]:
         "fixed_point": _iteration_text(program),
         "work": _work(program),
         "iteration_vectors": ITERATION_VECTORS,
-        "halves_vectors": HALVES_VECTORS,
+        "scratch_vectors": SCRATCH_VECTORS,
         "hot": "static",
         "waves": _lattice_context(program) if loops.reach else None,
         **_constraint_context(program, constrained),
@@ -86,7 +86,7 @@ def _work(program: Program) -> int:
     own = 2 * ITERATION_VECTORS if program.layout.momenta else ITERATION_VECTORS + bool(program.layout.velocities)
     linear = NEWTON_VECTORS + program.fixed_point.lanes if program.loops.products else 0
     waves = FOURIER_VECTORS * program.fixed_point.lanes + _roots_per_coordinate(program) if program.loops.reach else 0
-    return (own + linear) * program.fixed_point.lanes + waves + HALVES_VECTORS
+    return (own + linear) * program.fixed_point.lanes + waves + SCRATCH_VECTORS
 
 
 def _iteration_text(program: Program) -> IterationSource | None:

@@ -58,7 +58,7 @@ class Lanes:
     sources: Sources
     meaning: str
     before: tuple[str, ...]
-    memory: str
+    memory: tuple[str, ...]
 
     @property
     def are_points(self) -> bool:
@@ -70,8 +70,8 @@ class Lanes:
         return "lanes" if source in self.sources else "double"
 
 
-POINTS = Lanes(("u", "t"), "points", (), "iteration/one_trajectory")
-TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("core/batched_step",), "iteration/many_trajectories")
+POINTS = Lanes(("u", "t"), "points", (), ("core/progress", "iteration/one_trajectory"))
+TRAJECTORIES = Lanes(("u", "parameters"), "trajectories", ("core/batched_step",), ("iteration/many_trajectories",))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +155,7 @@ def iteration_source(
         kernels=kernels,
         mass=mass,
         damping=damping,
-        support=(*meaning.before, "iteration/convergence", meaning.memory, *parts, *solver),
+        support=(*meaning.before, "iteration/convergence", *meaning.memory, *parts, *solver),
         error_defines=_kept(fixed_point),
         highest=_table("HIGHEST", fixed_point.guess.highest),
         next=_table("NEXT", fixed_point.guess.next),

@@ -81,7 +81,7 @@ def test_newton_iteration_is_strict_c(name: str, tmp_path: Path) -> None:
 def check_strict(source: Source, tmp_path: Path) -> None:
     """Compile as a library with strict flags."""
     for path, text in source.files.items():
-        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text)
     check_style(source.code)
     check_style(source.header)

@@ -310,7 +310,7 @@ def windows(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], l
     folder = tmp_path_factory.mktemp("windows")
     source, _ = generate_array_source(system_of(CASES["ring"]), "stoermer-verlet", prefix="shared")
     for path, text in {**source.files, "main.c": WINDOWS}.items():
-        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
     subprocess.run([*find_compiler(), "-std=c99", "-w", "main.c", "-lm", "-o", "main"], cwd=folder, check=True)
     found: dict[tuple[str, int], list[list[int]]] = {}
@@ -392,7 +392,7 @@ def program(name: str, method: str, solver: str, folder: Path, **numbers: int) -
     """Write the source of a run with threads, and the C program that makes it."""
     source, interface = generate_array_source(system_of(CASES[name]), method, solver=solver, prefix="shared")
     for path, text in source.files.items():
-        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
     sizes = {"N": CASES[name].shape[0], "B": len(BONDS)}
     texts = {

@@ -117,7 +117,7 @@ FAULTS = {
         "number kick = 1.00000001 * data->inverse_mass[i] * ",
     ),
     "what rounding cuts off is lost": ("ring", "svi:2", r"\*low = rest - \(rounded - sum\);", "*low = 0.0;"),
-    "positions by the rates of momenta": ("waves", "gauss:2", r"move\(run, G \+ n,", "move(run, G,"),
+    "positions by the rates of momenta": ("waves", "gauss:2", r"X, past\.now \+ n, ", "X, past.now, "),
     "a kick too long": ("net", "stoermer-verlet", r"run->h \* KICK\[k\]", "1.000000001 * run->h * KICK[k]"),
     "a long loop without its second part": (
         "ring",

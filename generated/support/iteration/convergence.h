@@ -69,7 +69,24 @@ static inline long long steps_to_continue(long long steps, double first_change)
   return steps > 0 && first_change < GOOD_GUESS ? 2 : 1;
 }
 
-#ifndef ARRAYS
+#ifdef ARRAYS
+#define LEAST_SIZE 1e-6 /* relative to the largest coordinate: added to the size of each */
+
+/* Replaces sizes by inverse sizes whose squared changes add up to the mean over n coordinates, so that the sum of the
+ * rounding errors of many is not above the tolerance; with absolute = 1, to the 2-norm. NaN if a size is not finite. */
+static inline void invert_sizes(const solver_options *options, double largest, long long n, section here, double *size)
+{
+  const double unit = 1.0 / sqrt((double)n), least = LEAST_SIZE * largest + DBL_MIN;
+  for (long long i = here.first; i < here.end; i++)
+    size[i] = (options->absolute ? 1.0 : unit / (size[i] + least)) + 0.0 * largest;
+}
+
+/* Squared change relative to the squared size of a state in the 2-norm; NaN if that is not finite. */
+static inline double relative_change(double change, double size)
+{
+  return (size == 0.0 ? change : change / size) + 0.0 * size;
+}
+#else
 /* Inverse sizes, in units of which changes are measured. Requires: points.h or trajectories.h. */
 
 /* 1 / (size + a little of the largest), so that a coordinate at 0 has a size, too; or `absolute`, which converts to

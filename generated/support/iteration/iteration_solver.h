@@ -10,7 +10,7 @@ static void prepare(const step_data *step, solver_data *data)
 }
 
 /* Computes the increments by fixed-point iteration from the straight line, else by fall_back. */
-static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, double *memory,
+static __attribute__((noinline)) int solve_afresh(const step_data *step, const solver_data *data, history memory,
     long long *guess, double *dq, double *dp, const solver_options *options, solver_report *report, double *workspace)
 {
   long long steps = 0;
@@ -29,7 +29,7 @@ static __attribute__((noinline)) int solve_afresh(const step_data *step, const s
 /* Computes the increments by fixed-point iteration from the curve extrapolated from *guess former steps, or from the
  * straight line if there are none or it fails. On success *guess is the number of steps for the next predictor. On
  * failure the increments are undefined. */
-HOT int solve(const step_data *step, const solver_data *data, double *memory, long long *guess, double *dq, double *dp,
+HOT int solve(const step_data *step, const solver_data *data, history memory, long long *guess, double *dq, double *dp,
     const solver_options *options, solver_report *report, double *workspace)
 {
   long long steps = *guess;

@@ -15,11 +15,6 @@
 #define EXTENT(n) M
 #define PASS static inline __attribute__((always_inline))
 #define VELOCITIES 0
-
-/* Range of coordinates. */
-typedef struct {
-  long long first, end;
-} section;
 #endif
 
 enum { OF_EACH = 1 + VELOCITIES }; /* values per coordinate in X: positions, then velocities */
@@ -48,15 +43,10 @@ typedef struct {
   const iteration_data *data;
   lanes *X, *F;
   long long n;
-#ifdef ARRAYS
-  const run_memory *run;
-  const problem *given;
-  const lanes *last, *before; /* forces in the last step and in the one before */
-  double scale; /* of coordinates */
-#else
+  number *inverse_size;
+#ifndef ARRAYS
   drift_words *drifts;
   lanes *base, *rests; /* points of the straight line; low words of the iteration, with the first forces */
-  number *inverse_size;
 #endif
 } step_points;
 
@@ -89,12 +79,10 @@ PASS drift_words find_drift(const step_points *w, long long i)
 #define DRIFT_OF(w, i) find_drift(w, i)
 #define STRAIGHT(w, g, i, of) ((w)->step->q0[i] + DRIFT[g] * (of).high)
 #define WITH_LOW_WORDS(w, g, i, x) (x)
-#define MEASURE(w, i) ((w)->scale)
 #else
 #define DRIFT_OF(w, i) ((w)->drifts[i])
-#define STRAIGHT(w, g, i, of) ((w)->base[(g) * M + (i)])
+#define STRAIGHT(w, g, i, of) ((void)(of), (w)->base[(g) * M + (i)])
 #define WITH_LOW_WORDS(w, g, i, x) ((x) + (w)->rests[(g) * M + (i)])
-#define MEASURE(w, i) ((w)->inverse_size[i])
 #endif
 
 /* sum_j table_gj F_j of a coordinate. */
@@ -166,12 +154,10 @@ static inline lanes with_change(lanes change, lanes moved)
   return change + moved * moved;
 }
 
-/* Updates the points of a range of coordinates from the forces; returns the sum of the squared changes. *size, if it is
- * not NULL, is that of the sizes. */
-PASS lanes improve_points(const step_points *w, section here, number *size)
+/* Updates the points of a range of coordinates from the forces; returns the sum of the squared relative changes. */
+PASS lanes improve_points(const step_points *w, section here)
 {
   lanes change = lanes_of(0.0);
-  number sizes = number_of(0.0);
   for (long long i = here.first; i < here.end; i++) {
     const drift_words of = DRIFT_OF(w, i);
     const number unit = unit_of(w, i);
@@ -179,20 +165,129 @@ PASS lanes improve_points(const step_points *w, section here, number *size)
       lanes *X = &w->X[g * OF_EACH * EXTENT(w->n) + i];
       const lanes curved = unit * SUM_OF_FORCES(PRODUCT, w, g, i);
       const lanes x = STRAIGHT(w, g, i, of) + WITH_LOW_WORDS(w, g, i, curved);
-      change = with_change(change, (x - *X) * MEASURE(w, i));
+      change = with_change(change, (x - *X) * w->inverse_size[i]);
       *X = x;
     }
-    if (size) {
-      const number of_one = MEASURE(w, i) * size_of(w, of, i);
-      sizes += of_one * of_one;
-    }
   }
-  if (size)
-    *size = sizes;
   return change;
 }
 
-#ifndef ARRAYS
+/* Computes the points of a range of coordinates with double-double coefficients. */
+PASS void refine_points(const step_points *w, section here)
+{
+  for (long long i = here.first; i < here.end; i++)
+    for (int g = 0; g < GROUPS; g++)
+      w->X[g * OF_EACH * EXTENT(w->n) + i] = accurate_point(w, g, DRIFT_OF(w, i), i);
+}
+
+/* Computes the increments of a range of coordinates; low words follow those of q. */
+PASS void find_increments(const step_points *w, section here, number *dq, number *dp)
+{
+  for (long long i = here.first; i < here.end; i++) {
+    const end_increments end = increments_of(w, i);
+    dq[i] = end.q, dq[EXTENT(w->n) + i] = end.q_low, dp[i] = end.p;
+  }
+}
+
+#ifdef ARRAYS
+#define KEPT_FIRST(apart) 0
+
+static history history_in(const step_data *step)
+{
+  return history_of(step->run, OF_EACH * GROUPS * step->n, step->n);
+}
+
+static void prepare_iteration(const step_data *step, iteration_data *data)
+{
+  prepare_step_size(step->h, data);
+  data->inverse_mass = step->run->inverse_mass;
+}
+
+static step_points points_in(const step_data *step, const iteration_data *data, history past)
+{
+  const step_points points = {step, data, (lanes *)step->run->work, past.now, step->n, step->scratch};
+  return points;
+}
+
+static void forces(const step_points *w)
+{
+  forces_at(w->step, w->X, OF_EACH * w->n, w->F);
+}
+
+#if VELOCITIES
+/* Updates the velocities at the points from the forces; returns the sum of the squared relative changes times h. */
+static lanes improve_velocities(const step_points *w, section here)
+{
+  const step_data *step = w->step;
+  lanes change = lanes_of(0.0);
+  for (int g = 0; g < GROUPS; g++) {
+    lanes *V = w->X + (g * OF_EACH + 1) * w->n;
+    for (long long i = here.first; i < here.end; i++) {
+      const lanes kick = step->carry_p[i] + step->h * SUM_OF_FORCES(VELOCITY, w, g, i);
+      const lanes v = w->data->inverse_mass[i] * (step->p0[i] + kick);
+      change = with_change(change, step->h * (v - V[i]) * w->inverse_size[i]);
+      V[i] = v;
+    }
+  }
+  return change;
+}
+#else
+static lanes improve_velocities(const step_points *w, section here)
+{
+  (void)w, (void)here;
+  return lanes_of(0.0);
+}
+#endif
+
+/* Points of the straight line or, if there are former steps, with extrapolated forces. */
+static void first_points(const step_points *w, history past, long long steps)
+{
+  const section own = own_part(w->step);
+  for (long long i = own.first; i < own.end; i++) {
+    const drift_words of = find_drift(w, i);
+    for (int g = 0; g < GROUPS; g++) {
+      const lanes force = extrapolated(w->step, past, steps, g, i);
+      if (VELOCITIES) /* the extrapolation is of forces, from which velocities follow, too */
+        w->F[g * w->n + i] = force;
+      w->X[g * OF_EACH * w->n + i] = STRAIGHT(w, g, i, of);
+      if (!VELOCITIES && steps > 0)
+        w->X[g * OF_EACH * w->n + i] += unit_of(w, i) * force;
+    }
+    for (int g = 0; VELOCITIES && g < GROUPS; g++)
+      w->X[g * OF_EACH * w->n + i] += unit_of(w, i) * SUM_OF_FORCES(PRODUCT, w, g, i);
+  }
+  improve_velocities(w, own);
+}
+
+/* Sizes of the coordinates. */
+static inline void measure_points(const step_points *w, const solver_options *options)
+{
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    double largest = 0.0;
+    for (long long i = all.here.first; i < all.here.end; i++) {
+      w->inverse_size[i] = size_of(w, find_drift(w, i), i);
+      largest = larger(largest, w->inverse_size[i]);
+    }
+    add_block(&all, largest, 0.0);
+  }
+  meet(w->step);
+  invert_sizes(options, largest_over(&all, 0), w->n, own_part(w->step), w->inverse_size);
+}
+
+static inline double improve(const step_points *w)
+{
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    const lanes change = improve_points(w, all.here);
+    add_block(&all, lanes_total(change + improve_velocities(w, all.here)), 0.0);
+  }
+  meet(w->step);
+  return sum_of(&all, 0);
+}
+#else
 static void prepare_iteration(const step_data *step, iteration_data *data)
 {
   prepare_step_size(step->h, data);
@@ -235,41 +330,54 @@ PASS void measure_points(const step_points *w, const solver_options *options)
           w->data->inverse_mass[i] * (w->data->square * SUM_OF_FORCES(PRODUCT_LOW, w, g, i));
 }
 
+PASS number improve(const step_points *w)
+{
+  const section all = {0, M};
+  return total_change(improve_points(w, all));
+}
+#endif
+
+#ifndef NEWTON_KRYLOV
 /* Computes the increments of one step and their low words. The points X are iterated until they converge, then once
  * more with double-double coefficients; the forces are stored for the predictor. On failure the increments are
  * undefined. */
 HOT int fixed_point(const step_data *step, const iteration_data *data, history past, long long *steps, number *dq,
     number *dp, const solver_options *options, solver_report *report)
 {
-  const section all = {0, M};
-  coordinates X[GROUPS], base[GROUPS], rests[GROUPS], own[GROUPS], *F = kept(past, own);
+#ifdef ARRAYS
+  const section own = own_part(step);
+  const step_points w = points_in(step, data, past);
+#else
+  const section own = {0, M};
+  coordinates X[GROUPS], base[GROUPS], rests[GROUPS], local[GROUPS], *F = kept(past, local);
   drift_words drifts[M];
   number inverse_size[M];
-  const step_points w = {step, data, X[0], F[0], M, drifts, base[0], rests[0], inverse_size};
+  const step_points w = {step, data, X[0], F[0], M, inverse_size, drifts, base[0], rests[0]};
+#endif
   progress now = before_iterations();
   int status;
   first_points(&w, past, *steps);
   forces(&w);
   measure_points(&w, options);
   for (int k = 0; needs_iteration(&now); k++) {
-    const lanes change = improve_points(&w, all, NULL);
+    const number change = improve(&w);
     forces(&w);
-    take_change(&now, total_change(change), options, k, report);
+    take_change(&now, change, options, k, report);
   }
   status = outcome(&now, report);
   if (status != OK)
     return status;
-  for (int i = 0; i < M; i++)
-    for (int g = 0; g < GROUPS; g++)
-      X[g][i] = accurate_point(&w, g, drifts[i], i);
+  refine_points(&w, own);
+#ifdef ARRAYS
+  improve_velocities(&w, own);
+#endif
   forces(&w);
-  for (int i = 0; i < M; i++) {
-    const end_increments end = increments_of(&w, i);
-    dq[i] = end.q, dq[M + i] = end.q_low, dp[i] = end.p;
-  }
+  find_increments(&w, own, dq, dp);
   if (!accept(step, dq, dp, report))
     return NOT_FINITE;
+#ifndef ARRAYS
   remember_curve(F, past);
+#endif
   *steps = next_guess(*steps, &now, report);
   return OK;
 }

@@ -29,7 +29,7 @@ STEP_CONTROL_FIELDS = (
 """Fields of the C struct that control adaptive steps."""
 RUN_FIELDS = (
     *("t", "t_low", "h", "step", "guess", "turn", "error", "error_t"),
-    *("largest_q", "largest_p", "steps_from_rest", "uneven", *STEP_CONTROL_FIELDS),
+    *("largest_q", "largest_p", "steps_from_rest", *STEP_CONTROL_FIELDS),
 )
 """Scalar fields of the C struct of a run."""
 STATE = ("q", "p", "carry_q", "carry_p")

@@ -23,7 +23,6 @@ RANGES = {
     "guess": (0, 2),
     "turn": (0, 2),
     "direction": (-1, 1),
-    "uneven": (0, 1),
     **dict.fromkeys(("grid_level", "change", "change_before", "failed"), (-(2**16), 2**16)),
 }
 """Smallest and largest values of whole numbers that C uses as indices or states."""

@@ -3,16 +3,16 @@
 
 /* Linear systems of Newton's method for the points of a step of an array system: (1 - h^2 A F' / m) dX = the change
  * by one fixed-point iteration, where A is PRODUCT and F' the Jacobian of the forces at the points, which is only
- * multiplied by vectors, term group by term group. Requires: array_points.h; products and diagonals of F'. */
+ * multiplied by vectors, term group by term group. Requires: separable_iteration.h; products and diagonals of F'. */
 
 typedef struct {
+  const step_data *step;
   const run_memory *run;
   const problem *given;
   const step_points *points;
   long long n, count; /* coordinates, and lanes of a vector over all points */
   section own; /* coordinates of this thread */
-  measures by_size;
-  double state; /* scaled size of the coordinates */
+  double scale, state; /* of coordinates before they are squared, and their scaled size */
   lanes *residual, *correction, *product, *forces, *inverse, *spare, *basis;
   double *roots;
   int by_fourier, tried; /* 1 if the inverses are those of the Fourier modes; number of preconditioners for which one
@@ -24,7 +24,7 @@ typedef struct {
 static void multiply(const linear_system *of, const lanes *x, lanes *y)
 {
   const long long n = of->n;
-  products(of->run, of->given, of->points->X, x, of->forces, n);
+  products(of->step, of->points->X, x, of->forces);
   for (long long i = of->own.first; i < of->own.end; i++) {
     const double unit = unit_of(of->points, i);
     for (int g = 0; g < GROUPS; g++)
@@ -98,7 +98,7 @@ static double mean_derivative(const linear_system *of, const lanes *x, long long
 /* Inverts 1 - h^2 A F'_ii / m of every coordinate. */
 static void find_own_inverses(linear_system *of)
 {
-  diagonals(of->run, of->given, of->points->X, of->forces, of->n);
+  diagonals(of->step, of->points->X, of->forces);
   for (long long i = of->own.first; i < of->own.end; i++)
     keep_inverse(of, i, mean_derivative(of, of->forces, i), 1.0);
 }
@@ -108,7 +108,7 @@ static void find_own_inverses(linear_system *of)
 /* Inner product of scaled vectors. */
 static double inner_product(const linear_system *of, const lanes *x, const lanes *y)
 {
-  const double scale = of->by_size.scale;
+  const double scale = of->scale;
   sums all;
   begin_sums(&all, of->run, of->n);
   while (next_block(&all)) {

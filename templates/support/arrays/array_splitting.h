@@ -55,7 +55,7 @@ static void kick_by(const run_memory *run, const problem *given, const parts_of_
 }
 
 /* Performs a step. The increments start with the compensation terms of the state. */
-static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+static int perform_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
   double *work = run->work;

@@ -115,13 +115,14 @@ static double find_correction(linear_system *of, solver_report *report)
 static linear_system linear_of(const step_points *points)
 {
   const long long count = GROUPS * points->n;
-  lanes *work = (lanes *)points->run->work + ITERATION_VECTORS * count;
-  const linear_system of = {.run = points->run,
-      .given = points->given,
+  lanes *work = (lanes *)points->step->run->work + ITERATION_VECTORS * count;
+  const linear_system of = {.step = points->step,
+      .run = points->step->run,
+      .given = points->step->given,
       .points = points,
       .n = points->n,
       .count = count,
-      .own = mine(points->run, points->n),
+      .own = own_part(points->step),
       .residual = work,
       .correction = work + count,
       .product = work + 2 * count,
@@ -153,17 +154,17 @@ static double size_of_state(const linear_system *of)
 {
   const step_points *w = of->points;
   sums all;
-  begin_sums(&all, w->run, w->n);
-  while (next_block(&all)) {
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
     double size = 0.0;
     for (long long i = all.here.first; i < all.here.end; i++) {
       const double q = w->step->q0[i], part = fabs(q) + fabs(find_drift(w, i).high);
-      const double of_one = of->by_size.scale * (part + fabs(at_point(&w->X[i], w->n, KEPT - 1) - q));
+      const double of_one = of->scale * (part + fabs(at_point(&w->X[i], w->n, KEPT - 1) - q));
       size += of_one * of_one;
     }
     add_block(&all, size, 0.0);
   }
-  wait_at_barrier(w->run);
+  meet(w->step);
   return sum_of(&all, 0);
 }
 
@@ -180,7 +181,7 @@ static void start_nearer(linear_system *of)
   for (int g = 0; g < GROUPS; g++)
     for (long long i = of->own.first; i < of->own.end; i++)
       rest.X[g * of->n + i] = lanes_of(w->step->q0[i]);
-  forces_at_points(&rest);
+  forces(&rest);
   find_residual(of, &rest);
   at_rest = inner_product(of, of->residual, of->residual);
   if (continued <= at_rest)
@@ -189,44 +190,66 @@ static void start_nearer(linear_system *of)
   scale(of, w->F, 1.0, rest.F);
 }
 
-/* Iterates until the points converge. The tables extrapolate from *guess steps. On success *guess is the number of
- * steps for the next predictor, and *error the error estimate. */
-static int solve(run_memory *run, const problem *given, long long n, const struct predictor_tables_of *tables,
-    long long *guess, double decay, double *error, const solver_options *options, solver_report *report)
+/* Largest coordinate at the start of the step, or displacement by the drift or by the first force: for a step from rest
+ * at 0 the only size. */
+static double largest_size(const step_points *w)
 {
-  iteration now = new_iteration();
-  array_step step;
-  const step_points *w = &step.points;
-  linear_system of;
-  double largest;
-  begin_step(run, given, n, &step);
-  of = linear_of(w);
-  largest = first_points(w, tables, *guess);
-  forces_at_points(w);
-  largest = largest_moved(w, largest);
-  of.by_size = measures_of(largest);
+  sums all;
+  begin_blocks(&all, w->step);
+  EACH_BLOCK (all) {
+    double of_block = DBL_MIN;
+    for (long long i = all.here.first; i < all.here.end; i++)
+      of_block = larger(of_block, size_of(w, find_drift(w, i), i));
+    add_block(&all, of_block, 0.0);
+  }
+  meet(w->step);
+  return largest_over(&all, 0);
+}
+
+typedef iteration_data solver_data;
+
+static void prepare(const step_data *step, solver_data *data)
+{
+  prepare_iteration(step, data);
+}
+
+/* Computes the increments of one step: iterates until the points, extrapolated from *guess steps, converge. On success
+ * *guess is the number of steps for the next predictor. */
+static int solve(const step_data *step, const solver_data *data, history past, long long *guess, double *dq, double *dp,
+    const solver_options *options, solver_report *report, double *workspace)
+{
+  const step_points w = points_in(step, data, past);
+  linear_system of = linear_of(&w);
+  progress now = before_iterations();
+  int status;
+  (void)workspace;
+  first_points(&w, past, *guess);
+  forces(&w);
+  of.scale = scale_of(largest_size(&w));
   start_nearer(&of);
   of.state = sqrt(size_of_state(&of));
-  while (now.status == 0) {
-    double total[3] = {0.0}, left;
-    find_residual(&of, w);
-    if (now.last.of_all > REFRESHED) /* also before the first iteration */
+  for (int k = 0; needs_iteration(&now); k++) {
+    double change, size, left;
+    find_residual(&of, &w);
+    if (now.last > REFRESHED) /* also before the first iteration */
       find_inverses(&of);
     left = find_correction(&of, report);
-    add_multiple(&of, w->X, 1.0, of.correction);
-    forces_at_points(w);
-    total[0] = inner_product(&of, of.correction, of.correction);
-    total[2] = size_of_state(&of);
-    of.state = sqrt(total[2]);
-    record_change(&now, relative_changes(total, &of.by_size, n, options), options, report);
+    add_multiple(&of, w.X, 1.0, of.correction);
+    forces(&w);
+    change = inner_product(&of, of.correction, of.correction);
+    of.state = sqrt(size_of_state(&of));
+    size = options->absolute ? of.scale * of.scale : of.state * of.state;
+    take_change(&now, relative_change(change, size), options, k, report);
     if (now.status > 0 && !(left <= UNSOLVED * of.state)) /* an unsolved linear system does not count as a small
                                                            * correction */
-      now.status = -1, now.last.of_all = left;
+      now.status = -1, now.last = left;
   }
-  if (now.status < 0)
-    return failure_of(&now);
-  *guess = steps_to_continue(*guess, now.first);
-  return examine(w, largest, decay, error) ? OK : NOT_FINITE;
+  status = outcome(&now, report);
+  if (status != OK)
+    return status;
+  find_increments(&w, own_part(step), dq, dp);
+  *guess = next_guess(*guess, &now, report);
+  return accept(step, dq, dp, report) ? OK : NOT_FINITE;
 }
 
 #endif

@@ -3,7 +3,7 @@
 
 /* Constrained step: RATTLE substeps (H. C. Andersen, J. Comput. Phys. 52, 1983; Hairer, Lubich & Wanner, Geometric
  * Numerical Integration, sec. VII.1.4), composed with the coefficients PART. Requires: arrays.h, add_forces,
- * evaluate_constraints, constraint_matrix.h, array_convergence.h, PARTS of a step, PART and their ends, PART_END. */
+ * evaluate_constraints, constraint_matrix.h, progress.h, PARTS of a step, PART and their ends, PART_END. */
 
 #define NEAR_ENOUGH 1e-3 /* relative residual to which the linear system of a correction is solved */
 
@@ -94,12 +94,13 @@ static double push(double *x, const double *y, double by, const double *inverse_
 
 /* Status of a finished iteration. Constraints that are violated at converged positions contradict each other:
  * SINGULAR. */
-static int end_of_iteration(const iteration *now, const held *held)
+static int end_of_iteration(const progress *now, const held *held, solver_report *report)
 {
   const double left = product_of(held->right, held->right, held->count);
   const double rounding = product_of(held->rounding, held->rounding, held->count);
-  if (now->status < 0)
-    return failure_of(now);
+  const int status = outcome(now, report);
+  if (status != OK)
+    return status;
   return left <= ROUNDING_MULTIPLE * ROUNDING_MULTIPLE * rounding ? OK : SINGULAR;
 }
 
@@ -109,9 +110,9 @@ static int solve_positions(const constrained_run *of, double h, double t, double
 {
   const held *held = &of->held;
   const parts_of_work *parts = &of->parts;
-  iteration now = new_iteration();
+  progress now = before_iterations();
   compute_constraint_forces(held, held->lambda, parts->R, of->n);
-  for (;;) {
+  for (int k = 0;; k++) {
     int status;
     double moved;
     *size = trial_increments(of, h);
@@ -120,14 +121,14 @@ static int solve_positions(const constrained_run *of, double h, double t, double
       held->right[k] = -2.0 / (h * h) * held->g[k];
     compute_rounding(held, held->next, parts->X, 2.0 / (h * h));
     if (now.status)
-      return end_of_iteration(&now, held);
+      return end_of_iteration(&now, held, of->report);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
     add_to(held->lambda, held->change, 1.0, held->count);
     compute_constraint_forces(held, held->change, parts->F, of->n);
     moved = h * h / 2 * (h * h / 2) * push(parts->R, parts->F, 1.0, of->run->inverse_mass, of->n);
-    record_change(&now, changes_of_all(moved, *size, of->options), of->options, of->report);
+    take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : *size), of->options, k, of->report);
   }
 }
 
@@ -148,8 +149,8 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
 {
   const held *held = &of->held;
   const run_memory *run = of->run;
-  iteration now = new_iteration();
-  for (;;) {
+  progress now = before_iterations();
+  for (int k = 0;; k++) {
     int status;
     double moved;
     for (long long i = 0; i < of->n; i++)
@@ -157,13 +158,13 @@ static int project_momenta(const constrained_run *of, double by, double unit, do
     find_right(held, held->rate, of->parts.D, 1.0 / by);
     compute_rounding(held, held->derivative, of->parts.X, 1.0 / by);
     if (now.status)
-      return now.status < 0 ? failure_of(&now) : OK;
+      return outcome(&now, of->report);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
     compute_constraint_forces(held, held->change, of->parts.R, of->n);
     moved = unit * by * (unit * by) * push(of->parts.dp, of->parts.R, by, run->inverse_mass, of->n);
-    record_change(&now, changes_of_all(moved, size, of->options), of->options, of->report);
+    take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : size), of->options, k, of->report);
   }
 }
 
@@ -196,7 +197,7 @@ static int constrained_substep(const constrained_run *of, double h, double t)
 
 /* Performs a step. The increments start with the compensation terms of the state; a failed step leaves the state
  * unchanged and discards the predictor. */
-static int take_step(run_memory *run, const problem *given, long long n, const solver_options *options,
+static int perform_step(run_memory *run, const problem *given, long long n, const solver_options *options,
     solver_report *report)
 {
   const constrained_run of = constrained_run_of(run, given, options, report);

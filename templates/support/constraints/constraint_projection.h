@@ -14,10 +14,10 @@ static int project_positions(const constrained_run *of)
   const held *held = &of->held;
   const parts_of_work *parts = &of->parts;
   const run_memory *run = of->run;
-  iteration now = new_iteration();
+  progress now = before_iterations();
   memset(held->lambda, 0, sizeof(double) * (size_t)held->count);
   memcpy(parts->Y, run->q, sizeof(double) * (size_t)of->n);
-  for (;;) {
+  for (int k = 0;; k++) {
     double moved = 0.0, size = 0.0;
     int status;
     evaluate_constraints(of->given, parts->Y, run->t, held->g, held->rate, held->derivative);
@@ -31,7 +31,7 @@ static int project_positions(const constrained_run *of)
     find_right(held, held->g, parts->D, 1.0);
     compute_rounding(held, held->derivative, parts->X, 1.0);
     if (now.status)
-      return end_of_iteration(&now, held);
+      return end_of_iteration(&now, held, of->report);
     status = solve_constraint_system(held, NEAR_ENOUGH, of->report);
     if (status != OK)
       return status;
@@ -43,7 +43,7 @@ static int project_positions(const constrained_run *of)
       size += to * to;
       parts->Y[i] = to;
     }
-    record_change(&now, changes_of_all(moved, size, of->options), of->options, of->report);
+    take_change(&now, relative_change(moved, of->options->absolute ? 1.0 : size), of->options, k, of->report);
   }
 }
 

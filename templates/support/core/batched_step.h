@@ -22,4 +22,9 @@ typedef struct {
   const lanes *q0, *p0, *carry_q, *carry_p, *parameters;
 } step_data;
 
+/* Range of coordinates. */
+typedef struct {
+  long long first, end;
+} section;
+
 #endif

@@ -4,9 +4,8 @@
 /* Adaptive integration to a given time t_end.
  *
  * Stores every `every`-th state and the one at t_end, and returns after at most `steps` steps. On failure the run is
- * left at the last completed step and the status of the failed one is returned.
- * Requires a controller: trial, begin_trials, find_step, confirm_step, and take_step, which adds the increments to the
- * state. */
+ * left at the last completed step and the status of the failed one is returned. Requires a controller: trial,
+ * begin_trials, find_step, confirm_step, and accept_trial, which adds the increments to the state. */
 
 /* A run is at t_end only if no low word is left: beyond 2^53 step sizes t alone is t_end some steps too early. */
 static inline int has_arrived(real t, real t_low, real t_end)
@@ -39,7 +38,7 @@ int NAME(advance_to)(run_memory *run, real t_end, real tolerance, long long step
       save_state(&now.at, run);
       return status;
     }
-    take_step(run, &now);
+    accept_trial(run, &now);
     run->iterations += report->iterations - before;
     report->steps++;
     if (run->step % every == 0 || has_arrived(now.at.t, now.at.t_low, t_end)) {

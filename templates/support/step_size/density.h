@@ -90,7 +90,7 @@ static int confirm_step(run_memory *run, trial *now, const solver_options *optio
 }
 
 /* Adds the increments to the state. */
-static void take_step(run_memory *run, trial *now)
+static void accept_trial(run_memory *run, trial *now)
 {
   add_increments(now->at.q, now->at.carry_q, now->dq);
   add_increments(now->at.p, now->at.carry_p, now->dp);

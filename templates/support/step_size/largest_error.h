@@ -49,7 +49,7 @@ static double largest_error(const run_memory *run, const step_data *step, const 
     double *workspace)
 {
   (void)workspace;
-  return run->guess > 0 ? curve_error(step, data, run->memory, dq, ALL, now_and_then(run), run->error) : NAN;
+  return run->guess > 0 ? curve_error(step, data, STORED(run, step), dq, ALL, now_and_then(run), run->error) : NAN;
 }
 #endif
 

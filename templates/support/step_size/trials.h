@@ -89,9 +89,9 @@ HOT int find_step(run_memory *run, trial *now, const solver_options *options, so
  * factor of two or more although the momenta change little. Near a singular time or a nonsmooth force the coefficients
  * of the curve do not decay and do not show its error; steps are then so short that the error is in the momenta. Not
  * for Newton's method, whose steps may leave vibrations of stiff systems unresolved. */
-static inline int needs_momenta(run_memory *run, const trial *now)
+static inline int needs_momenta(const run_memory *run, const trial *now)
 {
-  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -LEVELS_PER_BINADE && changes_little(run, now)));
+  return DOUBTS && (run->steps_to_compare > 0 || (now->change <= -LEVELS_PER_BINADE && changes_little(now)));
 }
 
 /* Compares a step with its half steps and shortens it while the difference is far above its error estimate. */
@@ -102,7 +102,7 @@ static SELDOM int compare_step(run_memory *run, trial *now, int steps_to_compare
       ALLOWED_TO_HALVES * MATH(pow)(now->limits.most, ERROR_POWER), steps_to_compare ? ROUNDOFF_LEVEL : SPURIOUS);
   for (;;) {
     real apart;
-    int status = compare_trial(run, now, steps_to_compare, options, &apart);
+    int status = compare_trial(now, steps_to_compare, options, &apart);
     if (status > STATUS(SPURIOUS_SOLUTION))
       return status;
     if (status == OK && apart <= allowed) {
@@ -166,14 +166,32 @@ static inline void finish_trial(run_memory *run, trial *now, real h)
   run->step++;
 }
 
+/* Adds the increments of the accepted step to the state. */
+static inline void accept_trial(run_memory *run, trial *now)
+{
+#ifdef ARRAYS
+  continue_steps(run, &now->step, now->dq, now->dp);
+#else
+  add_increments(now->at.q, now->at.carry_q, now->dq);
+  add_increments(now->at.p, now->at.carry_p, now->dp);
+#endif
+  if (larger(now->error, now->apart) > run->error) {
+    run->error = larger(now->error, now->apart);
+    run->error_t = now->at.t;
+  }
+  finish_trial(run, now, now->step.h);
+}
+
 #ifdef ARRAYS
 /* Adaptive integration of arrays to a given time. */
 static int take_trials(run_memory *run, const job *way, solver_report *report)
 {
   solver_options standard = NAME(default_options)();
-  trial now = {
-      .given = way->given, .n = NAME(coordinates)(way->given), .t_end = way->t_end, .at = {run->t, run->t_low}};
   const solver_options *options = way->options ? way->options : &standard;
+  trial now = {.at = {run->t, run->t_low, run->q, run->p, run->carry_q, run->carry_p}, .t_end = way->t_end};
+  now.step = step_of(run, way->given, NAME(coordinates)(way->given));
+  now.step.h = 0.0;
+  now.dq = increments_in(&now.step), now.dp = now.dq + 2 * now.step.n;
   begin_trials(run, &now, way->tolerance, &standard);
   run->direction = (way->t_end - run->t) - run->t_low < 0 ? -1 : 1;
   while (report->steps < way->steps && (run->t != way->t_end || run->t_low != 0.0)) {
@@ -182,10 +200,8 @@ static int take_trials(run_memory *run, const job *way, solver_report *report)
       status = confirm_step(run, &now, options, report);
     if (status != OK)
       return status;
-    accept(run, now.n, larger(now.error, now.apart), now.guess);
-    finish_trial(run, &now, run->h);
-    run->t = now.at.t;
-    run->t_low = now.at.t_low;
+    accept_trial(run, &now);
+    run->t = now.at.t, run->t_low = now.at.t_low, run->h = now.step.h;
     report->steps++;
   }
   return OK;
@@ -199,18 +215,6 @@ int NAME(advance_to)(run_memory *run, const problem *given, double t_end, double
   report = report ? report : &unread;
   memset(report, 0, sizeof *report);
   return run_workers(run, &way, report);
-}
-#else
-/* Adds the increments of the accepted step to the state. */
-static inline void take_step(run_memory *run, trial *now)
-{
-  add_increments(now->at.q, now->at.carry_q, now->dq);
-  add_increments(now->at.p, now->at.carry_p, now->dp);
-  if (larger(now->error, now->apart) > run->error) {
-    run->error = larger(now->error, now->apart);
-    run->error_t = now->at.t;
-  }
-  finish_trial(run, now, now->step.h);
 }
 #endif
 
