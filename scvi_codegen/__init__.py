@@ -44,7 +44,7 @@ _HOMES = {
     "runtime.sensitivity.step_derivatives": ("Sensitivity",),
     "mechanics.hamiltonian": ("HamiltonianSystem",),
     "mechanics.legendre": ("hamiltonian_of", "lagrangian_of"),
-    "mechanics.reparametrisation": ("reparametrise",),
+    "mechanics.time_transformation": ("reparametrise",),
     "mechanics.variational": ("variational_system",),
     "mechanics.coordinate_change": ("change_coordinates",),
     "derivation.equations": ("StepEquations", "derive"),

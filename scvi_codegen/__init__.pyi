@@ -54,10 +54,10 @@ from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem as HamiltonianS
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem as LagrangianSystem
 from scvi_codegen.mechanics.legendre import hamiltonian_of as hamiltonian_of
 from scvi_codegen.mechanics.legendre import lagrangian_of as lagrangian_of
-from scvi_codegen.mechanics.reparametrisation import reparametrise as reparametrise
 from scvi_codegen.mechanics.symmetry.checking import check_symmetry as check_symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import Symmetry as Symmetry
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries as symmetries
+from scvi_codegen.mechanics.time_transformation import reparametrise as reparametrise
 from scvi_codegen.mechanics.variational import variational_system as variational_system
 from scvi_codegen.methods import SCVI as SCVI
 from scvi_codegen.methods import SVI as SVI

@@ -15,8 +15,8 @@ from scvi_codegen.advice.advice import advise
 from scvi_codegen.advice.tolerance_check import missed_tolerance
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import MethodError, StateError, StepFailedError
-from scvi_codegen.mechanics.reparametrisation import with_time_transformation
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_transformation import with_time_transformation
 from scvi_codegen.methods import Method, as_method, default_method
 from scvi_codegen.native.arguments import checked_number, checked_step
 from scvi_codegen.native.options import SolverOptions

@@ -33,7 +33,7 @@ from scvi_codegen.benchmark.report import OURS, CaseResult, Contender
 from scvi_codegen.benchmark.settings import Plan, ReportActivity
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.errors import StateError
-from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.run.accuracy import without_accuracy_warnings

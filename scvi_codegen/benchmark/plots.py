@@ -18,7 +18,7 @@ from scvi_codegen.benchmark.cases.unforced import Array
 from scvi_codegen.benchmark.report import OURS, CaseResult
 from scvi_codegen.compiler import compile_stepper
 from scvi_codegen.files.atomic import write_atomically
-from scvi_codegen.mechanics.reparametrisation import reparametrise
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods.galerkin import SVI
 from scvi_codegen.models.problems import problem
 from scvi_codegen.pictures.canvas import COLORS, STYLE, check_plot_path

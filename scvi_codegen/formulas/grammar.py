@@ -31,6 +31,7 @@ from scvi_codegen.formulas.canonical import (
     exponent_problem,
     unsupported_part,
 )
+from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.formulas.vocabulary import CONSTANTS, FUNCTIONS
 
 __all__ = ["Parser", "Token", "parse_expression", "parsed"]
@@ -108,6 +109,12 @@ def parsed(parser: Parser) -> Expr:
 def _is_zero(part: Expr) -> bool:
     """Return whether a constant is 0; formulas with symbols are not tested, which SymPy would do slowly."""
     return bool(part.is_number and part.is_zero)
+
+
+def _spellings(name: str) -> tuple[str, ...]:
+    """Return usual other spellings of a velocity; none for other names."""
+    q = name.removesuffix(DOT)
+    return () if q == name else (f"v_{q}", f"v{q}", f"{q}dot", f"d{q}", f"d{q}_dt", f"{q}_d", f"{q}_t", f"dot_{q}")
 
 
 def _tokens(text: str, pattern: re.Pattern[str]) -> list[Token]:
@@ -320,7 +327,9 @@ class Parser:
             declared = (
                 f"declare a constant as a parameter: parameters={{'{name}': 1.0}}, in files [parameters] {name} = 1.0"
             )
-            self.refuse(f"unknown name '{name}'{closest(name, self.symbols)} Known here: {known}; {declared}", column)
+            velocity = next((each for each in self.symbols if name in _spellings(each)), "")
+            hint = f"; did you mean '{velocity}'?" if velocity else closest(name, self.symbols)
+            self.refuse(f"unknown name '{name}'{hint} Known here: {known}; {declared}", column)
         return value
 
     def call(self, name: str, column: int) -> Expr:

@@ -27,7 +27,7 @@ from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.lowering.solvers.tables import DEGREE_OF_ONE, DEGREE_OF_TWO, INTERPOLATED
 from scvi_codegen.mechanics.derived_expressions import forms_of
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
+from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 
 __all__ = ["control_of", "density_of", "predictor_of"]
 
@@ -146,7 +146,7 @@ def density_of(system: MechanicalSystem, g: str | Expr) -> Control:
 
     Args:
         system: in physical time.
-        g: as in :func:`~scvi_codegen.mechanics.time_rescaling.time_rescaling_function`, or of time.
+        g: as in :func:`~scvi_codegen.mechanics.time_transformation.time_rescaling_function`, or of time.
 
     Raises:
         SystemDefinitionError: for an invalid time-rescaling function.

@@ -8,7 +8,7 @@ from functools import partial
 
 from sympy import Add, Expr, Symbol
 
-from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.arrays import ArrayTerm
 from scvi_codegen.formulas.derivatives import gradient
 from scvi_codegen.indices import Access, Array

@@ -23,8 +23,8 @@ from scvi_codegen.ir.numbers import lower_matrix, lower_vector
 from scvi_codegen.lowering.kernels import system_kernel
 from scvi_codegen.mechanics.derived_expressions import auxiliary_multipliers, curve_rates, multipliers
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
+from scvi_codegen.mechanics.symmetry.work_and_impulse import work_rates
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.work_and_impulse import work_rates
 from scvi_codegen.methods.stage_system import Gather, StageGroup, StageSystem
 from scvi_codegen.tables.precision import mp
 

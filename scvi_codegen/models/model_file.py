@@ -70,8 +70,7 @@ from scvi_codegen.files.atomic import write_atomically
 from scvi_codegen.files.toml_text import read_toml
 from scvi_codegen.lowering.arrays import one_coordinate
 from scvi_codegen.mechanics.definition_checks import warn_of_mistakes
-from scvi_codegen.mechanics.reparametrisation import with_time_transformation
-from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
+from scvi_codegen.mechanics.time_transformation import time_rescaling_function, with_time_transformation
 from scvi_codegen.methods import fitted
 from scvi_codegen.models.document import document_of, motion_of
 from scvi_codegen.models.model import Model

@@ -50,8 +50,8 @@ from scvi_codegen.errors import ExpressionError, ModelFileError, closest
 from scvi_codegen.files.numpy_files import loaded
 from scvi_codegen.formulas.arrays import parse_array
 from scvi_codegen.formulas.grammar import parse_expression
+from scvi_codegen.formulas.numpy_values import on_arrays
 from scvi_codegen.formulas.symbols import symbol
-from scvi_codegen.formulas.vectorized import on_arrays
 from scvi_codegen.indices import Array
 from scvi_codegen.mechanics.arrays.system import ArraySystem
 from scvi_codegen.mechanics.system import MechanicalSystem

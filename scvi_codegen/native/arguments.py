@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def real_array(value: ArrayLike, name: str) -> NDArray[np.float64]:
     try:
         converted = np.asanyarray(value)
         rows = value if isinstance(value, list | tuple) else ()
-        if np.ma.is_masked(converted) or any(map(np.ma.is_masked, rows)):
+        if "numpy.ma" in sys.modules and (np.ma.is_masked(converted) or any(map(np.ma.is_masked, rows))):
             raise StateError(f"{name} has masked entries: fill or remove them")
         if converted.dtype.kind == "O" and any(entry is None for entry in converted.flat):
             raise StateError(f"{name} must be real numbers, not None")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scvi_codegen.exact.solution import ExactMotion, exact_motion, numbers
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.mechanics.system import MechanicalSystem
-from scvi_codegen.mechanics.time_rescaling import time_rescaling_function
+from scvi_codegen.mechanics.time_transformation import time_rescaling_function
 from scvi_codegen.runtime.core.stepper import Stepper
 from scvi_codegen.runtime.trajectory.trajectory import Trajectory
 from scvi_codegen.tables.precision import mp

@@ -302,3 +302,9 @@ def test_evaluation_agrees_with_sympy(expression: sympy.Expr) -> None:
     if expected is sympy.nan:  # atan2(0, 0), which is 0 in C
         return
     assert abs(mp.mpf(str(sympy.re(expected))) - value) <= mp.mpf("1e-20") * max(1, abs(value))
+
+
+@pytest.mark.parametrize("name", ["v_x", "vx", "xdot", "dx", "x_t"])
+def test_other_spellings_of_velocities_get_a_suggestion(name: str) -> None:
+    with pytest.raises(ExpressionError, match=f"unknown name '{name}'; did you mean 'x_dot'"):
+        parse_expression(f"{name}**2/2", {each: sympy.Symbol(each, real=True) for each in ("x", "y", "x_dot", "y_dot")})

@@ -12,8 +12,8 @@ from scvi_codegen.mechanics.coordinate_change import change_coordinates
 from scvi_codegen.mechanics.hamiltonian import HamiltonianSystem
 from scvi_codegen.mechanics.lagrangian import LagrangianSystem
 from scvi_codegen.mechanics.legendre import hamiltonian_of, lagrangian_of
-from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.symmetry.symmetry import symmetries
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import SCVI, SVI
 from scvi_codegen.methods.discretise import discretise
 from scvi_codegen.models.model_file import dump_model, parse_model

@@ -22,8 +22,8 @@ from samples import (
     two_rods,
 )
 
-from scvi_codegen.mechanics.reparametrisation import reparametrise
 from scvi_codegen.mechanics.system import MechanicalSystem
+from scvi_codegen.mechanics.time_transformation import reparametrise
 from scvi_codegen.methods import (
     SCVI,
     SVI,

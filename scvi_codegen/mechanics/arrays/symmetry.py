@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from sympy import Add, Expr, S, Symbol
 
-from scvi_codegen.formulas.array_forces import ArrayForce
+from scvi_codegen.formulas.array_statements import ArrayForce
 from scvi_codegen.formulas.symbols import symbol
 from scvi_codegen.formulas.tape import Tape
 from scvi_codegen.indices import Access, Array, ArrayMap, Place, Size

@@ -18,9 +18,8 @@ from typing import Any, ClassVar
 from sympy import Expr, S, Symbol
 
 from scvi_codegen.errors import SystemDefinitionError
-from scvi_codegen.formulas.array_constraints import parse_constraint
-from scvi_codegen.formulas.array_forces import ArrayForce, parse_force
 from scvi_codegen.formulas.array_latex import latex_sum
+from scvi_codegen.formulas.array_statements import ArrayForce, parse_constraint, parse_force
 from scvi_codegen.formulas.array_sympy import array_text
 from scvi_codegen.formulas.arrays import ArrayTerm, parse_array, parse_coordinate, parse_sums
 from scvi_codegen.formulas.canonical import unsupported_part

@@ -255,7 +255,7 @@ class _Function:
         self.needs = {access.array.name for access, _ in accesses}
 
     def value(self, run: ArrayRun) -> float:
-        from scvi_codegen.formulas.array_symbols import Elements  # here, because it imports SymPy
+        from scvi_codegen.formulas.numpy_values import Elements  # here, because it imports SymPy
         from scvi_codegen.formulas.symbols import TIME, symbol
 
         stored = run.problem.arrays

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sympy import Expr
 
 from scvi_codegen.errors import StepFailedError
-from scvi_codegen.formulas.array_symbols import Elements
+from scvi_codegen.formulas.numpy_values import Elements
 from scvi_codegen.formulas.symbols import DOT
 from scvi_codegen.indices import Access, Loop
 from scvi_codegen.mechanics.arrays.system import ArraySystem
